@@ -1,0 +1,64 @@
+"""The pure middle: what to send, and what the replies mean.
+
+Nothing in this package talks to anybody. A function here turns a call into a `Plan`: the commands
+of one round trip and a `decode` that turns their replies into the result or into the next `Plan`.
+Whoever owns a connection drives it, blocking or not, so both fronts run the very same plans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["Command", "Plan", "Reply", "unwrap", "wire_commands"]
+
+Command = tuple[Any, ...]
+"""One server command: its words as str, bytes, int, float or a flat buffer."""
+
+Reply = Any
+"""What the server said: bytes, int, None, a container of these, or an exception object."""
+
+_MULTI: Command = ("MULTI",)
+_EXEC: Command = ("EXEC",)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """One round trip, and what to make of its replies.
+
+    Attributes:
+        commands: What to send, in order.
+        decode: Takes one reply per command; returns the result, or the next plan. A plan whose
+            transaction was given up because a watched key changed gets None instead.
+        atomic: Send the commands as one MULTI/EXEC.
+        held: Keep the connection to this plan and its successors (WATCH lives on a connection).
+        bulk: Many bytes are expected back: use a connection where nobody waits behind them.
+    """
+
+    commands: Sequence[Command]
+    decode: Callable[[Any], Any]
+    atomic: bool = False
+    held: bool = False
+    bulk: bool = False
+
+
+def wire_commands(plan: Plan) -> Sequence[Command]:
+    """Return what goes over the wire for `plan`, its transaction frame included."""
+    return (_MULTI, *plan.commands, _EXEC) if plan.atomic else plan.commands
+
+
+def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
+    """Return one reply per command of `plan`, or None for a transaction given up by WATCH.
+
+    Raises:
+        redis.exceptions.RedisError: The server refused the whole transaction; nothing was applied.
+    """
+    if not plan.atomic:
+        return replies
+    outcome = replies[-1]
+    if isinstance(outcome, Exception):
+        # EXECABORT only says that something was wrong; the reason was the reply to one of the commands.
+        raise next((reply for reply in replies if isinstance(reply, Exception)), outcome)
+    results: list[Reply] | None = outcome
+    return results

@@ -1,0 +1,297 @@
+"""Python value -> JSON text and parcels for the ships; anything that cannot be stored is refused here.
+
+The fast way is one pass of orjson and a few searches at memory speed for what orjson would change
+without a word: NaN becomes null, UUIDs and enums become strings, long floats lose their last bit on
+the server. Only where one of these may be present does a Python walk look at every node, decide
+exactly, and name the path of what it refuses.
+"""
+
+from __future__ import annotations
+
+import datetime
+import decimal
+import enum
+import marshal
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import orjson
+
+from ..errors import BadKey, BadType, BadValue, TooDeep
+from . import placeholders
+from .floats import exact_text, may_lose
+from .paths import Path, shorten, show
+from .placeholders import Placeholder
+
+__all__ = ["DEEPEST", "Encoded", "Fits", "Parcel", "encode", "number_text"]
+
+DEEPEST = 100
+"""Levels of nesting a document may have; RedisJSON parses up to 127."""
+
+_OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
+_LOWEST, _HIGHEST = -(2**63), 2**64 - 1
+
+
+class Fits(Protocol):
+    """Chooses the ship for a value that is not JSON, or None, and describes the parcel."""
+
+    def __call__(self, value: Any, /) -> Carrier | None:
+        """Return the ship for `value`."""
+        ...
+
+
+class Carrier(Protocol):
+    """As much of a ship as a document needs to know."""
+
+    label: str
+
+    def describe(self, value: Any, /) -> tuple[int, str]:
+        """Return bytes and a summary; raises BadType or BadValue for what it cannot carry."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Parcel:
+    """A value that a ship stores under a key of its own."""
+
+    suffix: str
+    ship: Any
+    value: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A value ready to be sent: the document's text and what goes by ship."""
+
+    text: bytes
+    parcels: tuple[Parcel, ...] = ()
+
+
+def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
+    """Return `value` as it will be stored at `place`.
+
+    Args:
+        value: What to store.
+        place: The full path, top-level key first; for messages, and it counts for the depth.
+        fits: Chooses ships.
+        name: Turns a path below `place` into the name of a ship's key.
+
+    Raises:
+        BadType, BadValue, BadKey, TooDeep: What cannot be stored, with its path and what to do.
+    """
+    try:
+        text = orjson.dumps(value, option=_OPTIONS)
+    except TypeError:
+        return _walk(value, place, fits, name)
+    if _may_be_changed(text, value, len(place) - 1):
+        return _walk(value, place, fits, name)
+    return Encoded(text)
+
+
+def number_text(value: float, place: Path) -> bytes:
+    """Return the JSON text of an operand, exact on the server.
+
+    Raises:
+        BadType: Not an int or float.
+        BadValue: NaN, infinite, out of range, or a float that no text carries.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise BadType(f"{show(place)}: cannot calculate with {shorten(value)}; use an int or a float")
+    if isinstance(value, int):
+        return b"%d" % _check_int(value, place)
+    text = exact_text(_check_float(value, place))
+    if text is None:
+        raise BadValue(f"{show(place)}: {value!r} cannot be sent exactly as an operand; write the result instead")
+    return text
+
+
+def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
+    """Return whether the text may differ from the value in meaning; False is certain."""
+    return (
+        b"null" in text
+        or placeholders.MARK_BYTES in text
+        or may_lose(text)
+        or (text.count(b"{") + text.count(b"[") > DEEPEST - above and _levels(value) > DEEPEST - above)
+        or not _only_plain_types(value)
+    )
+
+
+def _only_plain_types(value: Any) -> bool:
+    """Return whether all is of exactly the built-in types, so that orjson has converted nothing.
+
+    marshal (whose output is thrown away) is the one C-speed walk of the standard library that
+    refuses UUIDs, enums and subclasses, which orjson turns into something else without being asked.
+    """
+    try:
+        marshal.dumps(value)
+    except ValueError:
+        return False
+    return True
+
+
+def _levels(value: Any) -> int:
+    """Return how deep containers are nested, looking at containers only; stops past the limit."""
+    level, depth = [value] if isinstance(value, dict | list | tuple) else [], 0
+    while level and depth <= DEEPEST:
+        depth += 1
+        level = [item for each in level for item in _items(each) if isinstance(item, dict | list | tuple)]
+    return depth
+
+
+def _items(container: Any) -> Iterable[Any]:
+    return container.values() if isinstance(container, dict) else container
+
+
+def _walk(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
+    walker = _Walker(place, fits, name)
+    tree = walker.convert(value, ())
+    return Encoded(orjson.dumps(tree), tuple(walker.parcels))
+
+
+class _Walker:
+    """Turns a value into a tree orjson writes without surprises, collecting parcels."""
+
+    def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str]) -> None:
+        self._place = place
+        self._fits = fits
+        self._name = name
+        self._open: set[int] = set()  # containers being visited: meeting one again is a circle
+        self.parcels: list[Parcel] = []
+
+    def convert(self, value: Any, path: Path) -> Any:
+        kind = type(value)
+        if kind is str:
+            return self._text(value, path)
+        if kind is bool or value is None:
+            return value
+        if kind is int:
+            return _check_int(value, self._place + path)
+        if kind is float:
+            return _exact(_check_float(value, self._place + path))
+        if kind is dict:
+            return self._container(value, path, self._dict)
+        if kind is list or kind is tuple:
+            return self._container(value, path, self._list)
+        return self._other(value, path)
+
+    def _text(self, value: str, path: Path) -> str:
+        try:
+            value.isascii() or value.encode()
+        except UnicodeEncodeError:
+            where = show(self._place + path)
+            raise BadValue(f"{where}: {shorten(value)} has half a surrogate pair; repair the text") from None
+        return placeholders.inline_text(value) if value.startswith(placeholders.MARK) else value
+
+    def _container(self, value: Any, path: Path, convert: Callable[[Any, Path], Any]) -> Any:
+        if id(value) in self._open:
+            raise TooDeep(f"{show(self._place + path)}: circular, this {type(value).__name__} contains itself")
+        if len(self._place) + len(path) > DEEPEST:
+            raise TooDeep(
+                f"{show(self._place + path[:3])}...: nested over {DEEPEST} levels; "
+                "store the inner part as a key of its own"
+            )
+        self._open.add(id(value))
+        result = convert(value, path)
+        self._open.remove(id(value))
+        return result
+
+    def _list(self, value: Iterable[Any], path: Path) -> list[Any]:
+        return [self.convert(item, (*path, index)) for index, item in enumerate(value)]
+
+    def _dict(self, value: dict[Any, Any], path: Path) -> dict[str, Any]:
+        return {self._key(key, path): self.convert(item, (*path, key)) for key, item in value.items()}
+
+    def _key(self, key: Any, path: Path) -> str:
+        if not isinstance(key, str) or isinstance(key, enum.Enum):
+            raise BadKey(
+                f"{show(self._place + path)}: the key {shorten(key)} is not a str; use str(key) "
+                f"({type(key).__name__} keys would come back as text)"
+            )
+        try:
+            key.isascii() or key.encode()
+        except UnicodeEncodeError:
+            raise BadKey(f"{show(self._place + path)}: the key {shorten(key)} has half a surrogate pair") from None
+        return str(key)
+
+    def _other(self, value: Any, path: Path) -> Any:
+        ship = self._fits(value)
+        if ship is not None:
+            return self._parcel(ship, value, path)
+        if isinstance(value, enum.Enum):
+            raise self._refusal(value, path)
+        if isinstance(value, np.generic):
+            return self._numpy_scalar(value, path)
+        for base in (str, int, float, dict, list, tuple):
+            if isinstance(value, base):
+                return self._subclass(value, base, path)
+        raise self._refusal(value, path)
+
+    def _subclass(self, value: Any, base: type, path: Path) -> Any:
+        plain = value if base in (dict, list, tuple) else base(value)
+        if base is dict:
+            return self._container(plain, path, self._dict)
+        if base is list or base is tuple:
+            return self._container(plain, path, self._list)
+        return self.convert(plain, path)
+
+    def _parcel(self, ship: Carrier, value: Any, path: Path) -> str:
+        try:
+            size, summary = ship.describe(value)
+        except (BadType, BadValue) as error:
+            raise type(error)(f"{show(self._place + path)}: {error}") from None
+        suffix = self._name(path)
+        self.parcels.append(Parcel(suffix, ship, value))
+        return str(Placeholder(ship.label, suffix, size, summary))
+
+    def _numpy_scalar(self, value: np.generic, path: Path) -> Any:
+        plain = value.item()
+        # datetime64 and long doubles have no equal among Python's plain types.
+        if type(plain) not in (bool, int, float, str) or isinstance(value, np.datetime64 | np.timedelta64):
+            raise BadType(
+                f"{show(self._place + path)}: the numpy scalar {shorten(value)} has no plain Python equal; "
+                "store np.asarray(value), a 0-d array"
+            )
+        return self.convert(plain, path)
+
+    def _refusal(self, value: Any, path: Path) -> BadType:
+        remedy = next((text for kinds, text in _REMEDIES if isinstance(value, kinds)), _ANY_REMEDY)
+        return BadType(
+            f"{show(self._place + path)}: {shorten(value)} ({type(value).__name__}) cannot be stored; {remedy}"
+        )
+
+
+_ANY_REMEDY = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
+_REMEDIES: tuple[tuple[Any, str], ...] = (
+    (enum.Enum, "store its .value or .name"),
+    ((set, frozenset), "use a list, such as sorted(value)"),
+    (complex, "use [value.real, value.imag] or a numpy array"),
+    (decimal.Decimal, "use float(value) or str(value)"),
+    ((datetime.datetime, datetime.date), "use value.timestamp(), integer nanoseconds, or value.isoformat()"),
+    (datetime.timedelta, "use value.total_seconds()"),
+    (np.ndarray, "add NumpyShip() to the interface's ships"),
+    ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
+)
+
+
+def _check_int(value: int, place: Path) -> int:
+    if not _LOWEST <= value <= _HIGHEST:
+        raise BadValue(
+            f"{show(place)}: the int {shorten(value)} is outside [-2**63, 2**64-1]; use str(value) or a float"
+        )
+    return value
+
+
+def _check_float(value: float, place: Path) -> float:
+    if not math.isfinite(value):
+        raise BadValue(f"{show(place)}: {value!r} is not JSON; use None, or a numpy array, which keeps it")
+    return value
+
+
+def _exact(value: float) -> Any:
+    text = exact_text(value)
+    return placeholders.inline_float(value) if text is None else orjson.Fragment(text)

@@ -1,0 +1,84 @@
+"""Decimal text for floats that RedisJSON reads back bit for bit.
+
+RedisJSON parses numbers the quick way: it collects up to 64 bits of digits, then multiplies or
+divides once by a power of ten. That is off by one unit in the last place for one long decimal in
+nine. Since the procedure is known, digits and exponent can be chosen so that its one rounding lands
+on the wanted float (and so that a correctly rounding parser lands there too). For about two floats
+in a thousand no such text exists; those are stored in hexadecimal, see `documents`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+
+__all__ = ["exact_text", "may_lose"]
+
+_POWERS = tuple(float(f"1e{k}") for k in range(309))
+_LIMIT = 2**64
+_LOG2_OF_10 = math.log2(10.0)
+
+# Up to 15 significant digits with a small exponent are parsed exactly. These find what may be longer;
+# both begin with a literal character, which the regular expression engine looks for at memory speed.
+_LONG = re.compile(rb"\.(?:\d{6}|(?<=\d{10}\.)\d)")
+_EXPONENT = re.compile(rb"e[-+]\d")
+
+
+def may_lose(text: bytes) -> bool:
+    """Return whether JSON `text` may hold a float that RedisJSON would change. False is certain."""
+    return (b"." in text and _LONG.search(text) is not None) or _EXPONENT.search(text) is not None
+
+
+def exact_text(value: float) -> bytes | None:
+    """Return JSON text that RedisJSON parses to exactly `value`, or None where there is none.
+
+    `value` must be finite.
+    """
+    size = abs(value)
+    digits, exponent = _shortest(size)
+    if _as_parsed(digits, exponent) == size:
+        return repr(value).encode()
+    found = _search(size)
+    if found is None:
+        return None
+    return b"%s%de%d" % (b"-" if value < 0 else b"", *found)
+
+
+def _shortest(size: float) -> tuple[int, int]:
+    """Return repr(size) as digits and power of ten."""
+    mantissa, _, power = repr(size).partition("e")
+    whole, _, fraction = mantissa.partition(".")
+    return int(whole + fraction), int(power or 0) - len(fraction)
+
+
+def _as_parsed(digits: int, exponent: int) -> float:
+    """Return what RedisJSON makes of `digits`e`exponent`; digits below 2**64."""
+    result = float(digits)
+    while exponent < -308:
+        result /= 1e308
+        exponent += 308
+    if exponent > 308:
+        return math.inf if digits else 0.0
+    return result * _POWERS[exponent] if exponent >= 0 else result / _POWERS[-exponent]
+
+
+def _search(size: float) -> tuple[int, int] | None:
+    """Return digits and exponent that are parsed to `size`, trying each power of ten that can work."""
+    bits = math.frexp(size)[1]
+    first = int((53 - bits) / _LOG2_OF_10)
+    for places in range(first - 2, first + 6):
+        scaled = _scale(size, places)
+        if not 1 <= scaled < _LIMIT:
+            continue
+        for near in (scaled, math.nextafter(scaled, 0.0), math.nextafter(scaled, math.inf)):
+            digits = int(near)
+            if digits < _LIMIT and _as_parsed(digits, -places) == size and float(f"{digits}e{-places}") == size:
+                return digits, -places
+    return None
+
+
+def _scale(size: float, places: int) -> float:
+    """Return size * 10**places, roughly, without overflow on the way."""
+    if places > 308:
+        return size * 1e308 * _POWERS[min(places - 308, 308)]
+    return size * _POWERS[places] if places >= 0 else size / _POWERS[min(-places, 308)]

@@ -1,0 +1,40 @@
+"""The names on the server: everything that belongs to one top-level key.
+
+The braces are Redis Cluster's hash tag: whatever carries the same tag lives on the same node, so
+that one transaction can hold it all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+__all__ = ["Keys", "keys_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The server-side names of one top-level key.
+
+    Attributes:
+        name: The key as the user knows it.
+        document: The RedisJSON document, namespace included.
+        tag: What every ship's key begins with: `{foo}`.
+        registry: The set of the suffixes of all ships' keys that exist.
+        channel: Where notices of updates are published.
+    """
+
+    name: str
+    document: str
+    tag: str
+    registry: str
+    channel: str
+
+
+@lru_cache(maxsize=4096)
+def keys_of(name: str, namespace: str = "", database: int = 0) -> Keys:
+    """Return the server-side names of the top-level key `name`."""
+    tag = "{" + namespace + name + "}"
+    # Channels are shared by all databases of a server, keys are not.
+    channel = f"{tag}:notices" + (f"@{database}" if database else "")
+    return Keys(name, namespace + name, tag, f"{tag}:ships", channel)

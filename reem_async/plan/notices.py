@@ -1,0 +1,132 @@
+"""Notices: what a publisher tells the subscribers of a top-level key about one update.
+
+A line of JSON, then, for small updates, the document text and the ships' bytes as they were sent to
+the server: nothing is serialized twice, and a subscriber needs no trip back. Larger updates are only
+announced. What arrives is not trusted: anything unexpected is refused as `BadData`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import orjson
+
+from ..errors import BadData
+from ..ships.registry import Ships
+from .paths import Path
+from .placeholders import MARK_BYTES, find
+from .writes import Loaded
+
+__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "with_value"]
+
+VERSION = 1
+LARGEST_INLINE = 1 << 14
+"""Bytes of value up to which it travels in the notice."""
+
+ANNOUNCED = object()
+"""In place of a value that is to be fetched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One update, as a subscriber got to know of it.
+
+    Attributes:
+        publisher: Who made it: an id that is unique per interface.
+        sequence: Counts this publisher's updates of this top-level key, from 1.
+        time: Seconds since 1970 on the publisher's clock.
+        path: What was updated, below the top-level key.
+        deleted: It was removed.
+        value: The value, or ANNOUNCED.
+    """
+
+    publisher: str
+    sequence: int
+    time: float
+    path: Path
+    deleted: bool
+    value: Any
+
+
+def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False) -> bytes:
+    """Return a notice without the value."""
+    return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], 0)
+
+
+def with_value(publisher: str, sequence: int, time: float, path: Path, text: bytes, loaded: Sequence[Loaded]) -> bytes:
+    """Return a notice with the value if it is small and made of fields, else without."""
+    size = len(text)
+    for each in loaded:
+        if each.fields is None:
+            return announce(publisher, sequence, time, path)
+        size += sum(len(content) for content in each.fields.values())
+    if size > LARGEST_INLINE:
+        return announce(publisher, sequence, time, path)
+    parts = [
+        [each.label, each.suffix, [[name, len(content)] for name, content in each.fields.items()]]
+        for each in loaded
+        if each.fields is not None
+    ]
+    body = [bytes(content) for each in loaded if each.fields for content in each.fields.values()]
+    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *body])
+
+
+def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
+    return orjson.dumps([VERSION, publisher, sequence, time, path, kind, size, parts]) + b"\n"
+
+
+def decode(payload: bytes, ships: Ships) -> Notice:
+    """Return the notice in `payload`.
+
+    Raises:
+        BadData: Not a notice of REEM, or one of a version this program does not know.
+    """
+    end = payload.find(b"\n")
+    try:
+        version, publisher, sequence, time, path, kind, size, parts = orjson.loads(payload[: max(end, 0)])
+    except (orjson.JSONDecodeError, ValueError, TypeError):
+        raise BadData(f"a notice begins with {payload[:60]!r}, which is not REEM's") from None
+    _check(version, publisher, sequence, time, path, kind, size, parts)
+    value: Any = ANNOUNCED
+    if kind == "set":
+        value = _value(payload, end + 1, size, parts, ships)
+    return Notice(publisher, sequence, float(time), tuple(path), kind == "delete", value)
+
+
+def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, kind: Any, size: Any, parts: Any) -> None:
+    if version != VERSION:
+        raise BadData(f"a notice has version {version!r}; this program knows {VERSION}: update reem")
+    sound = (
+        type(publisher) is str
+        and type(sequence) is int
+        and type(time) in (int, float)
+        and type(path) is list
+        and all(type(key) in (str, int) for key in path)
+        and kind in ("set", "look", "delete")
+        and type(size) is int
+        and size >= 0
+        and type(parts) is list
+    )
+    if not sound:
+        raise BadData("a notice has fields of wrong types; it was not written by REEM")
+
+
+def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships) -> Any:
+    """Return the value a notice carries: the tree, with what the ships make of their fields."""
+    text, position = payload[start : start + size], start + size
+    replies: dict[tuple[str, str], Any] = {}
+    try:
+        for label, suffix, fields in parts:
+            fetched = {}
+            for name, length in fields:
+                fetched[name.encode()] = payload[position : position + length]
+                position += length
+            replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([fetched])
+        holder = [orjson.loads(text)]
+        for crate in find(holder) if MARK_BYTES in text else ():
+            crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]
+    except (orjson.JSONDecodeError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise BadData(f"a notice holds a value that cannot be rebuilt: {error}") from None
+    return holder[0]

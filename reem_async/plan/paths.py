@@ -1,0 +1,183 @@
+"""Paths: where a value lives, as a tuple of keys and indexes.
+
+A path is never handled as text except at three borders: what a user types (`parse`), what a user
+reads in messages (`show`), and what the server is sent (`to_jsonpath`, `suffix`). Comparing paths
+means comparing tuples, so `foo` has nothing to do with `foobar`.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+import orjson
+
+from ..errors import BadKey, BadType
+
+__all__ = [
+    "Path", "below", "check_element", "check_top_key", "may_hold", "parse", "parse_suffix", "show",
+    "suffix", "to_jsonpath",
+]  # fmt: skip
+
+Path = tuple[str | int, ...]
+
+LONGEST_TOP_KEY = 512
+"""Bytes a top-level key may have in UTF-8."""
+
+_PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
+_TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)
+
+
+def check_element(key: object, parent: Path) -> str | int:
+    """Return `key` if it can be an element of a path, else raise.
+
+    Raises:
+        BadType: Neither a str nor an int.
+        BadKey: A str that the server's paths cannot address.
+    """
+    if isinstance(key, str):
+        if "\\" in key or ('"' in key and "'" in key) or not _encodable(key):
+            raise BadKey(
+                f"{show(parent)}: the key {shorten(key)} cannot be addressed by a path (it has a backslash, "
+                "both kinds of quotes, or half a surrogate pair); read or write the dict that holds it instead"
+            )
+        return str(key)
+    if isinstance(key, bool) or not hasattr(key, "__index__"):
+        raise BadType(
+            f"{show(parent)}: {shorten(key)} ({type(key).__name__}) is neither a key (str) nor a list index (int)"
+        )
+    return int(key.__index__())
+
+
+def check_top_key(key: object) -> str:
+    """Return `key` if it can name a top-level entry, else raise BadType or BadKey."""
+    if not isinstance(key, str):
+        raise BadType(f"the top-level key {shorten(key)} is not a str; use str(key)")
+    if not key:
+        raise BadKey("the top-level key is empty; give it a name")
+    if "{" in key or "}" in key:
+        raise BadKey(f"the top-level key {shorten(key)} has a brace; Redis Cluster uses them to place keys")
+    if not _encodable(key) or len(key.encode()) > LONGEST_TOP_KEY:
+        raise BadKey(f"the top-level key {shorten(key)} is over {LONGEST_TOP_KEY} bytes or not UTF-8; shorten it")
+    return str(key)
+
+
+def _encodable(text: str) -> bool:
+    try:
+        text.isascii() or text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def shorten(value: object, limit: int = 60) -> str:
+    """Return repr(value), cut to `limit` characters, for error messages."""
+    try:
+        text = repr(value)
+    except Exception:  # a broken __repr__ must not hide the real error
+        text = f"<{type(value).__name__}>"
+    return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+@lru_cache(maxsize=4096)
+def to_jsonpath(path: Path) -> str:
+    """Return the JSONPath below the document's root, every element quoted: `$["a"][0]`.
+
+    The server takes what stands between the quotes as it is, so nothing is escaped; `check_element`
+    has refused what could end the quotes early.
+    """
+    return "$" + "".join(_bracket(key) for key in path)
+
+
+def _bracket(key: str | int) -> str:
+    if isinstance(key, int):
+        return f"[{key}]"
+    return f"['{key}']" if '"' in key else f'["{key}"]'
+
+
+@lru_cache(maxsize=4096)
+def suffix(path: Path) -> str:
+    """Return the text form of a path below a top-level key: `.bar.image`, `.tiles[0]`, `["a.b"]`."""
+    return "".join(_step(key) for key in path)
+
+
+def _step(key: str | int) -> str:
+    if isinstance(key, int):
+        return f"[{key}]"
+    return f".{key}" if _PLAIN.fullmatch(key) else f"[{orjson.dumps(key).decode()}]"
+
+
+@lru_cache(maxsize=4096)
+def parse_suffix(text: str) -> Path:
+    """Return the path that `suffix` turned into `text`; what follows a `~` only makes a name unique.
+
+    Raises:
+        BadKey: Not the text form of a path.
+    """
+    position, path = 0, []
+    while position < len(text) and text[position] != "~":
+        token = _TOKEN.match(text, position)
+        if token is None:
+            raise BadKey(f"{shorten(text)} is not a path, at character {position}; write it like foo.bar[0]")
+        path.append(_element(token))
+        position = token.end()
+    return tuple(path)
+
+
+def _element(token: re.Match[str]) -> str | int:
+    if token["index"] is not None:
+        return int(token["index"])
+    if token["quoted"] is None:
+        return token["plain"]
+    try:
+        key: str = orjson.loads(token["quoted"])
+    except orjson.JSONDecodeError:
+        raise BadKey(f"{shorten(token['quoted'])} is not a quoted key") from None
+    return key
+
+
+def parse(text: str) -> Path:
+    """Return the path a user typed: `foo.bar`, `foo.tiles[2]`, `.a.b`; "." and "" are the root.
+
+    Raises:
+        BadKey: Not a path, or with a key that cannot be addressed.
+    """
+    if not isinstance(text, str):
+        raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
+    if text in ("", "."):
+        return ()
+    tail = text if text[0] in ".[" else "." + text
+    if "~" in tail or tail.endswith(".") or ".." in tail:
+        # `~` is only special in names on the server; a user's plain key may have it.
+        return tuple(check_element(key, ()) for key in _split_plain(tail))
+    return tuple(check_element(key, ()) for key in parse_suffix(tail))
+
+
+def _split_plain(text: str) -> list[str]:
+    keys = text[1:].split(".")
+    if not all(keys) or any("[" in key for key in keys):
+        raise BadKey(f"{shorten(text)} has an empty or unclear element; use store['a']['b'] for such keys")
+    return keys
+
+
+def show(path: Path) -> str:
+    """Return a full path, top-level key first, the way people write it: `foo.bar[0]`."""
+    if not path:
+        return "(root)"
+    return str(path[0]) + suffix(path[1:])
+
+
+def below(path: Path, ancestor: Path) -> bool:
+    """Return whether `path` is `ancestor` itself or anything inside it."""
+    return path[: len(ancestor)] == ancestor
+
+
+def may_hold(written: Path, member: Path) -> bool:
+    """Return whether a write at `written` may have replaced what was stored when `member` was named.
+
+    Indexes count as equal: deleting from a list moves its items, their names stay.
+    """
+    return len(written) <= len(member) and all(
+        ours == theirs or (isinstance(ours, int) and isinstance(theirs, int))
+        for ours, theirs in zip(written, member, strict=False)
+    )

@@ -1,0 +1,119 @@
+"""What stands in a document where a value is not JSON: a string that says what is there.
+
+    $ship numpy .image 7372800 float64[640,480,3]
+    |     |     |      |       what it is, for people
+    |     |     |      bytes, so that a reader can choose how to fetch it
+    |     |     the key that holds it, after the tag {foo}
+    |     the label of the ship that wrote it
+    the mark
+
+A string, since a path can lead into an object and a write could then change a placeholder's inside;
+nothing leads into a string. Two labels are REEM's own and hold their value in place: `text` for a
+user's string that begins with the mark, `float` for a float no decimal text of which survives.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote, unquote
+
+from ..errors import BadData
+from .paths import shorten
+
+__all__ = ["INLINE_LABELS", "MARK", "Crate", "Placeholder", "find", "inline_float", "inline_text", "parse"]  # fmt: skip
+
+MARK = "$ship "
+MARK_BYTES = b"$ship "
+INLINE_LABELS = frozenset({"text", "float"})
+
+
+@dataclass(frozen=True, slots=True)
+class Placeholder:
+    """What a document says of a value that a ship holds under a key of its own.
+
+    Attributes:
+        label: The ship's label.
+        suffix: The key's name after the tag.
+        size: Bytes of the value, 0 where the ship does not say.
+        summary: What it is, for people: `float64[640,480,3]`.
+    """
+
+    label: str
+    suffix: str
+    size: int = 0
+    summary: str = ""
+
+    def __str__(self) -> str:
+        words = [MARK[:-1], quote(self.label, safe=_SAFE), quote(self.suffix, safe=_SAFE), str(self.size)]
+        return " ".join([*words, self.summary] if self.summary else words)
+
+
+# Everything but blanks, controls and the percent sign stays readable.
+_SAFE = "".join(chr(code) for code in range(33, 127) if chr(code) != "%")
+
+
+@dataclass(slots=True)
+class Crate:
+    """A placeholder found in a decoded tree, and where: `container[key]` is to be replaced."""
+
+    placeholder: Placeholder
+    container: Any
+    key: Any
+
+
+def inline_text(text: str) -> str:
+    """Return the placeholder of a user's string that looks like one."""
+    return f"{MARK}text {text}"
+
+
+def inline_float(value: float) -> str:
+    """Return the placeholder of a float that no decimal text carries."""
+    return f"{MARK}float {value.hex()}"
+
+
+def parse(text: str) -> Placeholder | str | float:
+    """Return what the string `text`, which begins with the mark, stands for.
+
+    Raises:
+        BadData: Not what REEM writes.
+    """
+    label, _, rest = text[len(MARK) :].partition(" ")
+    if label == "text":
+        return rest
+    if label == "float":
+        return _parse_float(rest)
+    words = rest.split(" ", 2)
+    if not label or len(words) < 2 or not words[1].isascii() or not words[1].isdigit() or len(words[1]) > 18:
+        raise BadData(f"the server holds {shorten(text)}, which looks like a placeholder of REEM but is none")
+    return Placeholder(unquote(label), unquote(words[0]), int(words[1]), words[2] if len(words) > 2 else "")
+
+
+def _parse_float(text: str) -> float:
+    try:
+        return float.fromhex(text)
+    except (ValueError, OverflowError):
+        raise BadData(f"the server holds the float {shorten(text)}, which is not hexadecimal") from None
+
+
+def find(holder: list[Any]) -> list[Crate]:
+    """Resolve what stands in place inside `holder` and return the placeholders that are left.
+
+    `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
+    every node, so callers look for the mark in the text first.
+    """
+    crates: list[Crate] = []
+    stack: list[Any] = [holder]
+    while stack:
+        container = stack.pop()
+        for key, value in container.items() if type(container) is dict else enumerate(container):
+            kind = type(value)
+            if kind is dict or kind is list:
+                stack.append(value)
+            elif kind is str and value.startswith(MARK):
+                meaning = parse(value)
+                if type(meaning) is Placeholder:
+                    crates.append(Crate(meaning, container, key))
+                else:
+                    container[key] = meaning
+    return crates

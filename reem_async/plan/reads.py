@@ -1,0 +1,193 @@
+"""Plans that read: one command for plain JSON, one transaction where ships hold a part.
+
+A transaction is what makes document and arrays of one instant. Which arrays to ask for is known
+from the last read; the placeholders in the reply say whether that guess was right. If not, the
+read is done again with what they name: a mixture is never returned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..errors import BadType, Conflict
+from ..ships.registry import Registered, Ships
+from . import Command, Plan, Reply
+from .keys import Keys
+from .memory import Memory
+from .paths import Path, show, to_jsonpath
+from .placeholders import MARK_BYTES, Crate, Placeholder, find
+from .replies import checked, full, loads, missing, type_name
+
+__all__ = ["BULK", "Sealed", "length", "read", "type_of"]
+
+BULK = 1 << 16
+"""Bytes from which a reply is asked for on a connection of its own."""
+
+_TRIES = 50
+
+
+@dataclass(slots=True)
+class Sealed:
+    """What a read brought, ships' replies not yet interpreted.
+
+    Attributes:
+        holder: A list of one: the tree, with placeholders where `crates` says.
+        crates: Where each ship's value goes, the ship, and the reply to interpret.
+        commands: What was asked in the end, and
+        raw: what was received for it, to tell later whether anything changed.
+    """
+
+    holder: list[Any]
+    crates: list[tuple[Crate, Registered, Reply]] = field(default_factory=list)
+    commands: tuple[Command, ...] = ()
+    raw: tuple[Any, ...] = ()
+
+
+def get_command(keys: Keys, path: Path) -> Command:
+    """Return the command that fetches the JSON at `path`."""
+    return ("JSON.GET", keys.document, to_jsonpath(path))
+
+
+def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
+    """Plan to read the value at `path`; the result is `Sealed`, or MissingKey is raised.
+
+    One round trip, if the arrays there are those the last read met; else two or more.
+    """
+    known = memory.layout(keys.document, path)
+    if known:
+        return _Fetch(keys, path, ships, memory, known).plan()
+
+    command = get_command(keys, path)
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        text = present(replies[0], keys, path)
+        holder = loads(text, keys)
+        crates = find(holder) if MARK_BYTES in text else []
+        if not crates:
+            return Sealed(holder, [], (command,), (text,))
+        return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
+
+    return Plan([command], decode)
+
+
+def present(reply: Reply, keys: Keys, path: Path) -> bytes:
+    """Return the text of a reply to JSON.GET; raise MissingKey if there is nothing."""
+    text: bytes | None = checked(reply, keys, path)
+    if text is None or text == b"[]":
+        raise missing(keys, path)
+    return text
+
+
+@dataclass(slots=True)
+class _Fetch:
+    """Reads document and ships' keys in one transaction, again if the guess was wrong."""
+
+    keys: Keys
+    path: Path
+    ships: Ships
+    memory: Memory
+    wanted: tuple[Placeholder, ...]
+    tries: int = 0
+
+    def plan(self) -> Plan:
+        where = show(full(self.keys, self.path))
+        asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in self.wanted}
+        reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
+        commands = (get_command(self.keys, self.path), *reads)
+        bulk = sum(each.size for each in self.wanted) >= BULK
+        return Plan(
+            commands,
+            lambda replies: self._decode(asked, commands, replies),
+            atomic=True,
+            bulk=bulk,
+        )
+
+    def _decode(
+        self,
+        asked: dict[tuple[str, str], Registered],
+        commands: tuple[Command, ...],
+        replies: Sequence[Reply],
+    ) -> Any:
+        text = present(replies[0], self.keys, self.path)
+        holder = loads(text, self.keys)
+        crates = find(holder)
+        met = tuple(crate.placeholder for crate in crates)
+        if met != self.wanted:
+            self.memory.saw_layout(self.keys.document, self.path, met)
+        got = dict(zip(asked, replies[1:], strict=True))
+        if any((each.label, each.suffix) not in got for each in met):
+            return self._again(met)
+        crated = [
+            (crate, asked[place], checked(got[place], self.keys, self.path))
+            for crate in crates
+            for place in [(crate.placeholder.label, crate.placeholder.suffix)]
+        ]
+        return Sealed(holder, crated, commands, (text, *replies[1:]))
+
+    def _again(self, met: tuple[Placeholder, ...]) -> Plan:
+        self.tries += 1
+        if self.tries > _TRIES:
+            raise Conflict(
+                f"{show(full(self.keys, self.path))} changed its shape {_TRIES} times while it was read; read again"
+            )
+        self.wanted = met
+        return self.plan()
+
+
+def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
+    """Plan to find the Python type at `path`: one round trip, two for what is text on the server.
+
+    The result is None where only reading the value can tell.
+    """
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        name = type_name(checked(replies[0], keys, path))
+        if name is None:
+            raise missing(keys, path)
+        return _PYTHON_TYPES.get(name) or Plan([get_command(keys, path)], decode_text)
+
+    def decode_text(replies: Sequence[Reply]) -> Any:
+        holder = loads(present(replies[0], keys, path), keys)
+        crates = find(holder)
+        if not crates:
+            return type(holder[0])
+        return ships.labelled(crates[0].placeholder.label, show(full(keys, path))).carries
+
+    return Plan([("JSON.TYPE", keys.document, to_jsonpath(path))], decode)
+
+
+_PYTHON_TYPES = {
+    "object": dict,
+    "array": list,
+    "integer": int,
+    "number": float,
+    "boolean": bool,
+    "null": type(None),
+}
+
+
+def length(keys: Keys, path: Path) -> Plan:
+    """Plan to find the length of a dict or list in one round trip; the result is None for anything else."""
+    place = to_jsonpath(path)
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        if type_name(checked(replies[0], keys, path)) is None:
+            raise missing(keys, path)
+        counts = [reply[0] for reply in replies[1:] if isinstance(reply, list) and reply]
+        return next((count for count in counts if count is not None), None)
+
+    return Plan(
+        [
+            ("JSON.TYPE", keys.document, place),
+            ("JSON.OBJLEN", keys.document, place),
+            ("JSON.ARRLEN", keys.document, place),
+        ],
+        decode,
+    )
+
+
+def not_sized(keys: Keys, path: Path, value: Any) -> BadType:
+    """Return the error for len() of what has none."""
+    return BadType(f"{show(full(keys, path))} is of type {type(value).__name__} and has no length")

@@ -1,0 +1,74 @@
+"""Local copies of documents: trees that are never changed, only replaced.
+
+An update makes new containers along its path and shares the rest, so a reader that holds the old
+tree keeps seeing the old instant. The rules are those of the server, so that a copy that follows
+every update stays equal to the document.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from .paths import Path
+
+__all__ = ["MISSING", "CannotApply", "copied", "get", "removed", "replaced"]
+
+
+class _Missing:
+    def __repr__(self) -> str:
+        return "MISSING"
+
+
+MISSING: Final = _Missing()
+"""Stands for a tree or a value that is not there."""
+
+
+class CannotApply(Exception):
+    """The update does not fit the tree: its parent is not there or cannot hold it."""
+
+
+def get(tree: Any, path: Path) -> Any:
+    """Return what is at `path`, or MISSING."""
+    for key in path:
+        if isinstance(key, str):
+            tree = tree.get(key, MISSING) if type(tree) is dict else MISSING
+        else:
+            tree = tree[key] if type(tree) is list and -len(tree) <= key < len(tree) else MISSING
+    return tree
+
+
+def replaced(tree: Any, path: Path, value: Any) -> Any:
+    """Return `tree` with `value` at `path`; raise CannotApply where the server would refuse."""
+    if not path:
+        return value
+    key, rest = path[0], path[1:]
+    if isinstance(key, str) and type(tree) is dict:
+        if rest and key not in tree:
+            raise CannotApply
+        return {**tree, key: replaced(tree.get(key), rest, value)}
+    if isinstance(key, int) and type(tree) is list and -len(tree) <= key < len(tree):
+        items = tree.copy()
+        items[key] = replaced(items[key], rest, value)
+        return items
+    raise CannotApply
+
+
+def removed(tree: Any, path: Path) -> Any:
+    """Return `tree` without what is at `path`; unchanged if nothing is there."""
+    if get(tree, path) is MISSING:
+        return tree
+    if not path:
+        return MISSING
+    parent = get(tree, path[:-1]).copy()
+    del parent[path[-1]]
+    return replaced(tree, path[:-1], parent)
+
+
+def copied(tree: Any) -> Any:
+    """Return `tree` with containers of its own, for a user to keep; leaves (arrays too) are shared."""
+    kind = type(tree)
+    if kind is dict:
+        return {key: copied(value) for key, value in tree.items()}
+    if kind is list:
+        return [copied(item) for item in tree]
+    return tree

@@ -1,0 +1,314 @@
+"""Plans that write: document, ships' keys and registry change together or not at all.
+
+Every key a ship fills is entered in a registry set, so that what a write replaces can be found and
+removed. Most of it goes in the write's own transaction: what was known to be there, below a path
+without list indexes, can only be referred to from there. What nobody here knew of (another client
+changed the shape meanwhile) shows in the registry, which the same round trip returns, and is then
+removed under WATCH, after a look at what the document refers to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import BadType, Conflict, MissingKey, PartialWrite
+from . import Command, Plan, Reply
+from .keys import Keys
+from .memory import Memory
+from .paths import Path, below, may_hold, parse_suffix, show, to_jsonpath
+from .placeholders import find
+from .reads import get_command
+from .replies import checked, diagnose, explained, full, loads
+
+__all__ = [
+    "Change",
+    "Loaded",
+    "append_change",
+    "change",
+    "delete_change",
+    "exchange",
+    "make_parents",
+    "set_change",
+    "static_change",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Loaded:
+    """A parcel ready to go: the commands its ship recorded.
+
+    Attributes:
+        suffix: The key's name after the tag.
+        label: The ship's label.
+        commands: What stores it.
+        fields: Its bytes by name, where the ship works that way: they can travel in a notice.
+    """
+
+    suffix: str
+    label: str
+    commands: tuple[Command, ...]
+    fields: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One change of a document.
+
+    Attributes:
+        keys: The document's names.
+        path: What is changed, below the top-level key.
+        command: The JSON command that does it.
+        judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
+        loaded: What goes by ship.
+        replaces: Whether what was at `path` is gone afterwards.
+        notice: What to publish in the same transaction, None for nothing.
+        retraction: What to publish if the server refuses the change after all.
+    """
+
+    keys: Keys
+    path: Path
+    command: Command
+    judge: Callable[[Reply], Any]
+    loaded: tuple[Loaded, ...] = ()
+    replaces: bool = True
+    notice: Sequence[Any] | None = None
+    retraction: Sequence[Any] | None = None
+
+
+REFUSED = object()
+"""The server did nothing and did not say why."""
+
+
+def set_change(keys: Keys, path: Path, text: bytes, loaded: tuple[Loaded, ...], **notices: Any) -> Change:
+    """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
+
+    def judge(reply: Reply) -> Any:
+        return REFUSED if reply is None else None
+
+    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), judge, loaded, **notices)
+
+
+def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
+    """Return the change that removes what is at `path`; raises MissingKey if nothing is there."""
+
+    def judge(reply: Reply) -> Any:
+        if reply == 0:
+            raise MissingKey(f"nothing is stored at {show(full(keys, path))}; nothing was deleted")
+        return None
+
+    return Change(keys, path, ("JSON.DEL", keys.document, to_jsonpath(path)), judge, **notices)
+
+
+def append_change(keys: Keys, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...], **notices: Any) -> Change:
+    """Return the change that appends to the list at `path`; raises MissingKey or BadType if there is none."""
+    where = show(full(keys, path))
+
+    def judge(reply: Reply) -> Any:
+        if reply == []:
+            raise MissingKey(f"nothing is stored at {where}; write a list there first")
+        if reply == [None]:
+            raise BadType(f"{where} is not a list; only lists can be appended to")
+        return None
+
+    command = ("JSON.ARRAPPEND", keys.document, to_jsonpath(path), *texts)
+    return Change(keys, path, command, judge, loaded, replaces=False, **notices)
+
+
+def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
+    """Plan one change, in one round trip unless somebody else changed the shape meanwhile.
+
+    Args:
+        it: The change.
+        memory: What is known of the server.
+        held: The connection watches keys.
+        given_up: Gives the next plan if a watched key changed.
+    """
+    stale = _stale(it, memory) if it.replaces else []
+    before = _clearing(it, stale)
+    writes = [command for each in it.loaded for command in each.commands]
+    after: list[Command] = [("SMEMBERS", it.keys.registry)]
+    if it.loaded:
+        after.insert(0, ("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
+    if it.notice is not None:
+        after.append(("PUBLISH", it.keys.channel, *it.notice))
+    commands = [*before, *writes, it.command, *after]
+    main = len(before) + len(writes)
+
+    def decode(replies: Sequence[Reply] | None) -> Any:
+        if replies is None:
+            assert given_up is not None  # only watched transactions are given up
+            return given_up()
+        return _Outcome(it, memory, commands, replies, main).next()
+
+    return Plan(commands, decode, atomic=len(commands) > 2 or held, held=held)
+
+
+def _stale(it: Change, memory: Memory) -> list[bytes]:
+    """Return the known keys that only what is replaced can refer to, and that are not written again."""
+    if any(isinstance(key, int) for key in it.path):
+        return []
+    written = {each.suffix.encode() for each in it.loaded}
+    known = memory.members(it.keys.document)
+    return [member for member in known if member not in written and below(parse_suffix(member.decode()), it.path)]
+
+
+def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
+    """Return the commands that make room: no leftovers, and no foreign type under a ship's key."""
+    tag = it.keys.tag.encode()
+    gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.loaded]
+    commands: list[Command] = [("UNLINK", *gone)] if gone else []
+    if stale:
+        commands.append(("SREM", it.keys.registry, *stale))
+    return commands
+
+
+@dataclass(slots=True)
+class _Outcome:
+    """What became of a change: the result, or the next plan that puts things right and then says so."""
+
+    it: Change
+    memory: Memory
+    commands: Sequence[Command]
+    replies: Sequence[Reply]
+    main: int
+
+    def next(self) -> Any:
+        members = self._members()
+        judged = self._judged()
+        refused = judged is REFUSED or isinstance(judged, Exception)
+        if refused and self.it.retraction is not None:
+            return Plan(
+                [("PUBLISH", self.it.keys.channel, *self.it.retraction)],
+                lambda _: self._settle(members, judged),
+            )
+        return self._settle(members, judged)
+
+    def _members(self) -> frozenset[bytes]:
+        """Return what the registry held right after the change."""
+        place = self.main + (2 if self.it.loaded else 1)
+        members = frozenset(checked(self.replies[place], self.it.keys, self.it.path))
+        self.memory.saw_members(self.it.keys.document, members)
+        return members
+
+    def _judged(self) -> Any:
+        """Return the result, REFUSED, or the error to raise."""
+        reply = self.replies[self.main]
+        if isinstance(reply, Exception):
+            return explained(reply, self.it.keys, self.it.path)
+        failed = [
+            (command, other)
+            for command, other in zip(self.commands, self.replies, strict=True)
+            if isinstance(other, Exception)
+        ]
+        if failed:
+            return self._partial(*failed[0])
+        try:
+            return self.it.judge(reply)
+        except Exception as error:
+            return error
+
+    def _partial(self, command: Command, error: Exception) -> PartialWrite:
+        where = show(full(self.it.keys, self.it.path))
+        return PartialWrite(
+            f"{where}: the document was written, but the server refused {command[0]} {command[1]!s:.60}: {error}; "
+            "what this command should have stored cannot be read: write again"
+        )
+
+    def _settle(self, members: frozenset[bytes], judged: Any) -> Any:
+        if self._suspects(members, judged):
+            return clean(self.it.keys, self.memory, lambda: self._finish(judged))
+        return self._finish(judged)
+
+    def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
+        """Return whether a key may exist that the document does not refer to."""
+        written = {each.suffix.encode() for each in self.it.loaded}
+        if judged is REFUSED or isinstance(judged, Exception):
+            return bool(written)
+        return self.it.replaces and any(
+            member not in written and may_hold(self.it.path, parse_suffix(member.decode())) for member in members
+        )
+
+    def _finish(self, judged: Any) -> Any:
+        if judged is REFUSED:
+            return diagnose(self.it.keys, self.it.path)
+        if isinstance(judged, Exception):
+            raise judged
+        return judged
+
+
+def make_parents(keys: Keys, path: Path) -> Plan:
+    """Plan to put an empty dict wherever a parent of `path` is missing; leaves everything else alone."""
+    prefixes = [path[:length] for length in range(len(path))]
+    commands = [("JSON.SET", keys.document, to_jsonpath(prefix), b"{}", "NX") for prefix in prefixes]
+
+    def decode(replies: Sequence[Reply]) -> None:
+        for prefix, reply in zip(prefixes, replies, strict=True):
+            checked(reply, keys, prefix)
+
+    return Plan(commands, decode)
+
+
+def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
+    """Plan to remove the ships' keys that the document does not refer to, then go on with `then`.
+
+    Looks and removes under WATCH: if anybody writes to the document in between, it looks again.
+    """
+
+    def look(replies: Sequence[Reply]) -> Any:
+        _, text, reply = (checked(each, keys, ()) for each in replies)
+        members = frozenset(reply)
+        used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys))} if text else set()
+        orphans = sorted(members - used)
+        memory.saw_members(keys.document, members)
+        if not orphans:
+            return Plan([("UNWATCH",)], lambda _: then(), held=True)
+        tag = keys.tag.encode()
+        removal = [("UNLINK", *(tag + orphan for orphan in orphans)), ("SREM", keys.registry, *orphans)]
+        return Plan(removal, lambda replies: remove(replies, members - frozenset(orphans)), atomic=True, held=True)
+
+    def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
+        if replies is None:
+            return clean(keys, memory, then)
+        memory.saw_members(keys.document, left)
+        return then()
+
+    commands = [("WATCH", keys.document, keys.registry), get_command(keys, ()), ("SMEMBERS", keys.registry)]
+    return Plan(commands, look, held=True)
+
+
+def static_change(it: Change) -> Plan:
+    """Plan a change whose shape is vouched for: no look at what it may replace, in one round trip."""
+    commands: list[Command] = [command for each in it.loaded for command in each.commands]
+    main = len(commands)
+    commands.append(it.command)
+    if it.notice is not None:
+        commands.append(("PUBLISH", it.keys.channel, *it.notice))
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        for reply in replies:
+            checked(reply, it.keys, it.path)
+        judged = it.judge(replies[main])
+        return diagnose(it.keys, it.path) if judged is REFUSED else judged
+
+    return Plan(commands, decode, atomic=len(commands) > 1)
+
+
+def exchange(it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory) -> Plan:
+    """Plan a change that is made only if what `reads` fetch is still `before`.
+
+    Raises (in decode):
+        Conflict: It is not; nothing was written.
+    """
+    where = show(full(it.keys, it.path))
+
+    def compare(replies: Sequence[Reply]) -> Any:
+        if tuple(replies[1:]) == before:
+            return change(it, memory, held=True, given_up=lambda: exchange(it, reads, before, memory))
+        return Plan([("UNWATCH",)], refuse, held=True)
+
+    def refuse(_: Sequence[Reply]) -> Any:
+        raise Conflict(f"{where} was changed by somebody else while it was edited; nothing was written: edit it again")
+
+    return Plan([("WATCH", it.keys.document, it.keys.registry), *reads], compare, held=True)

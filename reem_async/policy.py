@@ -1,0 +1,119 @@
+"""What a subscriber keeps when updates come faster than they are taken."""
+
+from __future__ import annotations
+
+import collections
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from .errors import BadValue, QueueFull
+
+__all__ = ["EMPTY", "Ended", "Every", "Last", "Mailbox", "Newest", "Policy"]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """How many updates wait at most, and what happens to the next one. Use one of the subclasses.
+
+    Attributes:
+        bound: How many updates may wait.
+        fails: More than that end the iterator with QueueFull; else the oldest is dropped.
+    """
+
+    bound: int
+    fails = False
+
+    def __post_init__(self) -> None:
+        if self.bound < 1:
+            raise BadValue(f"{type(self).__name__}({self.bound}) keeps nothing; use at least 1")
+
+
+@dataclass(frozen=True)
+class Newest(Policy):
+    """Keep only the newest update: a slow loop skips what is out of date."""
+
+    bound: int = 1
+
+
+@dataclass(frozen=True)
+class Last(Policy):
+    """Keep the last `bound` updates and drop older ones."""
+
+
+@dataclass(frozen=True)
+class Every(Policy):
+    """Keep every update, up to `bound`; one more raises QueueFull in the loop that should take them."""
+
+    fails = True
+
+
+class Ended(Exception):
+    """The queue was closed and all of it was taken."""
+
+
+EMPTY: Any = object()
+"""What `Mailbox.take` returns when nothing waits."""
+
+
+class Mailbox:
+    """The queue between the event loop, which puts updates in, and whoever takes them out.
+
+    Attributes:
+        dropped: How many updates were put in and will never be taken out.
+        wake: Called after each change, from the putting thread.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._items: collections.deque[Any] = collections.deque()
+        self._lock = threading.Lock()
+        self._end: BaseException | None = None
+        self.dropped = 0
+        self.wake: Callable[[], None] = lambda: None
+
+    def put(self, update: Any) -> None:
+        """Add an update, dropping or failing as the policy says."""
+        with self._lock:
+            if self._end is not None:
+                return
+            if len(self._items) >= self._policy.bound:
+                self.dropped += 1
+                if self._policy.fails:
+                    self._end = QueueFull(
+                        f"over {self._policy.bound} updates waited; take them faster, use a larger bound, "
+                        "or Last(n), which drops the oldest"
+                    )
+                    self.wake()
+                    return
+                self._items.popleft()
+            self._items.append(update)
+        self.wake()
+
+    def take(self) -> Any:
+        """Return the oldest update that waits, or EMPTY; raises Ended after the last, or QueueFull."""
+        with self._lock:
+            if self._items:
+                return self._items.popleft()
+            if self._end is not None:
+                raise self._end
+        return EMPTY
+
+    def take_waiting(self) -> Any:
+        """As `take`, but block this thread until there is something. One thread at a time."""
+        changed = threading.Event()
+        self.wake = changed.set
+        while True:
+            changed.clear()
+            item = self.take()
+            if item is not EMPTY:
+                return item
+            changed.wait()
+
+    def close(self) -> None:
+        """End the queue after what waits."""
+        with self._lock:
+            if self._end is None:
+                self._end = Ended()
+        self.wake()

@@ -1,0 +1,121 @@
+"""Publishing: a write and its notice in one transaction."""
+
+from __future__ import annotations
+
+import builtins
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+from .accessor import Accessor
+from .errors import WriteOnly
+from .plan import Command
+from .plan.documents import Encoded
+from .plan.notices import announce, with_value
+from .plan.paths import Path, show
+from .plan.reads import Sealed
+from .plan.writes import Change, Loaded, append_change, change, delete_change, set_change
+from .store import KeyValueStore, Writer
+
+__all__ = ["PublishAccessor", "PublishSpace", "Publisher"]
+
+
+class Publisher(Writer):
+    """Writes one top-level key and tells its subscribers, in the same transaction.
+
+    Updates of one interface to one top-level key are numbered and arrive in this order, so such
+    calls wait for each other; those to different keys do not.
+    """
+
+    async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+        async with self.interface.transport.ordered(self.keys.channel):
+            notice = with_value(*self._stamp(path), encoded.text, loaded)
+            it = set_change(
+                self.keys,
+                path,
+                encoded.text,
+                loaded,
+                notice=(notice,),
+                retraction=(announce(*self._stamp(path)),),
+            )
+            await self.interface.run(self._plan(it))
+
+    async def delete(self, path: Path) -> None:
+        """Remove what is at `path` and tell the subscribers."""
+        async with self.interface.transport.ordered(self.keys.channel):
+            it = delete_change(self.keys, path, notice=(announce(*self._stamp(path), deleted=True),))
+            await self.interface.run(change(it, self.interface.memory))
+
+    async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
+        async with self.interface.transport.ordered(self.keys.channel):
+            it = append_change(self.keys, path, texts, loaded, notice=(announce(*self._stamp(path)),))
+            await self.interface.run(change(it, self.interface.memory))
+
+    async def _run(self, path: Path, plan: Callable[[Sequence[Command]], Any]) -> Any:
+        async with self.interface.transport.ordered(self.keys.channel):
+            notice: Command = ("PUBLISH", self.keys.channel, announce(*self._stamp(path)))
+            return await self.interface.run(plan((notice,)))
+
+    async def _exchange(self, it: Change, before: Sealed) -> None:
+        raise WriteOnly(_cannot_read((self.top_key_name, *it.path)))
+
+    def _stamp(self, path: Path) -> tuple[str, int, float, Path]:
+        return self.interface.publisher_id, self.interface.next_sequence(self.keys), time.time(), path
+
+
+def _cannot_read(path: Path) -> str:
+    return (
+        f"{show(path)}: a PublishSpace can only be written; read through KeyValueStore(interface), "
+        "or follow it with a subscriber"
+    )
+
+
+class PublishAccessor(Accessor):
+    """One place of a PublishSpace: as `Accessor`, but what would read raises WriteOnly."""
+
+    __slots__ = ()
+
+    def _refuse(self) -> NoReturn:
+        raise WriteOnly(_cannot_read(self.full_path))
+
+    async def read(self) -> Any:
+        """Raise WriteOnly."""
+        self._refuse()
+
+    async def get(self, *default: Any) -> Any:
+        """Raise WriteOnly."""
+        self._refuse()
+
+    async def length(self) -> int:
+        """Raise WriteOnly."""
+        self._refuse()
+
+    async def type(self) -> builtins.type:
+        """Raise WriteOnly."""
+        self._refuse()
+
+    def edit(self) -> NoReturn:
+        """Raise WriteOnly."""
+        self._refuse()
+
+    def watch(self, policy: Any = None) -> NoReturn:
+        """Raise WriteOnly."""
+        self._refuse()
+
+
+class PublishSpace(KeyValueStore):
+    """A store that can only be written, and whose subscribers are told of every change.
+
+    Written like a `KeyValueStore`. A change and its notice are one transaction; a small value
+    travels in the notice, a large one is announced and subscribers fetch the newest.
+
+    Args:
+        interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.
+    """
+
+    _accessor = PublishAccessor
+    _writer = Publisher
+
+    async def get(self, path: str, default: Any = None) -> Any:
+        """Raise WriteOnly."""
+        await self.at(path).read()

@@ -1,0 +1,211 @@
+"""A private, real server inside a program: for scripts, tests, demonstrations and single robots."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import threading
+import weakref
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import quote
+
+import anyio
+import anyio.to_thread
+
+from reem_async._server_process import HOST, PortTaken, ServerProcess
+from reem_async._server_programs import find_program
+from reem_async.errors import BadValue, Misuse, ServerFailed
+
+__all__ = ["EmbeddedServer"]
+
+ATTEMPTS = 10  # to find a port that nobody takes in the moment before the server does
+PASSWORD_BYTES = 512  # the server's own limit
+
+
+class EmbeddedServer:
+    """A Redis-compatible server with JSON that belongs to this program and ends with it, however it ends.
+
+        with EmbeddedServer() as server:          # or: async with
+            kvs = KeyValueStore(RedisInterface(server.url))
+
+    It listens on 127.0.0.1 and on a unix socket that only this user can open. Several run side by side.
+    One object serves blocking and asyncio programs, and any thread; a forked child may use the server, but
+    does not own it: there, `start` and `stop` do nothing.
+
+    The program that runs is the first of: `$REEM_SERVER` (a path); a `redis-server` or `valkey-server` on
+    PATH with JSON; the extra `reem[server]`. The extra is Valkey (BSD licence) and the RedisJSON module,
+    which is under RSALv2/SSPL: free to use, but not to be offered to others as a managed service.
+
+    Everybody who can log in to this machine can connect to the port: set a password if that is not you alone.
+    """
+
+    def __init__(
+        self,
+        port: int = 0,
+        directory: str | os.PathLike[str] | None = None,
+        password: str | None = None,
+    ) -> None:
+        """Prepare a server; `start` or a `with` block starts it.
+
+        Args:
+            port: TCP port on 127.0.0.1; 0 takes a free one.
+            directory: where the data is kept from one start to the next; made if missing. None keeps it in
+                memory, and it is gone with the server.
+            password: what every client has to give, on the unix socket too.
+
+        Raises:
+            BadValue: a port or password that no server takes.
+        """
+        if not 0 <= port <= 65535:
+            raise BadValue(f"port {port} is not in 0..65535")
+        if password is not None and not 0 < len(password.encode()) <= PASSWORD_BYTES:
+            raise BadValue(f"a password has 1 to {PASSWORD_BYTES} bytes; None means that there is none")
+        if password is not None and "\0" in password:
+            raise BadValue("a password cannot contain NUL")
+        self._wanted_port = port
+        self._wanted_directory = None if directory is None else Path(directory).absolute()
+        self._password = password
+        self._lock = threading.Lock()
+        self._owner: int | None = None
+        self._process: ServerProcess | None = None
+        self._finalizer: weakref.finalize[[], EmbeddedServer] | None = None
+
+    def start(self) -> None:
+        """Start the server and wait until it answers; nothing if it runs already.
+
+        Raises:
+            ServerMissing: no server program was found; says what to install.
+            ServerFailed: the port is taken, the directory is in use or unusable, or the server ended; the
+                message holds the last lines of its log.
+        """
+        if self._is_in_fork():
+            return
+        with self._lock:
+            if self._process is not None and not self._process.ended():
+                return
+            self._clear()
+            self._owner = os.getpid()
+            self._process = self._run()
+            # At the program's end, and when this object is forgotten.
+            self._finalizer = weakref.finalize(self, self._process.stop)
+
+    def stop(self) -> None:
+        """Stop the server and wait until it is gone; nothing if it does not run.
+
+        With a directory, everything written is on disk afterwards.
+        """
+        if self._is_in_fork():
+            return
+        with self._lock:
+            self._clear()
+
+    @property
+    def running(self) -> bool:
+        """Whether the server is up: started, not stopped, and not ended by itself."""
+        process = self._process
+        return process is not None and not process.ended()
+
+    @property
+    def url(self) -> str:
+        """What to connect to: `redis://[:password@]127.0.0.1:PORT`."""
+        login = "" if self._password is None else f":{quote(self._password, safe='')}@"
+        return f"redis://{login}{HOST}:{self.port}"
+
+    @property
+    def port(self) -> int:
+        """The TCP port on 127.0.0.1."""
+        return self._started().port
+
+    @property
+    def socket_path(self) -> str:
+        """The unix socket; the shortest way on the same machine."""
+        return self._started().socket_path
+
+    @property
+    def pid(self) -> int:
+        """The process id of the server."""
+        return self._started().pid
+
+    @property
+    def directory(self) -> Path:
+        """Where the log `server.log` is, and the data if a directory was given; else a temporary one."""
+        return self._wanted_directory or self._started().directory
+
+    @property
+    def password(self) -> str | None:
+        """The password given."""
+        return self._password
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    async def __aenter__(self) -> Self:
+        try:
+            await anyio.to_thread.run_sync(self.start)
+        except BaseException:  # cancelled: the thread goes on, and what it starts would be nobody's
+            await self._stop_shielded()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._stop_shielded()
+
+    def __repr__(self) -> str:
+        process = self._process
+        state = f"on {HOST}:{process.port}, pid {process.pid}" if process is not None else "not started"
+        return f"<EmbeddedServer {state}>"
+
+    async def _stop_shielded(self) -> None:
+        with anyio.CancelScope(shield=True):
+            await anyio.to_thread.run_sync(self.stop)
+
+    def _run(self) -> ServerProcess:
+        program = find_program()
+        attempts = 1 if self._wanted_port else ATTEMPTS
+        while True:
+            attempts -= 1
+            port = _bindable(self._wanted_port)
+            try:
+                return ServerProcess(program, port=port, directory=self._wanted_directory, password=self._password)
+            except PortTaken:  # by somebody who came between the look and the start
+                if not attempts:
+                    raise
+
+    def _clear(self) -> None:
+        if self._finalizer is not None:
+            self._finalizer()  # runs once, here or at exit
+        self._finalizer = None
+        self._process = None
+
+    def _started(self) -> ServerProcess:
+        if self._process is None:
+            raise Misuse("the server is not running: use `with EmbeddedServer() as server:` or call start()")
+        return self._process
+
+    def _is_in_fork(self) -> bool:
+        # Asked before the lock is touched: a thread that the fork has left behind may hold it.
+        return self._owner is not None and self._owner != os.getpid()
+
+
+def _bindable(port: int) -> int:
+    """The port, or a free one for 0; PortTaken or ServerFailed if it cannot be had."""
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
+        try:
+            probe.bind((HOST, port))
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise PortTaken(port) from None
+            raise ServerFailed(f"port {port} on {HOST} cannot be used: {error.strerror}") from error
+        return int(probe.getsockname()[1])

@@ -1,0 +1,84 @@
+"""What a ship is: it carries one type of value to the server and back."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Mapping
+from typing import Any
+
+__all__ = ["FieldShip", "SpecialDatatypeShip"]
+
+
+class SpecialDatatypeShip(ABC):
+    """Base of the classes that store a custom type on the server.
+
+    Every method may be a plain function or `async def`. A ship never talks to the server itself:
+    the `client` it is given records commands (with redis-py's names: `set`, `hset`, `rpush`, ...)
+    and REEM sends them inside the transaction of the whole write or read. Values of exactly the
+    types str, int, float, bool, None, dict, list and tuple are JSON and never offered to ships.
+    """
+
+    carries: type | None = None
+    """The one type this ship gives back, if that is known without reading. Optional."""
+
+    @abstractmethod
+    def check_fit(self, value: Any) -> bool | Awaitable[bool]:
+        """Return whether this ship takes `value`. The first ship of the list that does is used."""
+
+    @abstractmethod
+    def write(self, key: str, value: Any, client: Any) -> Awaitable[None] | None:
+        """Record on `client` the commands that store `value` under `key`.
+
+        Everything must go under this one key (a hash holds several parts). The key is empty when
+        the commands run: REEM has removed what was there.
+        """
+
+    @abstractmethod
+    def read(self, key: str, client: Any) -> Awaitable[None] | None:
+        """Record on `client` the ONE command that fetches all of what `write` stored under `key`.
+
+        Called once per interface with a stand-in key, which is replaced by the real ones later.
+        """
+
+    @abstractmethod
+    def interpret_read(self, responses: list[Any]) -> Any:
+        """Return the value. `responses` holds one item, the reply to the command of `read`."""
+
+    @abstractmethod
+    def get_label(self) -> str | Awaitable[str]:
+        """Return the name of this kind of ship; it tells readers which ship to use."""
+
+    def describe(self, value: Any) -> tuple[int, str]:
+        """Return the bytes `value` takes and a few words on it, shown in the document.
+
+        Optional. Raise `BadType` or `BadValue` for a value that cannot be carried: nothing has been
+        sent at this point.
+        """
+        return 0, type(value).__name__
+
+
+class FieldShip(SpecialDatatypeShip):
+    """A ship whose value is a few named byte strings, held in one hash.
+
+    Since the fields are plain bytes, small values can also travel inside the notice of an update.
+    """
+
+    @abstractmethod
+    def pack(self, value: Any) -> dict[str, Any]:
+        """Return the fields, each bytes or a flat buffer of bytes."""
+
+    @abstractmethod
+    def unpack(self, fields: Mapping[bytes, bytes]) -> Any:
+        """Return the value; raise `BadData` for fields that `pack` cannot have made."""
+
+    def write(self, key: str, value: Any, client: Any) -> None:
+        """Record one HSET."""
+        client.hset(key, mapping=self.pack(value))
+
+    def read(self, key: str, client: Any) -> None:
+        """Record one HGETALL."""
+        client.hgetall(key)
+
+    def interpret_read(self, responses: list[Any]) -> Any:
+        """Return the value from the reply to HGETALL."""
+        return self.unpack(responses[0])

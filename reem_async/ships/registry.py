@@ -1,0 +1,151 @@
+"""The ships of one interface, in the order in which they are asked."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+from ..errors import BadData, BadType
+from ..plan import Command
+from ..plan.placeholders import INLINE_LABELS
+from .base import FieldShip, SpecialDatatypeShip
+from .bytes import BytesShip
+from .numpy import NumpyShip
+
+__all__ = ["Registered", "Ships", "default_ships"]
+
+_STAND_IN = "\0the key\0"
+_METHODS = ("check_fit", "write", "read", "interpret_read", "get_label")
+_JSON_TYPES = frozenset({str, int, float, bool, type(None)})
+
+
+def default_ships() -> list[SpecialDatatypeShip]:
+    """Return the ships an interface has when none are named: numpy arrays and bytes."""
+    return [NumpyShip(), BytesShip()]
+
+
+def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
+    """Return whether any of the ship's methods has to be awaited."""
+    return any(inspect.iscoroutinefunction(getattr(ship, name, None)) for name in _METHODS)
+
+
+class Registered:
+    """A ship with its label and the command that reads, found out once."""
+
+    __slots__ = ("_read", "carries", "fields", "label", "ship")
+
+    def __init__(self, ship: SpecialDatatypeShip, label: str, read: Command) -> None:
+        if not isinstance(label, str) or not label or label in INLINE_LABELS:
+            raise BadType(
+                f"get_label() of {type(ship).__name__} gave {label!r}; return a name other than text and float"
+            )
+        self.ship = ship
+        self.label = label
+        self._read = read
+        self.carries: type | None = getattr(ship, "carries", None)
+        self.fields: FieldShip | None = ship if isinstance(ship, FieldShip) and not is_asynchronous(ship) else None
+
+    def describe(self, value: Any) -> tuple[int, str]:
+        """Return bytes and a summary of `value`."""
+        describe = getattr(self.ship, "describe", None)
+        return describe(value) if describe else (0, type(value).__name__)
+
+    def read_command(self, key: str) -> Command:
+        """Return the command that fetches what is stored under `key`."""
+        return tuple(word.replace(_STAND_IN, key) if isinstance(word, str) else word for word in self._read)
+
+
+class Ships:
+    """Chooses ships for values and finds them by label.
+
+    Args:
+        ships: The ships, first come first served; they replace the default list.
+        new_recorder: Makes an object with redis-py's command methods and a list `commands`.
+    """
+
+    def __init__(self, ships: Iterable[SpecialDatatypeShip], new_recorder: Callable[[], Any]) -> None:
+        self.given = list(ships)
+        self.new_recorder = new_recorder
+        self.asynchronous = any(is_asynchronous(ship) for ship in self.given)
+        self._registered: list[Registered] = []
+        self._by_label: dict[str, Registered] = {}
+        if not self.asynchronous:
+            for ship in self.given:
+                self._register(ship, ship.get_label(), self._recorded(ship.read))
+
+    async def ready(self) -> None:
+        """Ask asynchronous ships for their labels and read commands; does nothing the second time."""
+        if len(self._registered) == len(self.given):
+            return
+        self._registered.clear()
+        for ship in self.given:
+            recorder = self.new_recorder()
+            await _settled(ship.read(_STAND_IN, recorder))
+            label = await _settled(ship.get_label())
+            self._register(ship, label, _only(recorder.commands, ship))
+
+    def _recorded(self, read: Callable[[str, Any], Any]) -> Command:
+        recorder = self.new_recorder()
+        read(_STAND_IN, recorder)
+        return _only(recorder.commands, read)
+
+    def _register(self, ship: SpecialDatatypeShip, label: Any, read: Command) -> None:
+        registered = Registered(ship, label, read)
+        self._registered.append(registered)
+        self._by_label.setdefault(registered.label, registered)
+
+    def fits(self, value: Any) -> Registered | None:
+        """Return the first ship that takes `value`, or None."""
+        return next((each for each in self._registered if each.ship.check_fit(value)), None)
+
+    async def choices(self, value: Any) -> Callable[[Any], Registered | None]:
+        """Return what `fits` would say for everything inside `value`, asking ships that must be awaited."""
+        chosen: dict[int, Registered | None] = {}
+        for leaf in _leaves(value, set()):
+            chosen[id(leaf)] = await self._first_fit(leaf)
+        return lambda leaf: chosen.get(id(leaf))
+
+    async def _first_fit(self, leaf: Any) -> Registered | None:
+        for each in self._registered:
+            if await _settled(each.ship.check_fit(leaf)):
+                return each
+        return None
+
+    def labelled(self, label: str, where: str) -> Registered:
+        """Return the ship with this label.
+
+        Raises:
+            BadData: This interface has none.
+        """
+        try:
+            return self._by_label[label]
+        except KeyError:
+            known = ", ".join(self._by_label) or "none"
+            raise BadData(
+                f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "
+                "pass it in RedisInterface(ships=[...])"
+            ) from None
+
+
+def _only(commands: Sequence[Command], what: Any) -> Command:
+    if len(commands) != 1:
+        raise BadType(f"{what!r}: read() must record exactly one command on the client, it recorded {len(commands)}")
+    return commands[0]
+
+
+async def _settled(result: Any) -> Any:
+    return await result if inspect.isawaitable(result) else result
+
+
+def _leaves(value: Any, seen: set[int]) -> Iterator[Any]:
+    """Yield what is inside `value` and not of a built-in type; circles are refused later."""
+    kind = type(value)
+    if kind in _JSON_TYPES or id(value) in seen:
+        return
+    if kind not in (dict, list, tuple):
+        yield value
+    if isinstance(value, dict | list | tuple):
+        seen.add(id(value))
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _leaves(item, seen)

@@ -1,0 +1,330 @@
+"""Subscribers: a variable that follows, a function that is called, a loop."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any, NoReturn, Self
+
+from .connection import RedisInterface
+from .errors import BadType, InterfaceClosed, MissingKey, ReadOnly
+from .follow import Follower, Update
+from .plan.keys import Keys
+from .plan.paths import Path, check_element, parse, show
+from .plan.trees import MISSING, copied, get
+from .policy import EMPTY, Ended, Last, Mailbox, Newest, Policy
+
+__all__ = ["CallbackSubscriber", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
+
+logger = logging.getLogger("reem.subscribe")
+
+
+class Watch:
+    """Follows one path of one interface: an async iterator over its updates.
+
+    Follows from the first `async for` or `async with` on. The first update is the value that is
+    already there, if any (`initial`). Cancelling a waiting loop loses no update. Leaving a loop
+    with `break` keeps following until the watch is closed or dropped.
+
+    Args:
+        interface: The server.
+        keys: The top-level key's names.
+        path: The path below it.
+        policy: What to keep for a loop that is slower than the updates.
+    """
+
+    def __init__(self, interface: RedisInterface, keys: Keys, path: Path, policy: Policy) -> None:
+        self._interface = interface
+        self.mailbox = Mailbox(policy)
+        self._follower: Follower | None = None
+        self._place = keys, path
+        self._closed = False
+        self._waiter: asyncio.Future[None] | None = None
+
+    @property
+    def following(self) -> bool:
+        """Whether it follows, or did until it was closed."""
+        return self._follower is not None or self._closed
+
+    @property
+    def dropped(self) -> int:
+        """How many updates were skipped since they were not taken in time."""
+        return self.mailbox.dropped
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later update is missed. Idempotent; two round trips."""
+        if self._closed:
+            raise InterfaceClosed("this subscription is closed; make a new one")
+        if self._follower is None:
+            follower = self._interface.hub.follower(*self._place)
+            follower.mailboxes.append(self.mailbox)
+            self._follower = follower
+            try:
+                await self._interface.hub.follow(follower)
+            except BaseException:
+                self._follower = None
+                raise
+
+    async def close(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        self._closed = True
+        self.mailbox.close()
+        if self._follower is not None:
+            await self._interface.hub.unfollow(self._follower)
+
+    aclose = close
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Update:
+        if not self.following:
+            await self.listen()
+        while True:
+            try:
+                update = self.mailbox.take()
+            except Ended:
+                raise StopAsyncIteration from None
+            if update is not EMPTY:
+                return update  # type: ignore[no-any-return]
+            await self._changed()
+
+    async def _changed(self) -> None:
+        """Wait until something was put into the mailbox."""
+        if self._waiter is not None:
+            raise BadType("two tasks take updates from one subscription; make one for each")
+        self._waiter = asyncio.get_running_loop().create_future()
+        self.mailbox.wake = self._wake
+        try:
+            await self._waiter
+        finally:
+            self._waiter = None
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+    async def __aenter__(self) -> Self:
+        await self.listen()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+
+class SilentSubscriber:
+    """A local variable that follows what is published at a path.
+
+    `value()` and `subscriber["number"].read()` answer from memory, without a trip to the server.
+    It starts with the value that is already there. It can also be iterated: `async for update in
+    subscriber`.
+
+    Args:
+        channel: The path to follow, such as "foo" or "foo.bar".
+        interface: The server: a RedisInterface, or what it takes as host.
+        policy: What an iteration keeps for a loop that is slower than the updates.
+    """
+
+    def __init__(self, channel: str, interface: Any = "localhost", policy: Policy | None = None) -> None:
+        self.interface: RedisInterface = (
+            interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
+        )
+        key, *rest = parse(channel) or ("",)
+        self.channel = channel
+        self._keys, self._path = self.interface.keys(key), tuple(rest)
+        self.full_path: Path = (self._keys.name, *rest)
+        self.policy = policy or Newest()
+        self._follower: Follower | None = None
+        self._watches: list[Watch] = []
+        self._closed = False
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later publish is missed. Idempotent; two round trips.
+
+        Raises:
+            NotConnected: Nobody listens there.
+            InterfaceClosed: It was closed before.
+        """
+        if self._closed:
+            raise InterfaceClosed("this subscriber is closed; make a new one")
+        if self._follower is None:
+            self._follower = self.interface.hub.follower(self._keys, self._path)
+            try:
+                await self.interface.hub.follow(self._follower)
+            except BaseException:
+                self._follower = None
+                raise
+
+    async def close(self) -> None:
+        """Stop following; the value stays as it is. Idempotent."""
+        self._closed = True
+        for watch in self._watches:
+            await watch.close()
+        if self._follower is not None:
+            await self.interface.hub.unfollow(self._follower)
+
+    def value(self) -> Any:
+        """Return a copy of the value as of now, None if there is none. No round trip; any thread may call."""
+        return None if self._follower is None else self._follower.value()
+
+    def __getitem__(self, key: str | int) -> LocalAccessor:
+        return LocalAccessor(self, (check_element(key, (self.channel,)),))
+
+    def watch(self, policy: Policy | None = None) -> Watch:
+        """Return an async iterator over the updates, beginning with the value that is there."""
+        watch = Watch(self.interface, self._keys, self._path, policy or self.policy)
+        self._watches.append(watch)
+        return watch
+
+    def __aiter__(self) -> Watch:
+        return self.watch()
+
+    async def __aenter__(self) -> Self:
+        await self.listen()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__module__.partition('.')[0]}.{type(self).__name__} {self.channel}>"
+
+
+class LocalAccessor:
+    """One place in a subscriber's local copy."""
+
+    __slots__ = ("_path", "_subscriber")
+
+    def __init__(self, subscriber: SilentSubscriber, path: Path) -> None:
+        self._subscriber = subscriber
+        self._path = path
+
+    def __getitem__(self, key: str | int) -> LocalAccessor:
+        return LocalAccessor(self._subscriber, (*self._path, check_element(key, self._path)))
+
+    def read(self) -> Any:
+        """Return a copy of the value here as of now. No round trip.
+
+        Raises:
+            MissingKey: Nothing is here.
+        """
+        follower = self._subscriber._follower
+        found = MISSING if follower is None else get(follower.tree, self._path)
+        if found is MISSING:
+            what = show((self._subscriber.channel, *self._path))
+            raise MissingKey(
+                f"nothing has been published at {what} yet" + ("" if follower else "; call listen() first")
+            )
+        return copied(found)
+
+    def get(self, default: Any = None) -> Any:
+        """Return the value here, or `default`. No round trip."""
+        try:
+            return self.read()
+        except MissingKey:
+            return default
+
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        raise ReadOnly("a subscriber only follows the server; write with a KeyValueStore or a PublishSpace")
+
+    __delitem__: Any = __setitem__
+
+    def __repr__(self) -> str:
+        return f"<LocalAccessor {show((self._subscriber.channel, *self._path))}>"
+
+
+class Caller:
+    """Makes the calls of one callback subscriber; both fronts use it, each on a thread of its own choice."""
+
+    def __init__(self, channel: str, function: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
+        self._channel = channel
+        self._function = function
+        self._kwargs = kwargs
+        self._dropped = 0
+
+    def __call__(self, update: Update) -> Any:
+        """Call the function for `update`, unless that is only the value that was there already."""
+        return None if update.initial else self._function(update.data, update.path, **self._kwargs)
+
+    @contextmanager
+    def logging(self, update: Update, dropped: int) -> Iterator[None]:
+        """Log what is raised inside, and updates that were dropped since the last call."""
+        if dropped > self._dropped:
+            self._dropped = dropped
+            logger.warning("%s: the callback is too slow, %d updates were dropped so far", self._channel, dropped)
+        try:
+            yield
+        except Exception:
+            logger.exception("the callback for %s raised at %s; the subscription goes on", self._channel, update.path)
+
+
+class CallbackSubscriber(SilentSubscriber):
+    """Calls a function for each update of what is published at a path.
+
+    Called as `callback(data, updated_path, **kwargs)`: the whole structure below the channel, and
+    which path was updated, such as "callback_channel.number". Calls are made one after the other,
+    in order. An exception in one is logged and does not end the subscription. If calls are slower
+    than updates, the oldest of over 1000 waiting ones are dropped; a warning says so.
+
+    Args:
+        channel: The path to follow.
+        interface: The server: a RedisInterface, or what it takes as host.
+        callback_function: A plain function (then it must not block) or a coroutine function.
+        kwargs: Keyword arguments for each call.
+        policy: What to keep when calls are slower than updates.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        interface: Any,
+        callback_function: Callable[..., Any],
+        kwargs: Mapping[str, Any] | None = None,
+        policy: Policy | None = None,
+    ) -> None:
+        super().__init__(channel, interface, policy or Last(1000))
+        if not callable(callback_function):
+            raise BadType(f"callback_function is a function, not {type(callback_function).__name__}")
+        self.callback_function = callback_function
+        self.kwargs = dict(kwargs or {})
+        self._task: asyncio.Task[None] | None = None
+
+    async def listen(self) -> None:
+        """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
+        if self._task is None:
+            updates = self.watch()
+            await updates.listen()
+            self._task = asyncio.get_running_loop().create_task(self._call_all(updates), name=f"reem {self.channel}")
+            _running.add(self._task)
+            self._task.add_done_callback(_running.discard)
+        await super().listen()
+
+    def caller(self) -> Caller:
+        """Return what makes the calls."""
+        return Caller(self.channel, self.callback_function, self.kwargs)
+
+    async def _call_all(self, updates: Watch) -> None:
+        call = self.caller()
+        async for update in updates:
+            with call.logging(update, updates.dropped):
+                result = call(update)
+                if inspect.isawaitable(result):
+                    await result
+
+    async def close(self) -> None:
+        """Stop following and calling; waits for a call that is being made. Idempotent."""
+        await super().close()
+        if self._task is not None and self._task is not asyncio.current_task():
+            await asyncio.wait([self._task])
+
+
+# Keeps subscribers alive that nobody holds on to: they work until the interface is closed.
+_running: set[asyncio.Task[None]] = set()

@@ -1,0 +1,68 @@
+"""The only place that talks to a server.
+
+`Transport` is the narrow port: commands out, one reply per command back. `AsyncTransport` serves an
+event loop, `BlockingTransport` a plain thread; both are handed the same plans by `drive`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Protocol
+
+from ..plan import Command, Plan, Reply, unwrap, wire_commands
+
+__all__ = ["Held", "Transport", "drive"]
+
+
+class Held(Protocol):
+    """One connection for one caller: what WATCH needs."""
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` in one go and return their replies; error replies are returned, not raised."""
+        ...
+
+
+class Transport(Held, Protocol):
+    """A server, as far as plans can see it."""
+
+    def hold(self) -> AbstractAsyncContextManager[Held]:
+        """Return a connection of the caller's own, given back on exit."""
+        ...
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        """Return a lock: what is sent inside arrives in the order of entering, per `key`."""
+        ...
+
+    def check(self) -> None:
+        """Raise if this cannot be used here: closed, or bound to another event loop."""
+        ...
+
+    async def close(self) -> None:
+        """Close all connections. Idempotent."""
+        ...
+
+
+async def drive(transport: Transport, plan: Plan) -> Any:
+    """Run `plan` and what follows from it; return the result.
+
+    Suspends only where `transport` does: over a blocking transport it runs through at the first step.
+    """
+    while True:
+        if plan.held:
+            async with transport.hold() as held:
+                outcome = await _drive_held(held, plan)
+        else:
+            replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
+            outcome = plan.decode(unwrap(plan, replies))
+        if type(outcome) is not Plan:
+            return outcome
+        plan = outcome
+
+
+async def _drive_held(held: Held, plan: Plan) -> Any:
+    outcome: Any = plan
+    while type(outcome) is Plan and outcome.held:
+        replies = await held.roundtrip(wire_commands(outcome))
+        outcome = outcome.decode(unwrap(outcome, replies))
+    return outcome

@@ -1,0 +1,121 @@
+"""The port on an event loop: a shared wire, a second one for large values, and spare ones for WATCH."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import Any
+
+import anyio
+
+from ..errors import InterfaceClosed, WrongLoop
+from ..plan import Command, Reply
+from .options import Options
+from .packing import LARGE
+from .wire import Wire, open_wire
+
+__all__ = ["AsyncTransport"]
+
+_BULK = 1 << 16
+_SPARE = 4
+
+
+class AsyncTransport:
+    """Connections of one interface in one event loop, made when first needed."""
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._pid = 0
+        self._closed = False
+        self._lanes: dict[bool, Wire] = {}
+        self._opening: dict[bool, anyio.Lock] = {}
+        self._spare: list[Wire] = []
+        self._orders: dict[str, anyio.Lock] = {}
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` on the shared wire, or on the one for large values, and return the replies."""
+        bulk = bulk or _is_bulk(commands)
+        wire = self._lanes.get(bulk)
+        if wire is None or not wire.alive or self._loop is not asyncio.get_running_loop() or self._closed:
+            wire = await self._lane(bulk)
+        return await wire.roundtrip(commands)
+
+    async def _lane(self, bulk: bool) -> Wire:
+        self.check()
+        async with self._opening.setdefault(bulk, anyio.Lock()):
+            wire = self._lanes.get(bulk)
+            if wire is None or not wire.alive:
+                wire = self._lanes[bulk] = await open_wire(self._options)
+            return wire
+
+    def check(self) -> None:
+        """Bind to the running loop at first use; raise if this is another one, or if it is closed."""
+        if self._closed:
+            raise InterfaceClosed("this RedisInterface is closed; make a new one")
+        loop = asyncio.get_running_loop()
+        if self._pid != os.getpid():
+            # After a fork the sockets belong to the parent: forget them without closing.
+            self._forget()
+            self._pid, self._loop = os.getpid(), loop
+        if self._loop is not loop:
+            if self._loop is not None and not self._loop.is_closed():
+                raise WrongLoop(
+                    "this RedisInterface is in use in another event loop; "
+                    "make one interface per loop (or per asyncio.run)"
+                )
+            self._forget()
+            self._loop = loop
+
+    def _forget(self) -> None:
+        self._lanes.clear()
+        self._opening.clear()
+        self._spare.clear()
+        self._orders.clear()
+
+    @asynccontextmanager
+    async def hold(self) -> AsyncIterator[Wire]:
+        """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled."""
+        self.check()
+        wire = self._spare.pop() if self._spare else await open_wire(self._options)
+        try:
+            yield wire
+        except BaseException:
+            await wire.close()
+            raise
+        if wire.alive and len(self._spare) < _SPARE:
+            self._spare.append(wire)
+        else:
+            await wire.close()
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
+        """Return the lock of `key`."""
+        return self._orders.setdefault(key, anyio.Lock())
+
+    async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Exception], None]) -> Wire:
+        """Open a connection whose pushed messages go to `on_push`."""
+        self.check()
+        return await open_wire(self._options, on_push, on_lost)
+
+    async def close(self) -> None:
+        """Close all connections."""
+        if self._closed:
+            return
+        self._closed = True
+        wires = [*self._lanes.values(), *self._spare]
+        self._forget()
+        if self._loop is asyncio.get_running_loop():
+            for wire in wires:
+                await wire.close()
+
+
+def _is_bulk(commands: Sequence[Command]) -> bool:
+    """Return whether so much is sent that others should not wait behind it."""
+    return any(
+        type(word) in (bytes, memoryview) and len(word) >= _BULK
+        for command in commands
+        if len(command) > LARGE or any(type(word) in (bytes, memoryview) and len(word) >= LARGE for word in command)
+        for word in command
+    )

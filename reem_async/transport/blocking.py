@@ -1,0 +1,204 @@
+"""The port for plain threads: the caller's own thread sends and receives, no event loop involved.
+
+Its methods are `async def` only to fit the port: nothing in them ever suspends, so a coroutine of
+the core over this transport is run to its end by a single step.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import Any
+
+import redis.exceptions
+
+from ..errors import ConnectionLost, InterfaceClosed
+from ..plan import Command, Reply
+from .options import Options
+from .packing import pack
+from .wire import MORE, new_reader
+
+__all__ = ["BlockingTransport"]
+
+_BUFFER = 1 << 17
+_IDLE = 1.0
+
+
+class _Line:
+    """One blocking connection, used by one caller at a time."""
+
+    def __init__(self, options: Options) -> None:
+        self._connection = options.blocking_connection()
+        try:
+            self._connection.connect()
+        except (redis.exceptions.RedisError, OSError) as error:
+            raise options.refused(error) from error
+        self._socket: socket.socket = self._connection._sock
+        self._timeout = options.timeout
+        self._set_timeout()
+        self._reader = new_reader()
+        self._buffer = bytearray(_BUFFER)
+        self._view = memoryview(self._buffer)
+        self.broken = False
+        self.used = time.monotonic()
+
+    def _set_timeout(self) -> None:
+        """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
+        if hasattr(self._socket, "context"):  # TLS: its reads need Python's timeout
+            self._socket.settimeout(self._timeout)
+            return
+        self._socket.settimeout(None)
+        whole, part = divmod(self._timeout, 1)
+        limit = struct.pack("ll", int(whole), int(part * 1e6))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` and read their replies, all on this thread."""
+        return self.exchange(commands)
+
+    def exchange(self, commands: Sequence[Command]) -> list[Reply]:
+        """Send `commands` and read their replies."""
+        try:
+            for piece in pack(commands):
+                self._socket.sendall(piece)
+            return self._replies(len(commands))
+        except (BlockingIOError, TimeoutError):
+            self.close()
+            raise ConnectionLost(
+                f"the server moved no byte for {self._timeout} s; the call was applied once or not at all"
+            ) from None
+        except OSError as error:
+            self.close()
+            raise ConnectionLost(
+                f"the connection broke before the reply came ({error}); the call was applied once or not at all"
+            ) from error
+        except redis.exceptions.InvalidResponse as error:
+            self.close()
+            raise ConnectionLost(f"the server sent something that is not its protocol: {error}") from error
+        except BaseException:  # Ctrl-C: the reply is still on its way and must not meet the next caller
+            self.close()
+            raise
+
+    def _replies(self, count: int) -> list[Reply]:
+        replies: list[Reply] = []
+        gets, feed, receive = self._reader.gets, self._reader.feed, self._socket.recv_into
+        while True:
+            reply = gets()
+            if reply is MORE:
+                received = receive(self._view)
+                if not received:
+                    raise ConnectionResetError("closed by the server")
+                feed(self._buffer, 0, received)  # type: ignore[arg-type]
+                continue
+            replies.append(reply)
+            if len(replies) == count:
+                return replies
+
+    def fresh(self) -> bool:
+        """Return whether the connection still stands, as far as one can see without sending."""
+        if time.monotonic() - self.used < _IDLE:
+            return True
+        try:
+            # Nothing is due: bytes mean a stray reply, none means the server has closed.
+            self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return True
+        except (OSError, ValueError):
+            return False
+        return False
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.broken = True
+        self._connection.disconnect()
+
+
+class BlockingTransport:
+    """Connections for the threads of one process: as many as there are calls at the same time."""
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._idle: collections.deque[_Line] = collections.deque()
+        self._pid = os.getpid()
+        self._closed = False
+        self._orders: dict[str, threading.Lock] = {}
+
+    def check(self) -> None:
+        """Raise if this is closed."""
+        if self._closed:
+            raise InterfaceClosed("this RedisInterface is closed; make a new one")
+
+    def _take(self) -> _Line:
+        self.check()
+        if self._pid != os.getpid():
+            # After a fork the sockets are the parent's: use new ones. (redis-py closes only the child's
+            # descriptors, without a word to the server.)
+            self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
+        while True:
+            try:
+                line = self._idle.pop()
+            except IndexError:
+                return _Line(self._options)
+            if line.fresh():
+                return line
+            line.close()
+
+    def _give(self, line: _Line) -> None:
+        if line.broken:
+            return
+        if self._closed:
+            line.close()
+            return
+        line.used = time.monotonic()
+        self._idle.append(line)
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` on a free connection and return their replies."""
+        line = self._take()
+        try:
+            return line.exchange(commands)
+        finally:
+            self._give(line)
+
+    @asynccontextmanager
+    async def hold(self) -> AsyncIterator[_Line]:
+        """Lend a connection; it is broken if the caller leaves with an error."""
+        line = self._take()
+        try:
+            yield line
+        except BaseException:
+            line.close()
+            raise
+        self._give(line)
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        """Return the lock of `key`."""
+        return _Locked(self._orders.setdefault(key, threading.Lock()))
+
+    async def close(self) -> None:
+        """Close all connections that are not in use; the others are closed when given back."""
+        self._closed = True
+        while self._idle:
+            self._idle.pop().close()
+
+
+class _Locked:
+    """A thread lock with the face of an asynchronous one; waiting for it blocks the thread."""
+
+    __slots__ = ("_lock",)
+
+    def __init__(self, lock: threading.Lock) -> None:
+        self._lock = lock
+
+    async def __aenter__(self) -> None:
+        self._lock.acquire()
+
+    async def __aexit__(self, *_: Any) -> None:
+        self._lock.release()

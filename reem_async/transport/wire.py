@@ -1,0 +1,240 @@
+"""One asyncio connection: replies matched to requests in the order sent.
+
+Callers share it: each appends its commands and waits for as many replies, so concurrent callers are
+pipelined by themselves, and a caller that was cancelled leaves no trace: its replies still come,
+in order, and are dropped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import hiredis
+import redis.exceptions
+from redis._parsers import BaseParser
+
+from ..errors import ConnectionLost
+from ..plan import Command, Reply
+from .options import Options
+from .packing import pack
+
+__all__ = ["MORE", "Wire", "new_reader", "open_wire"]
+
+BUFFER = 1 << 18
+"""Bytes read at a time."""
+
+_CONFIRMATIONS = (b"subscribe", b"unsubscribe")
+
+MORE = object()
+"""What the parser says when it needs more bytes; False and None are replies."""
+
+
+def new_reader() -> hiredis.Reader:
+    """Return a parser that hands error replies out as redis-py's exceptions."""
+    return hiredis.Reader(
+        protocolError=redis.exceptions.InvalidResponse, replyError=BaseParser.parse_error, notEnoughData=MORE
+    )
+
+
+class _Due:
+    """The replies one caller waits for."""
+
+    __slots__ = ("count", "done", "replies")
+
+    def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None]) -> None:
+        self.count = count
+        self.done = done
+        self.replies: list[Reply] = []
+
+
+class Wire(asyncio.BufferedProtocol):
+    """The protocol over a connection that has shaken hands.
+
+    Args:
+        on_push: Called with each message the server sends unasked.
+        on_lost: Called once when the connection is gone, with the reason.
+        timeout: Seconds without a byte received, while a reply is due, after which it is given up.
+    """
+
+    def __init__(
+        self,
+        timeout: float,
+        on_push: Callable[[list[Any]], None] | None = None,
+        on_lost: Callable[[Exception], None] | None = None,
+    ) -> None:
+        self._timeout = timeout
+        self._on_push = on_push
+        self._on_lost = on_lost
+        self._reader = new_reader()
+        self._buffer = bytearray(BUFFER)
+        self._due: collections.deque[_Due] = collections.deque()
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._keep: Any = None
+        self._watch: asyncio.TimerHandle | None = None
+        self._last_byte = 0.0
+        self._reason: Exception | None = None
+        self._gone = self._loop.create_future()
+        # What the socket does not take at once is copied by asyncio of Python 3.11; later versions and
+        # uvloop keep a view of the array, which the caller may change meanwhile.
+        self._keeps_views = sys.version_info >= (3, 12) or not isinstance(self._loop, asyncio.BaseEventLoop)
+
+    def take_over(self, connection: Any) -> None:
+        """Replace redis-py's stream on a connected `connection`."""
+        writer = connection._writer
+        self._keep = writer  # its finalizer would close the socket under us
+        connection._reader = connection._writer = None
+        transport: asyncio.Transport = writer.transport
+        self._transport = transport
+        transport.set_protocol(self)
+
+    @property
+    def alive(self) -> bool:
+        """Whether commands can be sent."""
+        return self._reason is None and self._transport is not None and not self._transport.is_closing()
+
+    @property
+    def idle(self) -> bool:
+        """Whether nobody waits for a reply."""
+        return not self._due
+
+    def send(self, commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]) -> None:
+        """Send `commands`; `done` is called with their replies, in order with pushed messages, or with an error."""
+        if self._transport is None or self._reason is not None:
+            done(self._reason or ConnectionLost("the connection is closed"))
+            return
+        pieces = pack(commands)
+        if not self._due:
+            self._last_byte = self._loop.time()
+            if self._watch is None:
+                self._watch = self._loop.call_later(self._timeout, self._check_time)
+        self._due.append(_Due(len(commands), done))
+        for piece in pieces:
+            self._transport.write(bytes(piece) if self._keeps_views and type(piece) is memoryview else piece)
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` and return their replies. Cancelling leaves the connection usable."""
+        answer: asyncio.Future[list[Reply]] = self._loop.create_future()
+
+        def done(outcome: list[Reply] | Exception) -> None:
+            if answer.done():  # cancelled
+                return
+            if isinstance(outcome, Exception):
+                answer.set_exception(outcome)
+            else:
+                answer.set_result(outcome)
+
+        self.send(commands, done)
+        return await answer
+
+    def abort(self, reason: Exception) -> None:
+        """Break the connection; whoever waits gets `reason`."""
+        self._fail(reason)
+        if self._transport is not None:
+            self._transport.abort()
+
+    async def close(self) -> None:
+        """Close the connection and wait until it is."""
+        if self._transport is None:
+            return
+        self._fail(ConnectionLost("the connection was closed"))
+        self._transport.close()
+        await asyncio.wait([self._gone], timeout=1.0)
+
+    # What asyncio calls.
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        """Return where to put received bytes."""
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Parse what was received and hand it out."""
+        self._last_byte = self._loop.time()
+        self._reader.feed(self._buffer, 0, nbytes)  # type: ignore[arg-type]
+        try:
+            while (reply := self._reader.gets()) is not MORE:
+                self._take(reply)
+        except redis.exceptions.InvalidResponse as error:
+            self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error}"))
+
+    def eof_received(self) -> None:
+        """Close: the server will not answer any more."""
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell everybody who waits."""
+        self._fail(
+            ConnectionLost(
+                f"the connection broke before the reply came ({exc or 'closed by the server'}); "
+                "the call was applied once or not at all"
+            )
+        )
+        self._keep = None
+        if not self._gone.done():
+            self._gone.set_result(None)
+
+    def _take(self, reply: Reply) -> None:
+        # The confirmation of a SUBSCRIBE is pushed too, but it is the only reply there is to the command.
+        if type(reply) is hiredis.PushNotification and reply[0] not in _CONFIRMATIONS:
+            if self._on_push is not None:
+                self._on_push(cast("list[Any]", reply))
+            return
+        if not self._due:
+            self.abort(ConnectionLost("the server sent a reply that nobody asked for"))
+            return
+        due = self._due[0]
+        due.replies.append(reply)
+        if len(due.replies) == due.count:
+            self._due.popleft()
+            due.done(due.replies)
+
+    def _check_time(self) -> None:
+        self._watch = None
+        if not self._due:
+            return
+        left = self._last_byte + self._timeout - self._loop.time()
+        if left <= 0:
+            self.abort(
+                ConnectionLost(
+                    f"the server sent nothing for {self._timeout} s; the call was applied once or not at all"
+                )
+            )
+        else:
+            self._watch = self._loop.call_later(left, self._check_time)
+
+    def _fail(self, reason: Exception) -> None:
+        if self._reason is not None:
+            return
+        self._reason = reason
+        if self._watch is not None:
+            self._watch.cancel()
+            self._watch = None
+        waiting, self._due = self._due, collections.deque()
+        for due in waiting:
+            due.done(reason)
+        if self._on_lost is not None:
+            self._on_lost(reason)
+
+
+async def open_wire(
+    options: Options,
+    on_push: Callable[[list[Any]], None] | None = None,
+    on_lost: Callable[[Exception], None] | None = None,
+) -> Wire:
+    """Connect, log in, and return the wire.
+
+    Raises:
+        NotConnected: Nobody listens there.
+        redis.exceptions.RedisError: The server refused the login.
+    """
+    connection = options.asynchronous_connection()
+    try:
+        await connection.connect()
+    except (redis.exceptions.RedisError, OSError) as error:
+        raise options.refused(error) from error
+    wire = Wire(options.timeout, on_push, on_lost)
+    wire.take_over(connection)
+    return wire
