@@ -7,11 +7,12 @@ wait for others: subscriptions, and ships with `async def` methods.
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from reem_async.errors import WrongLoop
+from reem_async.errors import InterfaceClosed, WrongLoop
 
 __all__ = ["Portal", "finish"]
 
@@ -45,20 +46,27 @@ class Portal:
 
     def __init__(self, name: str) -> None:
         self._loop = _new_loop()
+        self._gate = threading.Lock()
+        self._ended = False
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
         asyncio.set_event_loop(self._loop)
-        try:
-            self._loop.run_forever()
-        finally:
-            left = asyncio.all_tasks(self._loop)
-            for task in left:
-                task.cancel()
-            if left:
-                self._loop.run_until_complete(asyncio.wait(left, timeout=1.0))
-            self._loop.close()
+        self._loop.run_forever()
+        with self._gate:
+            self._ended = True
+        self._loop.run_until_complete(self._end_tasks())
+        self._loop.close()
+
+    async def _end_tasks(self) -> None:
+        """Cancel what still runs, including calls that were handed over just before the end."""
+        await asyncio.sleep(0)
+        left = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in left:
+            task.cancel()
+        if left:
+            await asyncio.wait(left, timeout=1.0)
 
     @property
     def inside(self) -> bool:
@@ -67,23 +75,28 @@ class Portal:
 
     def call(self, coroutine: Coroutine[Any, Any, Result], timeout: float | None = None) -> Result:
         """Run `coroutine` on the loop and wait for its result. Ctrl-C cancels it."""
-        if self.inside or not self._thread.is_alive():
+        if self.inside:
             coroutine.close()
             raise WrongLoop(
                 "a blocking call of REEM on REEM's own event loop thread would wait for itself; use reem_async there"
-                if self.inside
-                else "this interface's event loop has ended"
             )
-        future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        with self._gate:
+            if self._ended:
+                coroutine.close()
+                raise InterfaceClosed("this RedisInterface is closed; make a new one")
+            future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
         try:
             return future.result(timeout)
+        except concurrent.futures.CancelledError:
+            raise InterfaceClosed("this RedisInterface was closed during the call") from None
         except BaseException:
             future.cancel()
             raise
 
     def stop(self) -> None:
         """End the loop and wait for the thread, unless this is it. Idempotent."""
-        if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._loop.stop)
-            if not self.inside:
-                self._thread.join(2.0)
+        with self._gate:
+            if not self._ended:
+                self._loop.call_soon_threadsafe(self._loop.stop)
+        if not self.inside:
+            self._thread.join(2.0)

@@ -82,51 +82,51 @@ class Accessor:
 
     def read(self) -> Any:
         """Return the value here."""
-        return self._interface.run(self._core.read())
+        return self._interface._run(self._core.read())
 
     def get(self, *default: Any) -> Any:
         """Return the value here, or a default."""
-        return self._interface.run(self._core.get(*default))
+        return self._interface._run(self._core.get(*default))
 
     def write(self, value: Any) -> None:
         """Store `value` here."""
-        self._interface.run(self._core.write(value))
+        self._interface._run(self._core.write(value))
 
     def delete(self) -> None:
         """Remove what is here."""
-        self._interface.run(self._core.delete())
+        self._interface._run(self._core.delete())
 
     def length(self) -> int:
         """Return the length of what is here."""
-        return self._interface.run(self._core.length())
+        return self._interface._run(self._core.length())
 
     def type(self) -> builtins.type:
         """Return the Python type of what is here."""
-        return self._interface.run(self._core.type())
+        return self._interface._run(self._core.type())
 
     def increment(self, number: float = 1) -> Any:
         """Add to the number here."""
-        return self._interface.run(self._core.increment(number))
+        return self._interface._run(self._core.increment(number))
 
     def multiply(self, number: float) -> Any:
         """Multiply the number here."""
-        return self._interface.run(self._core.multiply(number))
+        return self._interface._run(self._core.multiply(number))
 
     def divide(self, number: float) -> Any:
         """Divide the number here."""
-        return self._interface.run(self._core.divide(number))
+        return self._interface._run(self._core.divide(number))
 
     def add(self, value: Any) -> None:
         """Add to the number, or to the list, here."""
-        self._interface.run(self._core.add(value))
+        self._interface._run(self._core.add(value))
 
     def append(self, value: Any) -> None:
         """Append to the list here."""
-        self._interface.run(self._core.append(value))
+        self._interface._run(self._core.append(value))
 
     def extend(self, values: Iterable[Any]) -> None:
         """Append several to the list here."""
-        self._interface.run(self._core.extend(values))
+        self._interface._run(self._core.extend(values))
 
     def edit(self) -> Edit:
         """Return a context manager that reads, lets you change, and writes back; also `with accessor:`."""
@@ -136,7 +136,7 @@ class Accessor:
         """Return an iterator over the value here and its updates."""
         from .subscribe import Watch
 
-        return Watch(self._interface, self._interface.followers, self._core.full_path, policy)
+        return Watch(self._interface, self._interface._followers, self._core.full_path, policy)
 
     def __enter__(self) -> Any:
         edit = self.edit()
@@ -150,13 +150,8 @@ class Accessor:
         self._edits[threading.get_ident()].pop().__exit__(kind, error, trace)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (
-            type(self),
-            self._interface,
-            type(self._core),
-            type(self._core._writer),
-            self._core.full_path,
-        )
+        kinds = type(self), type(self._core), type(self._core._writer)
+        return _rebuilt, (kinds, self._interface, self._core.full_path)
 
     def __repr__(self) -> str:
         return repr(self._core)
@@ -172,8 +167,10 @@ class PublishAccessor(Accessor):
         return self._core.watch(policy)  # type: ignore[return-value]
 
 
-def _rebuilt(kind: type[Accessor], interface: RedisInterface, inner: Any, writer: Any, path: Any) -> Accessor:
-    return kind(interface, core._rebuilt(inner, writer, interface.core, path[0], path[1:]))
+def _rebuilt(kinds: Any, interface: RedisInterface, path: tuple[Any, ...]) -> Accessor:
+    facade, inner, writer = kinds
+    made: Accessor = facade(interface, core.rebuilt(inner, writer, interface._core.session, path))
+    return made
 
 
 class Edit:
@@ -184,9 +181,9 @@ class Edit:
         self._core = inner
 
     def __enter__(self) -> Any:
-        return self._interface.run(self._core.__aenter__())
+        return self._interface._run(self._core.__aenter__())
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._interface.run(self._core.__aexit__(kind, error, trace))
+        self._interface._run(self._core.__aexit__(kind, error, trace))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import os
 import threading
@@ -12,8 +11,8 @@ from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import reem_async
+from reem_async.connection import rebuilt
 from reem_async.ships.base import SpecialDatatypeShip
-from reem_async.transport import Transport
 from reem_async.transport.blocking import BlockingTransport
 
 from ._portal import Portal, finish
@@ -27,8 +26,43 @@ Result = TypeVar("Result")
 class _OnThread(reem_async.RedisInterface):
     """The core's interface over connections that the caller's own thread drives."""
 
-    def _new_transport(self) -> Transport:
-        return BlockingTransport(self.options)
+    _new_transport = BlockingTransport
+
+
+class _Background:
+    """The event loop of an interface and the core's interface on it, made when first needed."""
+
+    def __init__(self, direct: reem_async.RedisInterface) -> None:
+        self._direct = direct
+        self._lock = threading.RLock()
+        self._made: tuple[int, Portal, reem_async.RedisInterface] | None = None
+
+    @property
+    def inside(self) -> bool:
+        """Whether the caller is on the loop's own thread."""
+        made = self._made
+        return made is not None and made[1].inside
+
+    def started(self) -> tuple[Portal, reem_async.RedisInterface]:
+        """Return both, starting them if need be; raises InterfaceClosed."""
+        with self._lock:
+            self._direct.session.transport.check()
+            if self._made is None or self._made[0] != os.getpid():  # threads do not survive a fork
+                host, ships, settings = self._direct._given
+                self._made = os.getpid(), Portal("reem-loop"), reem_async.RedisInterface(host, ships, **settings)
+            return self._made[1:]
+
+    def close(self) -> None:
+        """Close all connections and end the loop."""
+        finish(self._direct.close())
+        with self._lock:
+            made, self._made = self._made, None
+        if made is not None and made[0] == os.getpid():
+            _, portal, interface = made
+            if not portal.inside:
+                with contextlib.suppress(TimeoutError):
+                    portal.call(interface.close(), timeout=1.0)
+            portal.stop()
 
 
 @documented_by(reem_async.RedisInterface)
@@ -63,9 +97,8 @@ class RedisInterface:
     ) -> None:
         settings = {"namespace": namespace, "timeout": timeout, **options}
         self._direct = _OnThread(host, ships, **settings)
-        self._lock = threading.RLock()
-        self._looped: tuple[int, Portal, reem_async.RedisInterface] | None = None
-        _open.add(self)
+        self._background = _Background(self._direct)
+        self._closing = weakref.finalize(self, self._background.close)  # when dropped, or at exit
 
     @property
     def hostname(self) -> str:
@@ -78,46 +111,37 @@ class RedisInterface:
         return self._direct.namespace
 
     @property
-    def core(self) -> reem_async.RedisInterface:
+    def _core(self) -> reem_async.RedisInterface:
         """The core's interface that stores are made from."""
-        return self._background()[1] if self._direct.ships.asynchronous else self._direct
+        return self._followers if self._direct.session.ships.asynchronous else self._direct
 
     @property
-    def followers(self) -> reem_async.RedisInterface:
+    def _followers(self) -> reem_async.RedisInterface:
         """The core's interface that subscribers are made from: it lives on the background loop."""
-        return self._background()[1]
+        return self._background.started()[1]
 
-    def _background(self) -> tuple[Portal, reem_async.RedisInterface]:
-        with self._lock:
-            self._direct.transport.check()
-            if self._looped is None or self._looped[0] != os.getpid():  # threads do not survive a fork
-                self._looped = os.getpid(), Portal("reem-loop"), self._direct.twin()
-            return self._looped[1:]
-
-    def run(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
+    def _run(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on a store to its end and return the result."""
-        looped = self._looped
-        if self._direct.ships.asynchronous or (looped is not None and looped[1].inside):
-            return self.wait(coroutine)
+        if self._direct.session.ships.asynchronous or self._background.inside:
+            return self._wait(coroutine)
         return finish(coroutine)
 
-    def wait(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
+    def _wait(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on the background loop and return the result."""
-        return self._background()[0].call(coroutine)
+        try:
+            portal = self._background.started()[0]
+        except BaseException:
+            coroutine.close()
+            raise
+        return portal.call(coroutine)
 
     def initialize(self) -> None:
         """Connect now and check the server."""
-        self.run(self.core.initialize())
+        self._run(self._core.initialize())
 
     def close(self) -> None:
         """End all subscriptions and close all connections."""
-        finish(self._direct.close())
-        with self._lock:
-            looped, self._looped = self._looped, None
-        if looped is not None and looped[0] == os.getpid():
-            with contextlib.suppress(TimeoutError):
-                looped[1].call(looped[2].close(), timeout=1.0)
-            looped[1].stop()
+        self._closing()
 
     def __enter__(self) -> Self:
         self.initialize()
@@ -129,19 +153,7 @@ class RedisInterface:
         self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        rebuild, (_, *given) = self._direct.__reduce__()
-        return rebuild, (type(self), *given)
+        return rebuilt, (type(self), *self._direct._given)
 
     def __repr__(self) -> str:
         return f"<reem.RedisInterface {self.hostname}>"
-
-
-_open: weakref.WeakSet[RedisInterface] = weakref.WeakSet()
-
-
-@atexit.register
-def _close_all() -> None:
-    """Close what was left open, so that the program ends without a word."""
-    for interface in list(_open):
-        with contextlib.suppress(Exception):
-            interface.close()

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from reem_async.document import DocumentWriter
 from reem_async.errors import PathRefused
 from reem_async.plan.paths import Path
 from reem_async.plan.writes import make_parents
 from reem_async.ships import NumpyShip, SpecialDatatypeShip
 from reem_async.store import KeyValueStore as CoreStore
-from reem_async.store import Writer
 
 from .accessor import Accessor
 from .store import KeyValueStore
@@ -18,15 +18,11 @@ from .store import KeyValueStore
 __all__ = ["NumpyMarshaller", "SpecialDatatypeMarshaller", "TolerantKeyValueStore"]
 
 
-class SpecialDatatypeMarshaller(SpecialDatatypeShip):
-    """What REEM 0.1 called a ship; a `delete` method is accepted and not needed."""
+SpecialDatatypeMarshaller = SpecialDatatypeShip  # its `delete` is not needed any more, and ignored
+NumpyMarshaller = NumpyShip
 
 
-class NumpyMarshaller(NumpyShip):
-    """What REEM 0.1 called NumpyShip."""
-
-
-class _TolerantWriter(Writer):
+class _TolerantWriter(DocumentWriter):
     """Creates the parents of what it writes where they are missing."""
 
     async def set(self, path: Path, value: Any) -> None:
@@ -34,7 +30,7 @@ class _TolerantWriter(Writer):
         try:
             await super().set(path, value)
         except PathRefused:
-            await self.interface.run(make_parents(self.keys, path))
+            await self.session.run(make_parents(self.keys, path))
             await super().set(path, value)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from reem_async import publish as core
 
 from .accessor import PublishAccessor
@@ -33,3 +35,7 @@ class PublishSpace(KeyValueStore):
 
     _kind = core.PublishSpace
     _accessor = PublishAccessor
+
+    def get(self, path: str, default: Any = None) -> Any:
+        """Raise WriteOnly."""
+        return self.interface._run(self._core.get(path, default))

@@ -26,11 +26,11 @@ class Reader:
     def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
         self.interface = interface
         self.top_key_name = top_key_name
-        self._core = core.Reader(top_key_name, interface.core)
+        self._core = core.Reader(top_key_name, interface._core)
 
     def read_from_redis(self, read_path: str) -> Any:
         """Return the value at a path like ".a.b"."""
-        return self.interface.run(self._core.read_from_redis(read_path))
+        return self.interface._run(self._core.read_from_redis(read_path))
 
 
 @documented_by(core.Writer)
@@ -42,16 +42,16 @@ class Writer:
         interface: The server.
     """
 
-    _kind = core.Writer
+    _kind: type[core.Writer] = core.Writer
 
     def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
         self.interface = interface
         self.top_key_name = top_key_name
-        self._core = self._kind(top_key_name, interface.core)
+        self._core = self._kind(top_key_name, interface._core)
 
     def send_to_redis(self, set_path: str, set_value: Any) -> None:
         """Store a value at a path like ".a.b"."""
-        self.interface.run(self._core.send_to_redis(set_path, set_value))
+        self.interface._run(self._core.send_to_redis(set_path, set_value))
 
 
 @documented_by(core.KeyValueStore)
@@ -74,7 +74,7 @@ class KeyValueStore:
         self.interface: RedisInterface = (
             interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
         )
-        self._core = self._kind(self.interface.core)
+        self._core = self._kind(self.interface._core)
 
     def __getitem__(self, key: str) -> Accessor:
         return self._accessor(self.interface, self._core[key])
@@ -94,11 +94,11 @@ class KeyValueStore:
 
     def get(self, path: str, default: Any = core._NOTHING) -> Any:
         """Return the value at a dotted path."""
-        return self.interface.run(self._core.get(path, default))
+        return self.interface._run(self._core.get(path, default))
 
     def set(self, path: str, value: Any) -> None:
         """Store `value` at a dotted path."""
-        self.interface.run(self._core.set(path, value))
+        self.interface._run(self._core.set(path, value))
 
     def track_schema_changes(self, set_value: bool, keys: Iterable[str] | None = None) -> None:
         """Say whether the shape of what is written may change."""

@@ -20,7 +20,7 @@ __all__ = ["CallbackSubscriber", "SilentSubscriber", "Watch"]
 
 @documented_by(core.Watch)
 class Watch:
-    """Follows one path: an iterator over its updates.
+    """Follows one path and yields its updates, one by one: an (async) iterator.
 
     Follows from the first `for` or `with` on. The first update is the value that is already there,
     if any (`initial`). Leaving a loop with `break` keeps following until the watch is closed or
@@ -41,7 +41,8 @@ class Watch:
         policy: Policy | None,
     ) -> None:
         self._interface = interface
-        self._core = core.Watch(followers, followers.keys(path[0]), path[1:], policy or Newest())
+        session = followers.session
+        self._core = core.Watch(session, session.keys(path[0]), path[1:], policy or Newest())
 
     @property
     def dropped(self) -> int:
@@ -50,17 +51,17 @@ class Watch:
 
     def listen(self) -> None:
         """Begin to follow."""
-        self._interface.wait(self._core.listen())
+        self._interface._wait(self._core.listen())
 
     def close(self) -> None:
         """Stop following and end the loop."""
-        self._interface.wait(self._core.close())
+        self._interface._wait(self._core.close())
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> core.Update:
-        if not self._core.following:
+        if not self._core._following:
             self.listen()
         try:
             return self._core.mailbox.take_waiting()  # type: ignore[no-any-return]
@@ -94,16 +95,15 @@ class SilentSubscriber:
     def __init__(self, channel: str, interface: Any = "localhost", policy: Policy | None = None) -> None:
         self.interface = interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
         self.channel = channel
-        self._policy = policy
-        self._core = core.SilentSubscriber(channel, self.interface.followers, policy)
+        self._core = core.SilentSubscriber(channel, self.interface._followers, policy)
 
     def listen(self) -> None:
         """Begin to follow."""
-        self.interface.wait(self._core.listen())
+        self.interface._wait(self._core.listen())
 
     def close(self) -> None:
         """Stop following."""
-        self.interface.wait(self._core.close())
+        self.interface._wait(self._core.close())
 
     def value(self) -> Any:
         """Return a copy of the value as of now."""
@@ -114,7 +114,7 @@ class SilentSubscriber:
 
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an iterator over the updates."""
-        return Watch(self.interface, self._core.interface, self._core.full_path, policy or self._policy)
+        return Watch(self.interface, self._core.interface, self._core.full_path, policy or self._core.policy)
 
     def __iter__(self) -> Watch:
         return self.watch()
@@ -127,6 +127,15 @@ class SilentSubscriber:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def __setitem__(self, key: str | int, value: Any) -> None:
+        self._core[key] = value
+
+    def __delitem__(self, key: str | int) -> None:
+        del self._core[key]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.channel, self.interface, *self._core.__reduce__()[1][2:])
 
     def __repr__(self) -> str:
         return f"<reem.{type(self).__name__} {self.channel}>"
@@ -158,7 +167,7 @@ class CallbackSubscriber(SilentSubscriber):
         policy: Policy | None = None,
     ) -> None:
         super().__init__(channel, interface, policy)
-        self._calls = core.CallbackSubscriber(channel, self.interface.followers, callback_function, kwargs, policy)
+        self._calls = core.CallbackSubscriber(channel, self.interface._followers, callback_function, kwargs, policy)
         self._core = self._calls
         self._updates: Watch | None = None
         self._thread: threading.Thread | None = None
@@ -170,17 +179,17 @@ class CallbackSubscriber(SilentSubscriber):
             self._updates.listen()
             self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
             self._thread.start()
-        self.interface.wait(core.SilentSubscriber.listen(self._calls))
+        self.interface._wait(core.SilentSubscriber.listen(self._calls))
 
     def _call_all(self) -> None:
-        call, updates = self._calls.caller(), self._updates
+        call, updates = self._calls._caller(), self._updates
         assert updates is not None
         for update in updates:
             with call.logging(update, updates.dropped):
                 call(update)
 
     def close(self) -> None:
-        """Stop following and calling; waits up to a second for a call that is being made. Idempotent."""
+        """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
         if self._updates is not None:
             self._updates.close()
         super().close()

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .document import DocumentReader, DocumentWriter, opened, resolved
 from .errors import BadType, MissingKey
 from .plan.documents import number_text
-from .plan.paths import Path, check_element, show
+from .plan.paths import Path, check_element, counts_from_end, show
 from .policy import Newest, Policy
 
 if TYPE_CHECKING:
     from .plan.reads import Sealed
-    from .store import Reader, Writer
+    from .session import Session
     from .subscribe import Watch
 
 __all__ = ["Accessor", "Edit"]
@@ -35,7 +36,7 @@ class Accessor:
 
     __slots__ = ("_path", "_reader", "_writer")
 
-    def __init__(self, reader: Reader, writer: Writer, path: Path) -> None:
+    def __init__(self, reader: DocumentReader, writer: DocumentWriter, path: Path) -> None:
         self._reader = reader
         self._writer = writer
         self._path = path
@@ -56,7 +57,7 @@ class Accessor:
     @property
     def full_path(self) -> Path:
         """The keys and indexes that lead here, top-level key first."""
-        return (self._reader.top_key_name, *self._path)
+        return (self._reader.name, *self._path)
 
     async def read(self) -> Any:
         """Return the value here. Arrays are read-only: they share memory with the reply.
@@ -188,31 +189,24 @@ class Accessor:
         """
         from .subscribe import Watch
 
-        return Watch(self._reader.interface, self._reader.keys, self._path, policy or Newest())
+        return Watch(self._reader.session, self._reader.keys, self._path, policy or Newest())
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuilt, (
-            type(self),
-            type(self._writer),
-            self._reader.interface,
-            self._reader.top_key_name,
-            self._path,
-        )
+        return rebuilt, (type(self), type(self._writer), self._reader.session, self.full_path)
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {show(self.full_path)}>"
 
 
-def _rebuilt(kind: type[Accessor], writer: type[Writer], interface: Any, key: str, path: Path) -> Accessor:
-    from .store import Reader
-
-    return kind(Reader(key, interface), writer(key, interface), path)
+def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> Any:
+    """Make an accessor from the parts of a pickled one."""
+    return kind(DocumentReader(session, path[0]), writer(session, path[0]), path[1:])
 
 
 class Edit:
     """What `Accessor.edit` returns."""
 
-    def __init__(self, reader: Reader, writer: Writer, path: Path) -> None:
+    def __init__(self, reader: DocumentReader, writer: DocumentWriter, path: Path) -> None:
         self._reader = reader
         self._writer = writer
         self._path = path
@@ -220,8 +214,8 @@ class Edit:
         self._value: Any = None
 
     async def __aenter__(self) -> Any:
-        from .store import opened
-
+        if counts_from_end(self._path):
+            self._path = await resolved(self._reader, self._path, MissingKey)
         self._before = await self._reader.sealed(self._path)
         await opened(self._before)
         for crate, _, _ in self._before.crates:
@@ -230,7 +224,7 @@ class Edit:
                 crate.container[crate.key] = value.copy()
         self._value = self._before.holder[0]
         if not isinstance(self._value, dict | list | np.ndarray):
-            where = show((self._reader.top_key_name, *self._path))
+            where = show((self._reader.name, *self._path))
             raise BadType(
                 f"{where} is of type {type(self._value).__name__}, which cannot be changed in place; "
                 "edit the dict or list that holds it, or use write()"

@@ -33,6 +33,7 @@ Errors that come from the server or from the connection stay `redis.exceptions.R
 from __future__ import annotations
 
 import redis.exceptions
+from redis.exceptions import RedisError as RedisError
 
 __all__ = [
     "BadData",
@@ -102,7 +103,7 @@ class WriteOnly(Misuse, NotImplementedError):
     """A PublishSpace was read; it can only be written."""
 
 
-class ReadOnly(Misuse, NotImplementedError):
+class ReadOnly(Misuse, NotImplementedError, TypeError):
     """A subscriber's local copy was written; it only follows the server."""
 
 
@@ -157,7 +158,20 @@ class NoJsonSupport(ReemError, redis.exceptions.ResponseError):
 
 
 class WrongKind(ReemError, redis.exceptions.ResponseError):
-    """The key holds a Redis type that is not REEM's."""
+    """The key holds a Redis type that is not REEM's.
+
+    Attributes:
+        key: The key on the server.
+        where: The path that was meant.
+    """
+
+    def __init__(self, key: str, where: str, kind: str = "another type") -> None:
+        super().__init__(
+            f"{where}: the Redis key {key!r} holds a value of type {kind} (a program without REEM wrote it), "
+            "not a document; choose another name, or remove that key"
+        )
+        self.key = key
+        self.where = where
 
 
 class PartialWrite(ReemError, redis.exceptions.ResponseError):

@@ -16,15 +16,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-import redis.exceptions
-
-from .errors import BadData, InterfaceClosed, MissingKey, ReemError
+from .errors import BadData, InterfaceClosed, MissingKey, RedisError, ReemError
 from .plan import Plan, Reply, unwrap, wire_commands
 from .plan.keys import Keys
 from .plan.memory import Memory
 from .plan.notices import ANNOUNCED, Notice, decode
 from .plan.paths import Path, show
-from .plan.reads import Sealed, read
+from .plan.reads import Sealed, interpret, read
 from .plan.trees import MISSING, CannotApply, copied, get, removed, replaced
 from .policy import Mailbox
 from .ships.registry import Ships
@@ -168,7 +166,7 @@ class Follower:
             result = plan.decode(unwrap(plan, outcome))
         except MissingKey:
             self._settle(MISSING)
-        except (ReemError, redis.exceptions.RedisError) as error:
+        except (ReemError, RedisError) as error:
             self._failed(error)
         else:
             if isinstance(result, Plan):
@@ -181,7 +179,7 @@ class Follower:
         waiting: list[tuple[Any, Any, Any]] = []
         try:
             for crate, ship, reply in sealed.crates:
-                value = ship.ship.interpret_read([reply])
+                value = interpret(sealed.name, crate, ship, reply)
                 if inspect.isawaitable(value):
                     waiting.append((crate.container, crate.key, value))
                 else:
@@ -297,11 +295,10 @@ class Hub:
 
     async def follow(self, follower: Follower) -> None:
         """Subscribe, then take the first snapshot; when this returns, no later update is missed."""
-        if self._closed:
-            raise InterfaceClosed("this RedisInterface is closed; make a new one")
         await self._ships.ready()
         channel = follower.keys.channel.encode()
         async with self._lock:
+            self._check()
             wire = self._wire
             if wire is None or not wire.alive:
                 wire = self._wire = await self._transport.listen(self._on_push, self._on_lost)
@@ -316,9 +313,14 @@ class Hub:
             except BaseException:
                 self._channels[channel].discard(follower)
                 follower.lost()
+                self._check()
                 raise
             finally:
                 follower.ready = None
+
+    def _check(self) -> None:
+        if self._closed:
+            raise InterfaceClosed("this RedisInterface is closed; make a new one")
 
     async def unfollow(self, follower: Follower) -> None:
         """Stop following. Idempotent."""
@@ -385,7 +387,7 @@ class Hub:
                         for follower in list(followers):
                             follower.start(wire, "gap")
                 return
-            except (redis.exceptions.RedisError, OSError) as error:
+            except (RedisError, OSError) as error:
                 logger.debug("not connected yet: %s", error)
 
     async def close(self) -> None:
@@ -398,6 +400,8 @@ class Hub:
                 await self.unfollow(follower)
         if self._wire is not None:
             await self._wire.close()
+        async with self._lock:  # whoever is just subscribing has now failed
+            self._channels.clear()
 
 
 async def _subscribe(wire: Wire, channels: list[bytes]) -> None:

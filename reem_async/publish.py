@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
 from .accessor import Accessor
+from .document import DocumentWriter
 from .errors import WriteOnly
 from .plan import Command
 from .plan.documents import Encoded
@@ -20,7 +21,7 @@ from .store import KeyValueStore, Writer
 __all__ = ["PublishAccessor", "PublishSpace", "Publisher"]
 
 
-class Publisher(Writer):
+class DocumentPublisher(DocumentWriter):
     """Writes one top-level key and tells its subscribers, in the same transaction.
 
     Updates of one interface to one top-level key are numbered and arrive in this order, so such
@@ -28,39 +29,38 @@ class Publisher(Writer):
     """
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
-        async with self.interface.transport.ordered(self.keys.channel):
+        async with self.session.transport.ordered(self.keys.channel):
             notice = with_value(*self._stamp(path), encoded.text, loaded)
             it = set_change(
                 self.keys,
                 path,
                 encoded.text,
                 loaded,
-                notice=(notice,),
-                retraction=(announce(*self._stamp(path)),),
+                notice=notice,
+                retraction=lambda: announce(*self._stamp(path)),
             )
-            await self.interface.run(self._plan(it))
+            await self.session.run(self._plan(it))
 
-    async def delete(self, path: Path) -> None:
-        """Remove what is at `path` and tell the subscribers."""
-        async with self.interface.transport.ordered(self.keys.channel):
-            it = delete_change(self.keys, path, notice=(announce(*self._stamp(path), deleted=True),))
-            await self.interface.run(change(it, self.interface.memory))
+    async def _delete(self, path: Path) -> None:
+        async with self.session.transport.ordered(self.keys.channel):
+            it = delete_change(self.keys, path, notice=announce(*self._stamp(path), deleted=True))
+            await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
-        async with self.interface.transport.ordered(self.keys.channel):
-            it = append_change(self.keys, path, texts, loaded, notice=(announce(*self._stamp(path)),))
-            await self.interface.run(change(it, self.interface.memory))
+        async with self.session.transport.ordered(self.keys.channel):
+            it = append_change(self.keys, path, texts, loaded, notice=announce(*self._stamp(path)))
+            await self.session.run(change(it, self.session.memory))
 
     async def _run(self, path: Path, plan: Callable[[Sequence[Command]], Any]) -> Any:
-        async with self.interface.transport.ordered(self.keys.channel):
+        async with self.session.transport.ordered(self.keys.channel):
             notice: Command = ("PUBLISH", self.keys.channel, announce(*self._stamp(path)))
-            return await self.interface.run(plan((notice,)))
+            return await self.session.run(plan((notice,)))
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
-        raise WriteOnly(_cannot_read((self.top_key_name, *it.path)))
+        raise WriteOnly(_cannot_read((self.name, *it.path)))
 
     def _stamp(self, path: Path) -> tuple[str, int, float, Path]:
-        return self.interface.publisher_id, self.interface.next_sequence(self.keys), time.time(), path
+        return self.session.publisher_id, self.session.next_sequence(self.keys), time.time(), path
 
 
 def _cannot_read(path: Path) -> str:
@@ -103,6 +103,17 @@ class PublishAccessor(Accessor):
         self._refuse()
 
 
+class Publisher(Writer):
+    """Writes one top-level key and tells its subscribers, in the same transaction.
+
+    Args:
+        top_key_name: The key.
+        interface: The server.
+    """
+
+    _kind = DocumentPublisher
+
+
 class PublishSpace(KeyValueStore):
     """A store that can only be written, and whose subscribers are told of every change.
 
@@ -114,7 +125,7 @@ class PublishSpace(KeyValueStore):
     """
 
     _accessor = PublishAccessor
-    _writer = Publisher
+    _writer = DocumentPublisher
 
     async def get(self, path: str, default: Any = None) -> Any:
         """Raise WriteOnly."""

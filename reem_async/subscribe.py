@@ -17,6 +17,7 @@ from .plan.keys import Keys
 from .plan.paths import Path, check_element, parse, show
 from .plan.trees import MISSING, copied, get
 from .policy import EMPTY, Ended, Last, Mailbox, Newest, Policy
+from .session import Session
 
 __all__ = ["CallbackSubscriber", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
 
@@ -24,21 +25,21 @@ logger = logging.getLogger("reem.subscribe")
 
 
 class Watch:
-    """Follows one path of one interface: an async iterator over its updates.
+    """Follows one path and yields its updates, one by one: an (async) iterator.
 
     Follows from the first `async for` or `async with` on. The first update is the value that is
     already there, if any (`initial`). Cancelling a waiting loop loses no update. Leaving a loop
     with `break` keeps following until the watch is closed or dropped.
 
     Args:
-        interface: The server.
+        session: The server.
         keys: The top-level key's names.
         path: The path below it.
         policy: What to keep for a loop that is slower than the updates.
     """
 
-    def __init__(self, interface: RedisInterface, keys: Keys, path: Path, policy: Policy) -> None:
-        self._interface = interface
+    def __init__(self, session: Session, keys: Keys, path: Path, policy: Policy) -> None:
+        self._session = session
         self.mailbox = Mailbox(policy)
         self._follower: Follower | None = None
         self._place = keys, path
@@ -46,7 +47,7 @@ class Watch:
         self._waiter: asyncio.Future[None] | None = None
 
     @property
-    def following(self) -> bool:
+    def _following(self) -> bool:
         """Whether it follows, or did until it was closed."""
         return self._follower is not None or self._closed
 
@@ -60,11 +61,11 @@ class Watch:
         if self._closed:
             raise InterfaceClosed("this subscription is closed; make a new one")
         if self._follower is None:
-            follower = self._interface.hub.follower(*self._place)
+            follower = self._session.hub.follower(*self._place)
             follower.mailboxes.append(self.mailbox)
             self._follower = follower
             try:
-                await self._interface.hub.follow(follower)
+                await self._session.hub.follow(follower)
             except BaseException:
                 self._follower = None
                 raise
@@ -74,7 +75,7 @@ class Watch:
         self._closed = True
         self.mailbox.close()
         if self._follower is not None:
-            await self._interface.hub.unfollow(self._follower)
+            await self._session.hub.unfollow(self._follower)
 
     aclose = close
 
@@ -82,7 +83,7 @@ class Watch:
         return self
 
     async def __anext__(self) -> Update:
-        if not self.following:
+        if not self._following:
             await self.listen()
         while True:
             try:
@@ -137,7 +138,7 @@ class SilentSubscriber:
         )
         key, *rest = parse(channel) or ("",)
         self.channel = channel
-        self._keys, self._path = self.interface.keys(key), tuple(rest)
+        self._keys, self._path = self.interface.session.keys(key), tuple(rest)
         self.full_path: Path = (self._keys.name, *rest)
         self.policy = policy or Newest()
         self._follower: Follower | None = None
@@ -154,9 +155,9 @@ class SilentSubscriber:
         if self._closed:
             raise InterfaceClosed("this subscriber is closed; make a new one")
         if self._follower is None:
-            self._follower = self.interface.hub.follower(self._keys, self._path)
+            self._follower = self.interface.session.hub.follower(self._keys, self._path)
             try:
-                await self.interface.hub.follow(self._follower)
+                await self.interface.session.hub.follow(self._follower)
             except BaseException:
                 self._follower = None
                 raise
@@ -167,7 +168,7 @@ class SilentSubscriber:
         for watch in self._watches:
             await watch.close()
         if self._follower is not None:
-            await self.interface.hub.unfollow(self._follower)
+            await self.interface.session.hub.unfollow(self._follower)
 
     def value(self) -> Any:
         """Return a copy of the value as of now, None if there is none. No round trip; any thread may call."""
@@ -178,7 +179,7 @@ class SilentSubscriber:
 
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an async iterator over the updates, beginning with the value that is there."""
-        watch = Watch(self.interface, self._keys, self._path, policy or self.policy)
+        watch = Watch(self.interface.session, self._keys, self._path, policy or self.policy)
         self._watches.append(watch)
         return watch
 
@@ -194,8 +195,17 @@ class SilentSubscriber:
     ) -> None:
         await self.close()
 
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        self[key].write(value)
+
+    def __delitem__(self, key: str | int) -> NoReturn:
+        self[key].write()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.channel, self.interface, self.policy)
+
     def __repr__(self) -> str:
-        return f"<{type(self).__module__.partition('.')[0]}.{type(self).__name__} {self.channel}>"
+        return f"<reem_async.{type(self).__name__} {self.channel}>"
 
 
 class LocalAccessor:
@@ -232,10 +242,24 @@ class LocalAccessor:
         except MissingKey:
             return default
 
-    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
-        raise ReadOnly("a subscriber only follows the server; write with a KeyValueStore or a PublishSpace")
+    def write(self, value: Any = None) -> NoReturn:
+        """Raise ReadOnly."""
+        where = show((self._subscriber.channel, *self._path))
+        raise ReadOnly(f"{where}: a subscriber only follows the server; write with a KeyValueStore or a PublishSpace")
 
-    __delitem__: Any = __setitem__
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        self[key].write(value)
+
+    def __delitem__(self, key: str | int) -> NoReturn:
+        self[key].write()
+
+    def __iadd__(self, value: Any) -> NoReturn:
+        self.write(value)
+
+    append = extend = increment = multiply = divide = delete = write
+    __isub__ = __imul__ = __itruediv__ = __iadd__
+    __iter__ = None
+    __contains__ = None
 
     def __repr__(self) -> str:
         return f"<LocalAccessor {show((self._subscriber.channel, *self._path))}>"
@@ -307,12 +331,15 @@ class CallbackSubscriber(SilentSubscriber):
             self._task.add_done_callback(_running.discard)
         await super().listen()
 
-    def caller(self) -> Caller:
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)
+
+    def _caller(self) -> Caller:
         """Return what makes the calls."""
         return Caller(self.channel, self.callback_function, self.kwargs)
 
     async def _call_all(self, updates: Watch) -> None:
-        call = self.caller()
+        call = self._caller()
         async for update in updates:
             with call.logging(update, updates.dropped):
                 result = call(update)
@@ -320,7 +347,7 @@ class CallbackSubscriber(SilentSubscriber):
                     await result
 
     async def close(self) -> None:
-        """Stop following and calling; waits for a call that is being made. Idempotent."""
+        """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
         await super().close()
         if self._task is not None and self._task is not asyncio.current_task():
             await asyncio.wait([self._task])

@@ -24,7 +24,8 @@ __all__ = ["calculate", "compute"]
 
 Operation = Callable[[Any, Any], Any]
 
-_LOWEST, _HIGHEST = -(2**63), 2**64 - 1
+_LOWEST, _HIGHEST = -(2**63), 2**63 - 1
+"""The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
 
 
 def calculate(

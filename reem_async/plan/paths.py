@@ -15,7 +15,7 @@ import orjson
 from ..errors import BadKey, BadType
 
 __all__ = [
-    "Path", "below", "check_element", "check_top_key", "may_hold", "parse", "parse_suffix", "show",
+    "Path", "below", "check_element", "check_top_key", "counts_from_end", "may_hold", "parse", "parse_suffix", "show",
     "suffix", "to_jsonpath",
 ]  # fmt: skip
 
@@ -50,9 +50,9 @@ def check_element(key: object, parent: Path) -> str | int:
 
 
 def check_top_key(key: object) -> str:
-    """Return `key` if it can name a top-level entry, else raise BadType or BadKey."""
+    """Return `key` if it can name a top-level entry, else raise BadKey."""
     if not isinstance(key, str):
-        raise BadType(f"the top-level key {shorten(key)} is not a str; use str(key)")
+        raise BadKey(f"the top-level key {shorten(key)} is not a str; use str(key)")
     if not key:
         raise BadKey("the top-level key is empty; give it a name")
     if "{" in key or "}" in key:
@@ -165,6 +165,12 @@ def show(path: Path) -> str:
     if not path:
         return "(root)"
     return str(path[0]) + suffix(path[1:])
+
+
+@lru_cache(maxsize=4096)
+def counts_from_end(path: Path) -> bool:
+    """Return whether any index is negative."""
+    return any(isinstance(key, int) and key < 0 for key in path)
 
 
 def below(path: Path, ancestor: Path) -> bool:

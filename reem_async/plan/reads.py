@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ..errors import BadType, Conflict
+from ..errors import BadData, Conflict
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
@@ -34,15 +34,29 @@ class Sealed:
 
     Attributes:
         holder: A list of one: the tree, with placeholders where `crates` says.
+        name: The top-level key.
         crates: Where each ship's value goes, the ship, and the reply to interpret.
         commands: What was asked in the end, and
         raw: what was received for it, to tell later whether anything changed.
     """
 
     holder: list[Any]
+    name: str
     crates: list[tuple[Crate, Registered, Reply]] = field(default_factory=list)
     commands: tuple[Command, ...] = ()
     raw: tuple[Any, ...] = ()
+
+
+def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
+    """Return what the ship makes of a reply: the value, or something to await.
+
+    Raises:
+        BadData: With the path, if the ship cannot believe it.
+    """
+    try:
+        return ship.ship.interpret_read([reply])
+    except BadData as error:
+        raise BadData(f"{name}{crate.placeholder.suffix.partition('~')[0]}: {error}") from None
 
 
 def get_command(keys: Keys, path: Path) -> Command:
@@ -66,7 +80,7 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
         holder = loads(text, keys)
         crates = find(holder) if MARK_BYTES in text else []
         if not crates:
-            return Sealed(holder, [], (command,), (text,))
+            return Sealed(holder, keys.name, [], (command,), (text,))
         return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
 
     return Plan([command], decode)
@@ -124,7 +138,7 @@ class _Fetch:
             for crate in crates
             for place in [(crate.placeholder.label, crate.placeholder.suffix)]
         ]
-        return Sealed(holder, crated, commands, (text, *replies[1:]))
+        return Sealed(holder, self.keys.name, crated, commands, (text, *replies[1:]))
 
     def _again(self, met: tuple[Placeholder, ...]) -> Plan:
         self.tries += 1
@@ -186,8 +200,3 @@ def length(keys: Keys, path: Path) -> Plan:
         ],
         decode,
     )
-
-
-def not_sized(keys: Keys, path: Path, value: Any) -> BadType:
-    """Return the error for len() of what has none."""
-    return BadType(f"{show(full(keys, path))} is of type {type(value).__name__} and has no length")

@@ -47,13 +47,12 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
     text = str(error)
     where = show(full(keys, path))
     if "wrong Redis type" in text or text.startswith("WRONGTYPE"):
-        return WrongKind(
-            f"{where}: the Redis key {keys.document!r} holds another type of data (a program without REEM wrote it); "
-            "choose another name, or remove that key"
-        )
+        return WrongKind(keys.document, where)
     if "unknown command" in text.lower() and "JSON." in text:
         return NoJsonSupport(no_json())
-    if "created at the root" in text or "that doesn't exist" in text:
+    if "that doesn't exist" in text:
+        return missing(keys, path)
+    if "created at the root" in text:
         return PathRefused(f"{where}: nothing is stored at {keys.name!r}; write {keys.name} itself first, as a dict")
     if "index out of range" in text:
         return PathRefused(f"{where}: the list index is out of range; use append() to make a list longer")

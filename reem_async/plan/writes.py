@@ -64,7 +64,7 @@ class Change:
         loaded: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
         notice: What to publish in the same transaction, None for nothing.
-        retraction: What to publish if the server refuses the change after all.
+        retraction: Makes what to publish if the server refuses the change after all.
     """
 
     keys: Keys
@@ -73,8 +73,8 @@ class Change:
     judge: Callable[[Reply], Any]
     loaded: tuple[Loaded, ...] = ()
     replaces: bool = True
-    notice: Sequence[Any] | None = None
-    retraction: Sequence[Any] | None = None
+    notice: bytes | None = None
+    retraction: Callable[[], bytes] | None = None
 
 
 REFUSED = object()
@@ -132,7 +132,7 @@ def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable
     if it.loaded:
         after.insert(0, ("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
     if it.notice is not None:
-        after.append(("PUBLISH", it.keys.channel, *it.notice))
+        after.append(("PUBLISH", it.keys.channel, it.notice))
     commands = [*before, *writes, it.command, *after]
     main = len(before) + len(writes)
 
@@ -180,7 +180,7 @@ class _Outcome:
         refused = judged is REFUSED or isinstance(judged, Exception)
         if refused and self.it.retraction is not None:
             return Plan(
-                [("PUBLISH", self.it.keys.channel, *self.it.retraction)],
+                [("PUBLISH", self.it.keys.channel, self.it.retraction())],
                 lambda _: self._settle(members, judged),
             )
         return self._settle(members, judged)
@@ -257,8 +257,8 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
     """
 
     def look(replies: Sequence[Reply]) -> Any:
-        _, text, reply = (checked(each, keys, ()) for each in replies)
-        members = frozenset(reply)
+        text = None if isinstance(replies[1], Exception) else replies[1]  # a foreign type refers to nothing
+        members = frozenset(checked(replies[2], keys, ()))
         used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys))} if text else set()
         orphans = sorted(members - used)
         memory.saw_members(keys.document, members)
@@ -284,7 +284,7 @@ def static_change(it: Change) -> Plan:
     main = len(commands)
     commands.append(it.command)
     if it.notice is not None:
-        commands.append(("PUBLISH", it.keys.channel, *it.notice))
+        commands.append(("PUBLISH", it.keys.channel, it.notice))
 
     def decode(replies: Sequence[Reply]) -> Any:
         for reply in replies:

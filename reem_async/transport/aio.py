@@ -48,8 +48,18 @@ class AsyncTransport:
         async with self._opening.setdefault(bulk, anyio.Lock()):
             wire = self._lanes.get(bulk)
             if wire is None or not wire.alive:
-                wire = self._lanes[bulk] = await open_wire(self._options)
+                wire = self._lanes[bulk] = await self._opened()
             return wire
+
+    async def _opened(
+        self, on_push: Callable[[list[Any]], None] | None = None, on_lost: Callable[[Exception], None] | None = None
+    ) -> Wire:
+        """Return a new connection, unless the interface was closed while it was made."""
+        wire = await open_wire(self._options, on_push, on_lost)
+        if self._closed:
+            await wire.close()
+            self.check()
+        return wire
 
     def check(self) -> None:
         """Bind to the running loop at first use; raise if this is another one, or if it is closed."""
@@ -79,13 +89,13 @@ class AsyncTransport:
     async def hold(self) -> AsyncIterator[Wire]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled."""
         self.check()
-        wire = self._spare.pop() if self._spare else await open_wire(self._options)
+        wire = self._spare.pop() if self._spare else await self._opened()
         try:
             yield wire
         except BaseException:
             await wire.close()
             raise
-        if wire.alive and len(self._spare) < _SPARE:
+        if wire.alive and len(self._spare) < _SPARE and not self._closed:
             self._spare.append(wire)
         else:
             await wire.close()
@@ -97,7 +107,7 @@ class AsyncTransport:
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""
         self.check()
-        return await open_wire(self._options, on_push, on_lost)
+        return await self._opened(on_push, on_lost)
 
     async def close(self) -> None:
         """Close all connections."""

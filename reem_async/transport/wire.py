@@ -17,7 +17,7 @@ import hiredis
 import redis.exceptions
 from redis._parsers import BaseParser
 
-from ..errors import ConnectionLost
+from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
 from .packing import pack
@@ -141,7 +141,9 @@ class Wire(asyncio.BufferedProtocol):
         """Close the connection and wait until it is."""
         if self._transport is None:
             return
-        self._fail(ConnectionLost("the connection was closed"))
+        self._fail(
+            InterfaceClosed("this RedisInterface was closed during the call, which was applied once or not at all")
+        )
         self._transport.close()
         await asyncio.wait([self._gone], timeout=1.0)
 

@@ -1,0 +1,240 @@
+"""One top-level key: reading and writing it, from values to plans."""
+
+from __future__ import annotations
+
+import inspect
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from .errors import BadType, MissingKey, PathRefused
+from .plan import Command, Plan
+from .plan.arithmetic import Operation, calculate, compute
+from .plan.documents import Encoded, Parcel, encode, number_text
+from .plan.paths import Path, counts_from_end, show, suffix
+from .plan.reads import Sealed, interpret, length, read, type_of
+from .plan.writes import (
+    Change,
+    Loaded,
+    append_change,
+    change,
+    delete_change,
+    exchange,
+    set_change,
+    static_change,
+)
+from .session import Session
+
+__all__ = ["DocumentReader", "DocumentWriter", "opened"]
+
+
+class DocumentReader:
+    """Reads one top-level key.
+
+    Args:
+        session: The server.
+        name: The key.
+    """
+
+    def __init__(self, session: Session, name: object) -> None:
+        self.session = session
+        self.keys = session.keys(name)
+        self.name = self.keys.name
+
+    async def read(self, path: Path) -> Any:
+        """Return the value at `path`; raises MissingKey."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        return await opened(await self.sealed(path))
+
+    async def sealed(self, path: Path) -> Sealed:
+        """Return what the server has at `path`, ships' replies not yet interpreted."""
+        if self.session.ships.asynchronous:
+            await self.session.ships.ready()
+        sealed: Sealed = await self.session.run(read(self.keys, path, self.session.ships, self.session.memory))
+        return sealed
+
+    async def type_at(self, path: Path) -> type:
+        """Return the Python type of the value at `path`."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        await self.session.ships.ready()
+        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships))
+        return type(await self.read(path)) if kind is None else kind
+
+    async def length_at(self, path: Path) -> int:
+        """Return the length of the value at `path`."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        count: int | None = await self.session.run(length(self.keys, path))
+        if count is not None:
+            return count
+        value = await self.read(path)
+        try:
+            return len(value)
+        except TypeError:
+            where = show((self.name, *path))
+            raise BadType(f"{where} is of type {type(value).__name__} and has no length") from None
+
+
+async def opened(sealed: Sealed) -> Any:
+    """Return the value a read brought, everything the ships hold put in its place."""
+    for crate, ship, reply in sealed.crates:
+        value = interpret(sealed.name, crate, ship, reply)
+        crate.container[crate.key] = await value if inspect.isawaitable(value) else value
+    return sealed.holder[0]
+
+
+async def resolved(document: DocumentReader | DocumentWriter, path: Path, error: type[Exception]) -> Path:
+    """Return `path` with every index counted from the front; one round trip for each that was not.
+
+    The server takes an index that is too negative for the first item, so it must not see any.
+    """
+    for position, key in enumerate(path):
+        if isinstance(key, int) and key < 0:
+            count = await document.session.run(length(document.keys, path[:position]))
+            if count is not None and -key > count:
+                raise error(
+                    f"{show((document.name, *path))}: the index {key} is out of range, the list has {count} items"
+                )
+            path = (*path[:position], key + (count or 0), *path[position + 1 :])
+    return path
+
+
+class DocumentWriter:
+    """Writes one top-level key.
+
+    Args:
+        session: The server.
+        name: The key.
+
+    Attributes:
+        static: The shape of what is written never changes; see `track_schema_changes`.
+    """
+
+    def __init__(self, session: Session, name: object) -> None:
+        self.session = session
+        self.keys = session.keys(name)
+        self.name = self.keys.name
+        self.static = False
+
+    async def set(self, path: Path, value: Any) -> None:
+        """Store `value` at `path`: one transaction."""
+        if counts_from_end(path):
+            path = await resolved(self, path, PathRefused)
+        unique = "" if _is_fixed(path) else _unique()
+        encoded, loaded = await self._prepared(path, value, unique)
+        await self._set(path, encoded, loaded)
+
+    async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+        await self.session.run(self._plan(set_change(self.keys, path, encoded.text, loaded)))
+
+    async def delete(self, path: Path) -> None:
+        """Remove what is at `path`."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        await self._delete(path)
+
+    async def _delete(self, path: Path) -> None:
+        await self.session.run(change(delete_change(self.keys, path), self.session.memory))
+
+    async def extend(self, path: Path, values: Sequence[Any]) -> None:
+        """Append `values` to the list at `path`, all or none."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        unique = _unique()
+        texts: list[bytes] = []
+        loaded: list[Loaded] = []
+        for number, value in enumerate(values):
+            encoded, parcels = await self._prepared((*path, -1), value, f"{unique}.{number}")
+            texts.append(encoded.text)
+            loaded.extend(parcels)
+        if texts:
+            await self._append(path, texts, tuple(loaded))
+
+    async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
+        await self.session.run(change(append_change(self.keys, path, texts, loaded), self.session.memory))
+
+    async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
+        """Apply a JSON arithmetic command; returns the new number."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        text = number_text(operand, (self.name, *path))
+        if isinstance(operand, np.generic):
+            operand = operand.item()
+        return await self._run(
+            path, lambda notices: calculate(self.keys, path, command, operation, operand, text, notices)
+        )
+
+    async def compute(self, path: Path, function: Any) -> Any:
+        """Replace the number at `path` by a function of it; returns the new number."""
+        if counts_from_end(path):
+            path = await resolved(self, path, MissingKey)
+        return await self._run(path, lambda notices: compute(self.keys, path, function, notices))
+
+    async def _run(self, path: Path, plan: Any) -> Any:
+        return await self.session.run(plan(()))
+
+    async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
+        """Store `value` at `path` if what is there is still `before`; raises Conflict."""
+        encoded, loaded = await self._prepared(path, value, _unique())
+        await self._exchange(set_change(self.keys, path, encoded.text, loaded), before)
+
+    async def _exchange(self, it: Change, before: Sealed) -> None:
+        await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))
+
+    def _plan(self, it: Change) -> Plan:
+        """Return the plan of a write, the short one where the shape is vouched for."""
+        memory = self.session.memory
+        if not _is_fixed(it.path):
+            return change(it, memory)
+        known = memory.shape(it.keys.document, it.path) if self.static else None
+        suffixes = frozenset([each.suffix for each in it.loaded])
+        if known is None:
+            memory.saw_shape(it.keys.document, it.path, suffixes)
+            return change(it, memory)
+        if known != suffixes:
+            odd = min(known ^ suffixes)
+            raise BadType(
+                f"{self.name}{odd}: an array (or other shipped value) where none was, or none where one was, "
+                "but track_schema_changes(False) says that the shape never changes; switch it back on for this write"
+            )
+        return static_change(it)
+
+    async def _prepared(self, path: Path, value: Any, unique: str) -> tuple[Encoded, tuple[Loaded, ...]]:
+        """Encode `value`, refusing what cannot be stored, and have the ships record their commands."""
+        ships = self.session.ships
+        fits: Any = ships.fits
+        if ships.asynchronous:
+            await ships.ready()
+            fits = await ships.choices(value)
+
+        def name(inner: Path) -> str:
+            return suffix(path + inner) + (f"~{unique}" if unique else "")
+
+        encoded = encode(value, (self.name, *path), fits, name)
+        return encoded, tuple([await self._load(parcel) for parcel in encoded.parcels])
+
+    async def _load(self, parcel: Parcel) -> Loaded:
+        key, ship = self.keys.tag + parcel.suffix, parcel.ship
+        if ship.fields is not None:
+            fields = ship.fields.pack(parcel.value)
+            words = [word for pair in fields.items() for word in pair]
+            return Loaded(parcel.suffix, ship.label, (("HSET", key, *words),), fields)
+        recorder = self.session.ships.new_recorder()
+        result = ship.ship.write(key, parcel.value, recorder)
+        if inspect.isawaitable(result):
+            await result
+        commands: tuple[Command, ...] = tuple(recorder.commands)
+        return Loaded(parcel.suffix, ship.label, commands)
+
+
+def _is_fixed(path: Path) -> bool:
+    """Return whether what is at `path` stays there: items of lists move when others are deleted."""
+    return not any(isinstance(key, int) for key in path)
+
+
+def _unique() -> str:
+    return secrets.token_hex(5)

@@ -1,0 +1,110 @@
+"""Session: what one interface shares among its stores and subscribers, on one transport."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+from .errors import BadType, NoJsonSupport, WrongKind
+from .plan import Plan
+from .plan.keys import Keys, keys_of
+from .plan.memory import Memory
+from .plan.paths import check_top_key
+from .plan.replies import no_json
+from .ships.base import SpecialDatatypeShip
+from .ships.registry import Ships, default_ships
+from .transport import Transport, drive
+from .transport.aio import AsyncTransport
+from .transport.options import Options
+from .transport.recorder import CommandRecorder
+
+if TYPE_CHECKING:
+    from .follow import Hub
+
+__all__ = ["Session"]
+
+
+class Session:
+    """One server as one interface sees it.
+
+    Args:
+        host: A host name, a URL, or an `EmbeddedServer`.
+        ships: What carries values that are not JSON; None for the default list.
+        namespace: Goes before every key and channel.
+        timeout: Seconds without a byte received after which a call is given up.
+        options: redis-py's connection options.
+        new_transport: Makes the transport.
+
+    Attributes:
+        ships: Chooses ships.
+        memory: What is known of the server.
+        transport: The way to the server.
+        interface: The interface this belongs to: what is pickled in its place.
+        publisher_id: Names this session in the notices of its updates.
+    """
+
+    def __init__(
+        self,
+        host: Any,
+        ships: Sequence[SpecialDatatypeShip] | None,
+        namespace: str,
+        timeout: float,
+        options: dict[str, Any],
+        new_transport: Callable[[Options], Transport],
+    ) -> None:
+        if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
+            raise BadType(f"the namespace {namespace!r} is not a str without braces")
+        self.namespace = namespace
+        self.options = Options(host, timeout, options)
+        self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
+        self.memory = Memory()
+        self.transport = new_transport(self.options)
+        self.interface: Any = None
+        self.publisher_id = secrets.token_hex(6)
+        self._sequences: dict[str, int] = {}
+        self._hub: Hub | None = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return attrgetter("session"), (self.interface,)
+
+    @property
+    def hub(self) -> Hub:
+        """The one subscription connection and all that follow updates through it."""
+        if self._hub is None:
+            from .follow import Hub
+
+            assert isinstance(self.transport, AsyncTransport)
+            self._hub = Hub(self.transport, self.ships, self.memory)
+        return self._hub
+
+    def keys(self, name: object) -> Keys:
+        """Return the server-side names of the top-level key `name`; raises BadKey."""
+        return keys_of(check_top_key(name), self.namespace, self.options.database)
+
+    async def run(self, plan: Plan) -> Any:
+        """Send a plan's commands, and those that follow from the replies; return the result."""
+        try:
+            return await drive(self.transport, plan)
+        except WrongKind as error:
+            (kind,) = await self.transport.roundtrip([("TYPE", error.key)])
+            raise WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?") from None
+
+    def next_sequence(self, keys: Keys) -> int:
+        """Return the number of this publisher's next update of a top-level key."""
+        number = self._sequences[keys.channel] = self._sequences.get(keys.channel, 0) + 1
+        return number
+
+    async def initialize(self) -> None:
+        """Connect and check that the server has RedisJSON."""
+        await self.ships.ready()
+        (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
+        if isinstance(reply, Exception) and "unknown command" in str(reply).lower():
+            raise NoJsonSupport(f"{self.options.address}: {no_json()}")
+
+    async def close(self) -> None:
+        """End all subscriptions and close all connections."""
+        if self._hub is not None:
+            await self._hub.close()
+        await self.transport.close()
