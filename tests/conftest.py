@@ -1,0 +1,400 @@
+"""Fixtures and small tools shared by all tests.
+
+The server is `$REEM_TEST_URL` if set, else an `EmbeddedServer`, else a `redis:8` container. It is not
+flushed: every test names its keys through the `key` fixture, and what carries its prefix is unlinked.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import operator
+import os
+import struct
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import numpy as np
+import pytest
+import redis
+
+ROOT = Path(__file__).resolve().parents[1]
+
+EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", "2000"))
+"""How many documents (and a fifth of it, arrays) the property tests try; the full promise is 100000."""
+
+PATIENCE = 10.0
+"""Seconds after which something that must happen is given up on."""
+
+
+# --- the server -------------------------------------------------
+
+
+@contextlib.contextmanager
+def _container():
+    """A redis:8 in Docker; not exercised where Docker does not run."""
+    from testcontainers.redis import RedisContainer
+
+    with RedisContainer("redis:8") as box:
+        yield f"redis://{box.get_container_host_ip()}:{box.get_exposed_port(6379)}/0"
+
+
+@pytest.fixture(scope="session")
+def server_url():
+    """Where the server of this test run listens."""
+    given = os.environ.get("REEM_TEST_URL")
+    if given:
+        yield given
+        return
+    from reem_async.errors import ServerMissing
+    from reem_async.server import EmbeddedServer
+
+    with contextlib.ExitStack() as stack:
+        try:
+            url = stack.enter_context(EmbeddedServer()).url
+        except ServerMissing:
+            url = stack.enter_context(_container())
+        yield url
+
+
+@pytest.fixture(scope="session")
+def raw(server_url):
+    """A plain client, to look behind the scenes."""
+    with redis.Redis.from_url(server_url, decode_responses=True) as client:
+        yield client
+
+
+class Keys:
+    """Makes names that no other test uses: `key("foo")` and `key("foobar")` share their beginning."""
+
+    def __init__(self):
+        self.prefix = f"t{uuid.uuid4().hex[:10]}"
+
+    def __call__(self, name="foo"):
+        return self.prefix + name
+
+
+@pytest.fixture
+def key(raw):
+    keys = Keys()
+    yield keys
+    left = list(raw.scan_iter(match=f"*{keys.prefix}*", count=1000))
+    if left:
+        raw.unlink(*left)
+
+
+# --- the two fronts -------------------------------------------------
+
+
+@pytest.fixture
+def interface(server_url, key):
+    import reem
+
+    with contextlib.closing(reem.RedisInterface(server_url)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def kvs(interface):
+    import reem
+
+    return reem.KeyValueStore(interface)
+
+
+@pytest.fixture
+def pspace(interface):
+    import reem
+
+    return reem.PublishSpace(interface)
+
+
+@pytest.fixture
+async def ainterface(server_url, key):
+    import reem_async
+
+    async with reem_async.RedisInterface(server_url) as opened:
+        yield opened
+
+
+@pytest.fixture
+async def akvs(ainterface):
+    import reem_async
+
+    return reem_async.KeyValueStore(ainterface)
+
+
+@pytest.fixture
+async def apspace(ainterface):
+    import reem_async
+
+    return reem_async.PublishSpace(ainterface)
+
+
+class BlockingFront:
+    """`reem` behind the few calls that tests of both fronts need; a path begins with the top-level key."""
+
+    def __init__(self, url, space="KeyValueStore", **options):
+        import reem
+
+        self.interface = reem.RedisInterface(url, **options)
+        self.interface.initialize()
+        self.kvs = getattr(reem, space)(self.interface)
+
+    def at(self, path):
+        handle = self.kvs
+        for element in path:
+            handle = handle[element]
+        return handle
+
+    def write(self, path, value):
+        self.at(path[:-1])[path[-1]] = value
+
+    def read(self, path):
+        return self.at(path).read()
+
+    def delete(self, path):
+        del self.at(path[:-1])[path[-1]]
+
+    def length(self, path):
+        return len(self.at(path))
+
+    def type(self, path):
+        return self.at(path).type()
+
+    def append(self, path, value):
+        self.at(path).append(value)
+
+    def extend(self, path, values):
+        operator.iadd(self.at(path), values)
+
+    def increment(self, path, number):
+        operator.iadd(self.at(path), number)
+
+    def multiply(self, path, number):
+        operator.imul(self.at(path), number)
+
+    def divide(self, path, number):
+        operator.itruediv(self.at(path), number)
+
+    def set(self, dotted, value):
+        self.kvs.set(dotted, value)
+
+    def get(self, dotted, *default):
+        return self.kvs.get(dotted, *default)
+
+    def close(self):
+        self.interface.close()
+
+
+class AsyncFront:
+    """`reem_async` behind the same calls, each run to its end on a loop of its own."""
+
+    def __init__(self, url, space="KeyValueStore", **options):
+        import reem_async
+
+        self.runner = asyncio.Runner(loop_factory=asyncio.new_event_loop)
+        self.interface = reem_async.RedisInterface(url, **options)
+        self.run(self.interface.initialize())
+        self.kvs = getattr(reem_async, space)(self.interface)
+
+    def run(self, awaitable):
+        async def wait():
+            return await awaitable
+
+        return self.runner.run(wait())
+
+    def at(self, path):
+        handle = self.kvs
+        for element in path:
+            handle = handle[element]
+        return handle
+
+    def write(self, path, value):
+        self.run(self.at(path).write(value))
+
+    def read(self, path):
+        return self.run(self.at(path).read())
+
+    def delete(self, path):
+        self.run(self.at(path).delete())
+
+    def length(self, path):
+        return self.run(self.at(path).length())
+
+    def type(self, path):
+        return self.run(self.at(path).type())
+
+    def append(self, path, value):
+        self.run(self.at(path).append(value))
+
+    def extend(self, path, values):
+        self.run(self.at(path).extend(values))
+
+    def increment(self, path, number):
+        self.run(self.at(path).increment(number))
+
+    def multiply(self, path, number):
+        self.run(self.at(path).multiply(number))
+
+    def divide(self, path, number):
+        self.run(self.at(path).divide(number))
+
+    def set(self, dotted, value):
+        self.run(self.kvs.set(dotted, value))
+
+    def get(self, dotted, *default):
+        return self.run(self.kvs.get(dotted, *default))
+
+    def close(self):
+        try:
+            self.run(self.interface.close())
+        finally:
+            self.runner.close()
+
+
+FRONTS = {"blocking": BlockingFront, "asyncio": AsyncFront}
+
+
+@pytest.fixture(params=list(FRONTS))
+def open_front(request, server_url, key):
+    """Opens a front with options; all are closed at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def open_(space="KeyValueStore", url=server_url, **options):
+            return stack.enter_context(contextlib.closing(FRONTS[request.param](url, space, **options)))
+
+        yield open_
+
+
+@pytest.fixture
+def front(open_front):
+    """Either front with the default options."""
+    return open_front()
+
+
+# --- comparing -------------------------------------------------
+
+
+def same_bits(one, other):
+    """Equal shape, dtype and content, bit by bit; padding between fields does not count."""
+    if one.dtype != other.dtype or one.shape != other.shape:
+        return False
+    if one.dtype.names:
+        return all(same_bits(one[name], other[name]) for name in one.dtype.names)
+    return one.tobytes() == other.tobytes()
+
+
+def assert_same(read, written, where="value"):
+    """What was read is what was written: type by type and bit by bit; a tuple has become a list."""
+    if isinstance(written, np.ndarray):
+        assert isinstance(read, np.ndarray), f"{where}: {type(read)} in place of an array"
+        assert same_bits(read, written), f"{where}: {read!r} in place of {written!r}"
+    elif isinstance(written, dict):
+        assert type(read) is dict, f"{where}: {read!r}"
+        assert set(read) == set(written), f"{where}: keys {set(read) ^ set(written)!r} differ"
+        for name in written:
+            assert_same(read[name], written[name], f"{where}[{name!r}]")
+    elif isinstance(written, (list, tuple)):
+        assert type(read) is list, f"{where}: {read!r}"
+        assert len(read) == len(written), f"{where}: {len(read)} items in place of {len(written)}"
+        for index, item in enumerate(written):
+            assert_same(read[index], item, f"{where}[{index}]")
+    elif isinstance(written, float):
+        assert type(read) is float, f"{where}: {read!r} in place of {written!r}"
+        assert struct.pack("<d", read) == struct.pack("<d", written), f"{where}: {read!r} is not {written!r}"
+    else:
+        assert type(read) is type(written), f"{where}: {read!r} in place of {written!r}"
+        assert read == written, f"{where}: {read!r} in place of {written!r}"
+
+
+# --- looking behind the scenes -------------------------------------------------
+
+HOUSEKEEPING = {"info", "ping", "hello", "auth", "select", "client", "command"}
+
+
+def commands_run(raw):
+    """How many commands of each name the server has run or turned down, but for housekeeping."""
+    counts = {}
+    for label, row in raw.info("commandstats").items():
+        name = label.removeprefix("cmdstat_").lower()
+        if name.split("|")[0] not in HOUSEKEEPING:
+            counts[name] = row["calls"] + row.get("rejected_calls", 0)
+    return counts
+
+
+@contextlib.contextmanager
+def nothing_sent(raw):
+    """Fails if the server saw any command inside the block."""
+    before = commands_run(raw)
+    yield
+    after = commands_run(raw)
+    sent = {name: count - before.get(name, 0) for name, count in after.items() if count != before.get(name, 0)}
+    assert not sent, f"the server was sent {sent}"
+
+
+def keys_of(raw, top_key):
+    """Every Redis key that belongs to one top-level key, but for the document itself."""
+    return {name for name in raw.scan_iter(match=f"*{top_key}*", count=1000) if name.startswith("{" + top_key + "}")}
+
+
+def placeholders(node):
+    """Every placeholder in a document as the server holds it."""
+    if isinstance(node, str):
+        return [node] if node.startswith("$ship ") else []
+    if isinstance(node, dict):
+        node = list(node.values())
+    return [found for child in node for found in placeholders(child)] if isinstance(node, list) else []
+
+
+def assert_no_orphans(raw, top_key):
+    """Arrays, registry and placeholders of a top-level key name each other exactly; nothing else exists."""
+    import json
+
+    text = raw.execute_command("JSON.GET", top_key)
+    found = placeholders(json.loads(text)) if text is not None else []
+    registry = "{" + top_key + "}:ships"
+    arrays = {name.removeprefix("{" + top_key + "}") for name in keys_of(raw, top_key) - {registry}}
+    members = set(raw.smembers(registry))
+    assert members == arrays, f"registry and arrays differ by {members ^ arrays}"
+    assert len(found) == len(arrays), f"placeholders {found} but arrays {arrays}"
+    for name in arrays:
+        assert any(name in text for text in found), f"no placeholder for {name} among {found}"
+
+
+def subscribed(raw):
+    """The ids of the connections that are subscribed to anything."""
+    rows = raw.client_list()
+    return {row["id"] for row in rows if any(int(row.get(kind, 0)) for kind in ("sub", "psub", "ssub"))}
+
+
+# --- waiting and other processes -------------------------------------------------
+
+
+def eventually(condition, timeout=PATIENCE):
+    """Wait until the condition holds; returns its last value."""
+    deadline = time.monotonic() + timeout
+    while not (value := condition()) and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert value, f"did not come true within {timeout} s"
+    return value
+
+
+async def aeventually(condition, timeout=PATIENCE):
+    """`eventually` for asyncio."""
+    deadline = time.monotonic() + timeout
+    while not (value := condition()) and time.monotonic() < deadline:
+        await asyncio.sleep(0.005)
+    assert value, f"did not come true within {timeout} s"
+    return value
+
+
+def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False):
+    """Run code in another Python; returns the finished process, or with `start` the running one."""
+    command = [sys.executable, *flags, "-c", code, *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    if start:
+        return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)

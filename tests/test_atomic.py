@@ -1,0 +1,401 @@
+"""One write is one transaction, one read one version, and no change of shape loses or leaves anything.
+
+The full promise (20,000 reads, 8 x 2,000 changes of shape) runs with REEM_TEST_EXAMPLES=100000.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import threading
+import time
+
+import numpy as np
+import pytest
+from conftest import EXAMPLES, PATIENCE, assert_no_orphans, assert_same, commands_run, keys_of, nothing_sent
+
+import reem
+import reem_async
+from reem_async.errors import MissingKey, PathRefused
+
+READS = max(200, EXAMPLES // 5)
+CHANGES = max(40, EXAMPLES // 50)
+SMALL, FULL = (48, 64, 3), (640, 480, 3)
+
+
+def frame(stamp, shape):
+    """An image that shows its stamp in every element."""
+    return {
+        "stamp": float(stamp),
+        "image": np.full(shape, float(stamp)),
+        "deep": [{"copy": np.full(5, float(stamp))}],
+    }
+
+
+def assert_not_torn(value):
+    image, copy = value["image"], value["deep"][0]["copy"]
+    seen = {value["stamp"], float(image.min()), float(image.max()), float(copy.min()), float(copy.max())}
+    assert len(seen) == 1, f"torn: {seen}"
+
+
+class Crew:
+    """Threads that work until told to stop, and whose failures count."""
+
+    def __init__(self):
+        self.failures = []
+        self.over = threading.Event()
+        self.threads = []
+
+    def start(self, work, *arguments):
+        def run():
+            try:
+                work(*arguments)
+            except BaseException as failure:
+                self.failures.append(failure)
+
+        self.threads.append(threading.Thread(target=run))
+        self.threads[-1].start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.over.set()
+        for thread in self.threads:
+            thread.join()
+        if self.failures:
+            raise self.failures[0]
+
+
+# --- torn values -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "reads"), [(SMALL, READS), (FULL, max(20, READS // 20) if EXAMPLES < 50_000 else READS)]
+)
+def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
+    """Two writers that replace both, two readers of the whole and of a part, each with an interface."""
+    with contextlib.ExitStack() as stack:
+        stores = [
+            reem.KeyValueStore(stack.enter_context(contextlib.closing(reem.RedisInterface(server_url))))
+            for _ in range(4)
+        ]
+        stores[0][key()] = {"frame": frame(0, shape)}
+        written = [0, 0]
+
+        def write(me):
+            for stamp in range(1 + me, 10**9, 2):
+                if crew.over.is_set():
+                    return
+                if stamp % 5:
+                    stores[me][key()]["frame"] = frame(stamp, shape)
+                else:
+                    stores[me][key()] = {"frame": frame(stamp, shape)}
+                written[me] += 1
+
+        def read(me):
+            for number in range(reads // 2):
+                if number % 3:
+                    assert_not_torn(stores[me][key()]["frame"].read())
+                else:
+                    assert_not_torn(stores[me][key()].read()["frame"])
+
+        with Crew() as crew:
+            crew.start(write, 0)
+            crew.start(write, 1)
+            with Crew() as readers:
+                readers.start(read, 2)
+                readers.start(read, 3)
+        assert min(written) >= 3, "a run counts only if there was load"
+
+
+def test_arrays_that_change_shape_dtype_and_place_are_never_read_apart(server_url, key):
+    """A reader that remembers where the arrays were is never shown a mixture."""
+    with contextlib.ExitStack() as stack:
+        writing, reading = (
+            reem.KeyValueStore(stack.enter_context(contextlib.closing(reem.RedisInterface(server_url))))
+            for _ in range(2)
+        )
+
+        def value(n):
+            shapes = [(3,), (2, 3), (0,), (1, 1, 4)]
+            array = np.full(shapes[n % 4], n % 100, ["u1", "<f8", ">i4"][n % 3])
+            places = [
+                {"a": array},
+                {"b": {"a": array}},
+                {"l": [array, array]},
+                {"a": n % 100},
+                {"a": [n], "b": array},
+            ]
+            return {"n": n, "in": places[n % 5]}
+
+        writing[key()] = value(0)
+
+        def write():
+            for n in range(10**9):
+                if crew.over.is_set():
+                    return
+                writing[key()] = value(n)
+
+        with Crew() as crew:
+            crew.start(write)
+            for _ in range(READS):
+                got = reading[key()].read()
+                assert_same(got, value(got["n"]))
+
+
+@pytest.mark.parametrize("shape", [SMALL, FULL], ids=["small", "full size"])
+async def test_image_and_stamp_are_never_seen_apart_by_a_subscriber(ainterface, key, server_url, shape):
+    """Neither by a loop, nor by a mirror, nor by a callback, with two publishers at work."""
+    seen = [0, 0]
+
+    def callback(data, updated_path):
+        assert_not_torn(data)
+        seen[1] += 1
+
+    failures = []
+
+    async def callback_and_tell(data, updated_path):
+        try:
+            callback(data, updated_path)
+        except AssertionError as failure:
+            failures.append(failure)
+
+    async with reem_async.RedisInterface(server_url) as other:
+        spaces = [reem_async.PublishSpace(ainterface), reem_async.PublishSpace(other)]
+        await spaces[0][key()].write(frame(0, shape))
+        mirror = reem_async.SilentSubscriber(key(), ainterface)
+        calls = reem_async.CallbackSubscriber(key(), ainterface, callback_and_tell, {})
+        async with mirror, calls:
+            updates = reem_async.KeyValueStore(ainterface)[key()].watch()
+
+            async def publish(me):
+                for stamp in range(1 + me, 10**9, 2):
+                    await spaces[me][key()].write(frame(stamp, shape))
+                    await asyncio.sleep(0)
+
+            publishers = [asyncio.create_task(publish(me)) for me in range(2)]
+            enough = max(10, READS // 10) if shape == SMALL else 10
+            async with asyncio.timeout(60 + READS / 50):
+                async for update in updates:
+                    assert_not_torn(update.data)
+                    assert_not_torn(mirror.value())
+                    seen[0] += 1
+                    if seen[0] >= enough and seen[1] >= 3:
+                        break
+            for task in publishers:
+                task.cancel()
+            await asyncio.gather(*publishers, return_exceptions=True)
+    assert not failures, failures[0]
+
+
+# --- how many commands -----------------------------------------------------------------------------
+
+
+def test_a_plain_read_is_one_command_and_a_plain_write_needs_no_transaction(front, key, raw):
+    """As design section 3 has it."""
+    front.write([key()], {"n": 1, "x": 0.5})
+    before = commands_run(raw)
+    front.read([key()])
+    front.read([key(), "n"])
+    after = commands_run(raw)
+    assert sum(after.values()) - sum(before.values()) == 2
+    front.write([key()], {"n": 2, "x": 0.25})
+    with nothing_sent(raw):
+        pass
+    for name in (
+        "eval",
+        "evalsha",
+        "fcall",
+        "script",
+        "function",
+        "keys",
+        "flushall",
+        "flushdb",
+        "config|set",
+    ):
+        assert not commands_run(raw).get(name), f"{name} was used"
+
+
+# --- changes of shape ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "array", [np.arange(3), b"bytes", [np.arange(2), {"x": np.arange(4)}]], ids=["array", "bytes", "list"]
+)
+def test_a_write_refused_by_the_server_leaves_no_arrays(front, key, raw, array):
+    """The document part cannot be set, so its arrays must not stay either, nor replace others."""
+    front.write([key()], {"scalar": 1, "image": np.zeros(2), "l": [np.ones(1)]})
+    before = set(raw.scan_iter(match=f"*{key()}*"))
+    for path in (["scalar", "x"], ["gone", "x"], ["image", "x"], ["l", 5], ["l", 0, "x"], ["image", 0]):
+        with pytest.raises(PathRefused):
+            front.write([key(), *path], array)
+        assert set(raw.scan_iter(match=f"*{key()}*")) == before
+    assert_same(front.read([key()]), {"scalar": 1, "image": np.zeros(2), "l": [np.ones(1)]})
+    assert_no_orphans(raw, key())
+
+
+def test_a_writer_does_not_trust_what_it_remembers(front, open_front, key, raw):
+    """Another client changes the shape between two writes of one client."""
+    other = open_front()
+    shapes = [
+        1,
+        np.arange(3),
+        {"a": np.arange(2)},
+        {"a": {"b": np.arange(4)}},
+        [np.arange(1), 2],
+        "text",
+        {},
+        b"x",
+    ]
+    front.write([key()], {"s": None})
+    for mine in shapes:
+        for theirs in shapes:
+            front.write([key(), "s"], mine)
+            other.write([key(), "s"], theirs)
+            assert_same(front.read([key(), "s"]), theirs)
+            assert_no_orphans(raw, key())
+            front.write([key(), "s"], mine)
+            assert_same(other.read([key()]), {"s": mine})
+            assert_no_orphans(raw, key())
+            with contextlib.suppress(PathRefused):
+                front.write([key(), "s", "a"], np.arange(6))
+            other.delete([key(), "s"])
+            assert_same(front.read([key()]), {})
+            assert keys_of(raw, key()) == set()
+
+
+def _shape(rng, n):
+    """A value that shows in itself whether it is whole: everything in it is n."""
+    array = np.full(rng.choice([(2,), (3, 1), ()]), n)
+    return rng.choice(
+        [
+            n,
+            array,
+            {"n": n, "a": array},
+            {"n": n, "deep": {"a": array, "b": array}},
+            [n, array],
+            str(n),
+            {"a": [array]},
+        ]
+    )
+
+
+def _numbers(value):
+    """All numbers in a value."""
+    if isinstance(value, np.ndarray):
+        return {int(number) for number in value.ravel()}
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return set().union(*map(_numbers, value)) if value else set()
+    return {int(value)}
+
+
+def _change_shapes(store, top, me, rng, failed):
+    """One client's work: its own entry must keep what it wrote last, the shared one must always be whole."""
+    mine = f"mine{me}"
+    last = None
+    for step in range(CHANGES):
+        n = me * 1_000_000 + step
+        kind = rng.randrange(8)
+        try:
+            if kind < 3:
+                store[top]["shared"] = _shape(rng, n)
+            elif kind == 3:
+                store[top]["shared"]["sub"] = _shape(rng, n)
+            elif kind == 4:
+                del store[top]["shared"]["deep"]
+            elif kind == 5:
+                store[top]["list"].append(_shape(rng, n))
+                if rng.random() < 0.7:
+                    del store[top]["list"][0]
+            elif kind == 6:
+                value = store[top]["shared"].read()
+                if not (isinstance(value, dict) and "sub" in value):
+                    assert len(_numbers(value)) <= 1, f"a mixture: {value!r}"
+            else:
+                store[top].read()
+        except (PathRefused, MissingKey, reem.BadType):
+            failed.append(kind)
+        last = _shape(rng, n)
+        store[top][mine] = last
+        if step % 10 == 0:
+            assert_same(store[top][mine].read(), last)
+    return mine, last
+
+
+def test_eight_clients_that_change_shapes_lose_nothing_and_leave_no_orphans(server_url, key, raw):
+    """`foo` beside `foobar`; each client's own entry holds what it wrote last."""
+    seed = time.time_ns()
+    print("seed", seed)
+    expected = {key("foo"): {}, key("foobar"): {}}
+    failed = []
+    with contextlib.ExitStack() as stack:
+        opened = [stack.enter_context(contextlib.closing(reem.RedisInterface(server_url))) for _ in range(8)]
+        for top in expected:
+            reem.KeyValueStore(opened[0])[top] = {"shared": 0, "list": []}
+
+        def work(me):
+            top = key("foo") if me % 4 else key("foobar")
+            mine, last = _change_shapes(reem.KeyValueStore(opened[me]), top, me, random.Random(seed + me), failed)
+            expected[top][mine] = last
+
+        with Crew() as crew:
+            for me in range(8):
+                crew.start(work, me)
+        kvs = reem.KeyValueStore(opened[0])
+        for top, entries in expected.items():
+            assert_no_orphans(raw, top)
+            value = kvs[top].read()
+            assert_same({name: value[name] for name in entries}, entries)
+            assert set(value) == {"shared", "list", *entries}
+        for top in expected:
+            del kvs[top]
+            assert keys_of(raw, top) == set()
+    assert len(failed) < 8 * CHANGES, "every operation failed"
+
+
+async def test_concurrent_tasks_that_change_shapes_leave_no_orphans(akvs, key, raw):
+    """The same on one shared async interface, where calls interleave at every await."""
+    rng = random.Random(5)
+    await akvs[key()].write({"shared": 0})
+
+    async def work(me):
+        for step in range(CHANGES):
+            n = me * 1_000_000 + step
+            with contextlib.suppress(PathRefused, MissingKey):
+                if rng.random() < 0.5:
+                    await akvs[key()]["shared"].write(_shape(rng, n))
+                elif rng.random() < 0.5:
+                    await akvs[key()]["shared"]["a"].write(_shape(rng, n))
+                else:
+                    await akvs[key()]["shared"]["a"].delete()
+            await akvs[key()][f"mine{me}"].write(last := _shape(rng, n))
+        return last
+
+    async with asyncio.timeout(PATIENCE * 6):
+        lasts = await asyncio.gather(*(work(me) for me in range(8)))
+    value = await akvs[key()].read()
+    assert_same(
+        {f"mine{me}": value[f"mine{me}"] for me in range(8)},
+        {f"mine{me}": last for me, last in enumerate(lasts)},
+    )
+    assert_no_orphans(raw, key())
+
+
+async def test_a_cancelled_write_is_whole_or_absent(akvs, key, raw):
+    """Never a document without its arrays, nor arrays without a document."""
+    await akvs[key()].write(frame(0, SMALL))
+    for stamp in range(1, 60):
+        task = asyncio.create_task(akvs[key()].write(frame(stamp, SMALL)))
+        for _ in range(stamp % 6):
+            await asyncio.sleep(0)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        value = await akvs[key()].read()
+        assert_not_torn(value)
+    await akvs[key()].write(frame(99, SMALL))
+    assert_same(await akvs[key()].read(), frame(99, SMALL))
+    assert_no_orphans(raw, key())

@@ -1,0 +1,452 @@
+"""What cannot be stored is refused before anything is sent, by the right error, which names the path.
+
+The rows are those of research/reliability.md, section 4, and of issue 2, item 3.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import datetime
+import decimal
+import enum
+import fractions
+import uuid
+
+import numpy as np
+import pytest
+from conftest import assert_no_orphans, assert_same, commands_run, nothing_sent
+
+import reem
+from reem_async.errors import (
+    BadInput,
+    BadKey,
+    BadType,
+    BadValue,
+    InterfaceClosed,
+    MissingKey,
+    Overflow,
+    PathRefused,
+    ReemError,
+    TooDeep,
+    WrongKind,
+    WrongLoop,
+)
+
+
+class Colour(enum.Enum):
+    RED = "red"
+
+
+@dataclasses.dataclass
+class Pose:
+    x: float = 0.0
+
+
+def nest(levels, inner=1):
+    for _ in range(levels):
+        inner = [inner]
+    return inner
+
+
+def circle():
+    around = {"a": [1]}
+    around["a"].append(around)
+    return around
+
+
+VALUES = {
+    "nan": (BadValue, float("nan")),
+    "inf": (BadValue, float("inf")),
+    "minus inf": (BadValue, float("-inf")),
+    "numpy nan": (BadValue, np.float64("nan")),
+    "float32 inf": (BadValue, np.float32("inf")),
+    "int above": (BadValue, 2**64),
+    "int below": (BadValue, -(2**63) - 1),
+    "int far above": (BadValue, 10**40),
+    "lone surrogate": (BadValue, "a\ud800b"),
+    "set": (BadType, {1, 2}),
+    "frozenset": (BadType, frozenset([1])),
+    "complex": (BadType, 1 + 2j),
+    "decimal": (BadType, decimal.Decimal("1.5")),
+    "fraction": (BadType, fractions.Fraction(1, 3)),
+    "object": (BadType, object()),
+    "function": (BadType, len),
+    "class": (BadType, dict),
+    "generator": (BadType, (n for n in [1])),
+    "datetime": (BadType, datetime.datetime(2019, 5, 23)),
+    "date": (BadType, datetime.date(2019, 5, 23)),
+    "time": (BadType, datetime.time(1, 2)),
+    "uuid": (BadType, uuid.UUID(int=5)),
+    "enum": (BadType, Colour.RED),
+    "dataclass": (BadType, Pose()),
+    "object array": (BadType, np.array([1, "a", None], object)),
+    "0-d object array": (BadType, np.array(None, object)),
+    "struct with object": (BadType, np.zeros(2, [("n", "i4"), ("o", "O")])),
+    "nested struct with object": (BadType, np.zeros(2, [("n", [("o", "O")])])),
+    "masked array": (BadType, np.ma.masked_array([1, 2], [True, False])),
+    "masked constant": (BadType, np.ma.masked),
+    "key int": (BadKey, {1: "one"}),
+    "key None": (BadKey, {None: 1}),
+    "key bool": (BadKey, {True: 1}),
+    "key float": (BadKey, {1.5: 1}),
+    "key tuple": (BadKey, {("a", "b"): 1}),
+    "key bytes": (BadKey, {b"a": 1}),
+    "key enum": (BadKey, {Colour.RED: 1}),
+    "key that would collide": (BadKey, {1: "one", "1": "eins"}),
+    "key lone surrogate": (BadInput, {"\udfff": 1}),
+    "nan beside an array": (BadValue, {"a": np.arange(2), "n": float("nan")}),
+    "set beside an array": (BadType, [np.arange(2), {1}]),
+    "101 levels": (TooDeep, nest(101)),
+    "2000 levels": (TooDeep, nest(2000)),
+    "100000 levels": (TooDeep, nest(100_000)),
+    "circle": (TooDeep, circle()),
+}
+if np.dtype(np.longdouble) != np.dtype(np.float64):
+    VALUES["longdouble"] = (BadType, np.zeros(2, np.longdouble))
+    VALUES["clongdouble"] = (BadType, np.zeros(2, np.clongdouble))
+    VALUES["struct with longdouble"] = (BadType, np.zeros(2, [("n", "i4"), ("x", np.longdouble)]))
+if hasattr(np.dtypes, "StringDType"):
+    VALUES["StringDType"] = (BadType, np.array(["a", "b"], np.dtypes.StringDType()))
+
+
+@pytest.fixture
+def stored(front, key):
+    """A document that must stay as it is."""
+    document = {"outer": {"inner": [0, 1, 2]}, "n": 1, "image": np.arange(4)}
+    front.write([key()], document)
+    yield document
+    assert_same(front.read([key()]), document)
+
+
+# --- values ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", VALUES)
+def test_a_value_that_cannot_be_stored_is_refused_wherever_it_is(front, key, raw, stored, row):
+    """As the root, deep inside a document, and at a path; the class is also the builtin one."""
+    error, value = VALUES[row]
+    with nothing_sent(raw):
+        with pytest.raises(error) as caught:
+            front.write([key()], value)
+        assert key() in str(caught.value)
+        with pytest.raises(error):
+            front.write([key(), "outer", "new"], value)
+        with pytest.raises(error):
+            front.append([key(), "outer", "inner"], value)
+        with pytest.raises(error):
+            front.extend([key(), "outer", "inner"], [1, value])
+        with pytest.raises(error):
+            front.set(key() + ".outer", value)
+    assert isinstance(caught.value, ReemError)
+    assert isinstance(caught.value, (ValueError, TypeError))
+    assert len(str(caught.value)) < 1000, "a long value must be shortened"
+
+
+@pytest.mark.parametrize("row", [row for row in VALUES if "levels" not in row])
+def test_the_error_names_the_path_of_the_bad_value(front, key, raw, stored, row):
+    """From the top-level key down through dicts and lists."""
+    error, value = VALUES[row]
+    with nothing_sent(raw), pytest.raises(error) as caught:
+        front.write([key(), "outer"], {"neighbour": 1, "left": [0, {"right": value}]})
+    text = str(caught.value)
+    where = [text.find(part) for part in (key(), "outer", "left", "1", "right")]
+    assert -1 not in where, text
+    assert "neighbour" not in text, "only the path is named, not the neighbours"
+
+
+@pytest.mark.parametrize("row", ["nan", "int above", "set", "object array", "key int", "circle"])
+def test_a_publish_is_checked_like_a_write(open_front, key, raw, row):
+    """No notice goes out either."""
+    error, value = VALUES[row]
+    publishing = open_front("PublishSpace")
+    publishing.write([key()], {"a": 1})
+    with nothing_sent(raw), pytest.raises(error, match=key()):
+        publishing.write([key(), "a"], {"b": value})
+
+
+def test_a_circle_is_called_circular(front, key):
+    """Depth alone would not tell what is wrong."""
+    with pytest.raises(TooDeep, match=r"(?i)circular|itself"):
+        front.write([key()], circle())
+
+
+def test_the_same_object_twice_is_no_circle(front, key):
+    """A shared list or array is written twice."""
+    shared = [1, np.arange(2)]
+    front.write([key()], {"a": shared, "b": [shared, shared]})
+    assert_same(front.read([key()]), {"a": shared, "b": [shared, shared]})
+
+
+def test_depth_counts_from_the_root_of_the_document(front, key, raw):
+    """What could not be written whole cannot be built step by step either."""
+    named = {}
+    for _ in range(60):
+        named = {"d": named}
+    front.write([key()], named)
+    with nothing_sent(raw), pytest.raises(TooDeep):
+        front.write([key(), *["d"] * 60, "e"], nest(60))
+    assert_same(front.read([key()]), named)
+
+
+def test_checks_are_real_exceptions_also_under_optimization(server_url, key):
+    """`python -O` drops assert statements."""
+    from conftest import python
+
+    code = (
+        "import sys, reem\n"
+        "interface = reem.RedisInterface(sys.argv[1])\n"
+        "kvs = reem.KeyValueStore(interface)\n"
+        "for bad in (float('nan'), {1: 2}, {1}, 2**64):\n"
+        "    try: kvs[sys.argv[2]] = {'a': bad}\n"
+        "    except reem.BadInput: print('refused')\n"
+        "interface.close()\n"
+    )
+    done = python(code, server_url, key(), flags=("-O",))
+    assert done.stdout.split() == ["refused"] * 4, done.stderr
+
+
+# --- keys and paths --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "top",
+    ["", "a{b", "a}b", "{a}", "x" * 513, "é" * 257, "a\ud800", 5, None, True, 1.5, b"foo", ("a",)],
+    ids=lambda top: repr(top)[:12],
+)
+def test_a_top_level_key_is_checked(front, raw, top):
+    """A str of 1 to 512 bytes without braces; read, write and delete alike."""
+    with nothing_sent(raw):
+        for call in (front.read, front.delete, lambda path: front.write(path, 1)):
+            with pytest.raises(BadInput) as caught:
+                call([top])
+            assert isinstance(caught.value, (BadKey, BadValue))
+
+
+def test_a_top_level_key_of_512_bytes_is_fine(front, key):
+    """With dots, spaces, quotes and unicode in it."""
+    for top in (key("x" * 300).ljust(512, "y"), key(" a.b é🤖 *$[]'")):
+        front.write([top], {"a": np.arange(2)})
+        assert_same(front.read([top, "a"]), np.arange(2))
+
+
+@pytest.mark.parametrize("element", ["a\\b", "\\", "\"'", "x'y\"z"])
+def test_an_element_that_cannot_be_addressed_is_refused_as_a_path(front, key, raw, element):
+    """A backslash or both kinds of quotes: the server would write another key. The document may hold it."""
+    document = {"odd": {element: 1, "image": np.arange(2)}}
+    front.write([key()], document)
+    with nothing_sent(raw):
+        for call in (front.read, front.delete, lambda path: front.write(path, 2), front.length):
+            with pytest.raises(BadKey, match=key()):
+                call([key(), "odd", element])
+        with pytest.raises(BadKey):
+            front.write([key(), "odd", element, "below"], 2)
+    assert_same(front.read([key()]), document)
+
+
+@pytest.mark.parametrize("element", [None, True, 1.5, b"a", ("a",), slice(0, 1), "\ud800"], ids=repr)
+def test_a_path_element_is_a_string_or_an_integer(front, key, raw, stored, element):
+    """A bool is no index."""
+    with nothing_sent(raw):
+        for call in (front.read, front.delete, lambda path: front.write(path, 1)):
+            with pytest.raises(BadInput):
+                call([key(), "outer", element])
+
+
+@pytest.mark.parametrize("element", ["*", "..", ".", "$", "$.*", "[*]", "?(@)", '"],$["n', "'],$['n", "n,outer"])
+def test_path_syntax_inside_an_element_is_just_a_name(front, key, stored, element):
+    """Nothing is matched, joined or escaped by it."""
+    with pytest.raises(MissingKey):
+        front.read([key(), element])
+    with pytest.raises(MissingKey):
+        front.delete([key(), element])
+    front.write([key(), element], "here")
+    assert front.read([key(), element]) == "here"
+    assert front.read([key(), "n"]) == 1
+    front.delete([key(), element])
+
+
+# --- what the server holds -------------------------------------------------------------------------
+
+
+def test_a_missing_key_or_path_is_a_key_error(front, key, stored):
+    """On read, delete, length, type and append; the text names the path."""
+    calls = (front.read, front.delete, front.length, front.type, lambda path: front.append(path, 1))
+    for call in calls:
+        with pytest.raises(MissingKey, match=key("absent")):
+            call([key("absent")])
+        with pytest.raises(KeyError, match="absent"):
+            call([key(), "outer", "absent"])
+
+
+@pytest.mark.parametrize("value", [1, np.arange(3), {"a": [np.arange(3), b"x"]}], ids=["plain", "array", "mixed"])
+def test_a_write_that_has_no_parent_is_refused_and_leaves_nothing(front, key, raw, stored, value):
+    """A missing parent, a scalar or an array as parent, an index out of range; no arrays are left behind."""
+    before = set(raw.scan_iter(match=f"*{key()}*"))
+    for path, named in [
+        ([key("absent"), "a"], key("absent")),
+        ([key(), "gone", "a"], "gone"),
+        ([key(), "gone", "a", "b"], "gone"),
+        ([key(), "n", "a"], "n"),
+        ([key(), "n", 0], "n"),
+        ([key(), "image", "a"], "image"),
+        ([key(), "image", 0], "image"),
+        ([key(), "outer", "inner", 3], "inner"),
+        ([key(), "outer", "inner", "a"], "inner"),
+        ([key(), "outer", 0], "outer"),
+    ]:
+        with pytest.raises(PathRefused) as caught:
+            front.write(path, value)
+        assert isinstance(caught.value, KeyError)
+        assert path[0] in str(caught.value)
+        assert named in str(caught.value)
+    assert set(raw.scan_iter(match=f"*{key()}*")) == before
+    assert_no_orphans(raw, key())
+
+
+def test_the_first_missing_element_is_named(front, key):
+    """It is the one to create."""
+    front.write([key()], {"here": {}})
+    with pytest.raises(PathRefused) as caught:
+        front.write([key(), "here", "first", "second", "third"], 1)
+    assert "first" in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["string", "list", "hash"])
+def test_a_key_of_a_foreign_type_is_named_and_left_alone(front, key, raw, kind):
+    """Whoever put it there did not expect it to be overwritten."""
+    put = {
+        "string": lambda: raw.set(key(), "x"),
+        "list": lambda: raw.rpush(key(), "x"),
+        "hash": lambda: raw.hset(key(), "x", 1),
+    }
+    put[kind]()
+    writes = [lambda: front.write([key()], 1), lambda: front.write([key()], np.arange(3))]
+    for call in (lambda: front.read([key()]), lambda: front.write([key(), "a"], 1), *writes):
+        with pytest.raises(WrongKind, match=kind) as caught:
+            call()
+        assert key() in str(caught.value)
+    assert raw.type(key()) == kind
+    assert set(raw.scan_iter(match=f"*{key()}*")) == {key()}
+
+
+@pytest.mark.parametrize(
+    ("start", "method", "operand"),
+    [
+        (2**63 - 1, "increment", 1),
+        (2**63 - 5, "increment", 2**62),
+        (-(2**63), "increment", -1),
+        (2**62, "multiply", 2),
+        (2**62, "multiply", 4),
+        (3_037_000_500, "multiply", 3_037_000_500),
+        (2**64 - 1, "increment", 1),
+        (1e308, "multiply", 100.0),
+    ],
+)
+def test_arithmetic_out_of_range_is_an_overflow_and_changes_nothing(front, key, start, method, operand):
+    """The server itself would wrap around or turn to float."""
+    front.write([key()], {"n": start})
+    with pytest.raises(Overflow) as caught:
+        getattr(front, method)([key(), "n"], operand)
+    assert isinstance(caught.value, OverflowError)
+    assert key() in str(caught.value)
+    assert_same(front.read([key()]), {"n": start})
+
+
+@pytest.mark.parametrize("value", ["text", None, True, [1], {"a": 1}, np.arange(3), np.array(1), b"1"], ids=repr)
+def test_arithmetic_on_what_is_no_number_is_a_type_error(front, key, value):
+    """An array is none: its elements are not on the server as numbers."""
+    front.write([key()], {"n": value})
+    for method in (front.increment, front.multiply, front.divide):
+        with pytest.raises(BadType, match=key()):
+            method([key(), "n"], 2)
+    assert_same(front.read([key(), "n"]), value)
+
+
+@pytest.mark.parametrize("operand", ["1", None, 1j, float("nan"), float("inf"), {1}], ids=repr)
+def test_arithmetic_with_a_bad_operand_is_refused(front, key, raw, stored, operand):
+    """Before anything is sent."""
+    with nothing_sent(raw):
+        for method in (front.multiply, front.divide):
+            with pytest.raises((BadInput, TypeError)):
+                method([key(), "n"], operand)
+        with pytest.raises((BadInput, TypeError)):
+            front.increment([key(), "n"], operand)
+
+
+def test_a_division_by_zero_changes_nothing(front, key, stored):
+    """And is an error."""
+    with pytest.raises((ZeroDivisionError, BadInput)):
+        front.divide([key(), "n"], 0)
+
+
+@pytest.mark.parametrize("value", ["text", None, 1, {"a": 1}, np.arange(3), b"1"], ids=repr)
+def test_append_and_extend_on_what_is_no_list_is_a_type_error(front, key, raw, value):
+    """Also with an array to append, of which nothing is left."""
+    front.write([key()], {"l": value})
+    for item in (1, np.arange(2)):
+        with pytest.raises(BadType, match=key()):
+            front.append([key(), "l"], item)
+        with pytest.raises(TypeError):
+            front.extend([key(), "l"], [item])
+    assert_same(front.read([key(), "l"]), value)
+    assert_no_orphans(raw, key())
+
+
+@pytest.mark.parametrize("value", [1, 1.5, None, True, np.array(1)], ids=repr)
+def test_what_has_no_length_is_a_type_error(front, key, value):
+    """As in Python."""
+    front.write([key()], {"x": value})
+    with pytest.raises(TypeError):
+        front.length([key(), "x"])
+
+
+# --- the interface ---------------------------------------------------------------------------------
+
+
+def test_a_closed_interface_says_so(open_front, key):
+    """Every call after close; closing twice is fine."""
+    import contextlib
+
+    front = open_front()
+    front.write([key()], 1)
+    closing = front.interface.close()
+    if closing is not None:
+        front.run(closing)
+    for call in (lambda: front.read([key()]), lambda: front.write([key()], 2)):
+        with pytest.raises(InterfaceClosed):
+            call()
+    with contextlib.suppress(InterfaceClosed):
+        closing = front.interface.close()
+        if closing is not None:
+            front.run(closing)
+
+
+def test_an_async_interface_in_a_second_loop_says_so(server_url, key):
+    """It is bound to the loop that used it first."""
+    import reem_async
+
+    with asyncio.Runner(loop_factory=asyncio.new_event_loop) as first:
+        interface = reem_async.RedisInterface(server_url)
+        first.run(interface.initialize())
+        kvs = reem_async.KeyValueStore(interface)
+
+        async def read():
+            return await kvs[key()].read()
+
+        with asyncio.Runner(loop_factory=asyncio.new_event_loop) as second, pytest.raises(WrongLoop):
+            second.run(read())
+        first.run(interface.close())
+
+
+def test_a_wrong_option_is_a_type_error():
+    """A misspelt option is not silently dropped."""
+    with pytest.raises(TypeError):
+        reem.RedisInterface("localhost", no_such_option=1).initialize()
+
+
+def test_housekeeping_is_all_that_is_not_counted(front, key, raw):
+    """The check of these tests sees a write."""
+    before = commands_run(raw)
+    front.write([key()], 1)
+    assert commands_run(raw) != before

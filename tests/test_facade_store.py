@@ -1,0 +1,435 @@
+"""The key-value store of `reem`: Python's own syntax, threads, processes, exit, programs with loops."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import pickle
+import signal
+import threading
+import time
+import urllib.parse
+
+import numpy as np
+import pytest
+from conftest import PATIENCE, assert_no_orphans, assert_same, eventually, python
+
+import reem
+from reem import Conflict, KeyValueStore, MissingKey, RedisInterface
+
+# --- Python's own syntax ---------------------------------------------------------------------------
+
+
+def test_items_are_assigned_read_and_deleted(kvs, key):
+    """As in a dictionary, but for `.read()`."""
+    kvs[key()] = {"number": 1000, "string": "REEM"}
+    assert kvs[key()].read() == {"number": 1000, "string": "REEM"}
+    assert kvs[key()]["number"].read() == 1000
+    kvs[key()]["bar"] = {"deep": [1, 2]}
+    kvs[key()]["bar"]["deep"][1] = 5
+    assert kvs[key()]["bar"]["deep"][1].read() == 5
+    del kvs[key()]["bar"]["deep"][0]
+    assert kvs[key()]["bar"].read() == {"deep": [5]}
+    del kvs[key()]["bar"]
+    assert len(kvs[key()]) == 2
+    del kvs[key()]
+    with pytest.raises(MissingKey):
+        kvs[key()].read()
+    with pytest.raises(KeyError):
+        del kvs[key()]
+
+
+def test_write_is_the_same_as_assigning(kvs, key):
+    """For an accessor held in a variable."""
+    kvs[key()] = {}
+    accessor = kvs[key()]["bar"]
+    accessor.write({"image": np.arange(3)})
+    assert_same(kvs[key()].read(), {"bar": {"image": np.arange(3)}})
+    accessor.write(2)
+    assert accessor.read() == 2
+
+
+def test_an_accessor_keeps_its_path(kvs, key):
+    """Going deeper from it leaves it alone."""
+    kvs[key()] = {"x": {"foo": 3}}
+    a = kvs[key()]
+    b = a["x"]
+    b["foo"] = 4
+    assert a.read() == {"x": {"foo": 4}}
+    assert b.read() == {"foo": 4}
+    assert a["x"]["foo"].read() == 4
+
+
+@pytest.mark.parametrize("value", [1.5, "text", None, True, [1, 2], np.arange(3), b"x", time.time()], ids=repr)
+def test_a_root_value_need_not_be_a_dict(kvs, key, value):
+    """A set point is a number."""
+    kvs[key()] = value
+    assert_same(kvs[key()].read(), value)
+
+
+def test_augmented_assignment(kvs, key):
+    """`+= -= *= /=` on numbers and `+=` of a list, at the root and below."""
+    kvs[key()] = {"n": 5, "f": 1.5, "l": [1]}
+    kvs[key()]["n"] += 3
+    kvs[key()]["n"] -= 2
+    kvs[key()]["n"] *= 4
+    assert_same(kvs[key()]["n"].read(), 24)
+    kvs[key()]["f"] += 0.25
+    kvs[key()]["f"] -= 1
+    assert_same(kvs[key()]["f"].read(), 0.75)
+    kvs[key()]["n"] /= 5
+    assert kvs[key()]["n"].read() == 4.8
+    kvs[key()]["l"] += [2, np.arange(2)]
+    kvs[key()]["l"].append("x")
+    assert_same(kvs[key()]["l"].read(), [1, 2, np.arange(2), "x"])
+    kvs[key("root")] = 10
+    kvs[key("root")] += 1
+    assert kvs[key("root")].read() == 11
+    kvs[key("list")] = []
+    kvs[key("list")] += [1]
+    kvs[key("list")].append([2])
+    assert kvs[key("list")].read() == [1, [2]]
+    held = kvs[key()]["n"]
+    held += 1
+    assert held.read() == 5.8
+
+
+def test_a_division_is_a_true_one(kvs, key):
+    """7 / 2 is 3.5, as in Python."""
+    kvs[key()] = {"n": 7, "third": 1.0}
+    kvs[key()]["n"] /= 2
+    assert kvs[key()]["n"].read() == 3.5
+    kvs[key()]["third"] /= 3
+    assert kvs[key()]["third"].read() == pytest.approx(1 / 3, rel=1e-15)
+
+
+def test_a_with_block_edits(kvs, key, raw):
+    """Written back on success, at the root and below; arrays are writable inside."""
+    kvs[key()] = {"a": {"n": 1, "image": np.zeros(3)}, "l": [3, 1, 2]}
+    with kvs[key()]["a"] as value:
+        value["n"] = 2
+        value["image"] += 1
+    with kvs[key()]["l"] as items:
+        items.sort()
+    assert_same(kvs[key()].read(), {"a": {"n": 2, "image": np.ones(3)}, "l": [1, 2, 3]})
+    assert_no_orphans(raw, key())
+
+
+def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, server_url):
+    """The exception passes through; somebody else's change is a Conflict."""
+    kvs[key()] = {"n": 1}
+    with pytest.raises(ZeroDivisionError), kvs[key()] as value:
+        value["n"] = 1 / 0
+    other = RedisInterface(server_url)
+    with contextlib.closing(other), pytest.raises(Conflict), kvs[key()] as value:  # noqa: PT012
+        value["n"] = 2
+        KeyValueStore(other)[key()]["n"] = 3
+    assert kvs[key()].read() == {"n": 3}
+
+
+# --- connecting ------------------------------------------------------------------------------------
+
+
+def test_the_host_may_be_positional_a_keyword_or_a_url(server_url, key):
+    """And further options go to redis-py; `interface=` is a keyword too."""
+    parts = urllib.parse.urlsplit(server_url)
+    options = {"port": parts.port or 6379, "password": parts.password, "username": parts.username}
+    opened = [
+        RedisInterface(server_url),
+        RedisInterface(host=server_url),
+        RedisInterface(parts.hostname, **options),
+        RedisInterface(host=parts.hostname, socket_connect_timeout=2, **options),
+    ]
+    for number, interface in enumerate(opened):
+        interface.initialize()
+        kvs = KeyValueStore(interface=interface)
+        kvs[key()] = number
+        assert kvs[key()].read() == number
+        interface.close()
+
+
+def test_a_store_takes_the_address_itself(server_url, key):
+    """As since REEM 0.1."""
+    kvs = KeyValueStore(server_url)
+    kvs[key()] = 1
+    assert kvs[key()].read() == 1
+    assert isinstance(kvs.interface, RedisInterface)
+    kvs.interface.close()
+
+
+def test_leaving_a_with_block_closes_the_interface(server_url, key):
+    """Calls after it say so."""
+    with RedisInterface(server_url) as interface:
+        kvs = KeyValueStore(interface)
+        kvs[key()] = 1
+    with pytest.raises(reem.InterfaceClosed):
+        kvs[key()].read()
+
+
+def test_every_documented_name_is_where_the_manual_has_it():
+    """Module paths included."""
+    import reem.connection
+    import reem.datatypes
+    import reem.errors
+    import reem.ships
+    import reem_async.connection
+    import reem_async.datatypes
+    import reem_async.ships
+
+    stores = ["KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber"]
+    for package in (reem, reem_async):
+        for module, names in {
+            "connection": ["RedisInterface"],
+            "datatypes": [*stores, "Writer", "Reader", "Publisher"],
+            "ships": ["SpecialDatatypeShip", "NumpyShip"],
+            "errors": ["ReemError", "BadInput", "MissingKey", "Conflict"],
+        }.items():
+            for name in names:
+                assert getattr(getattr(package, module), name) is getattr(package, name)
+    assert reem.ReemError is reem_async.ReemError
+
+
+def test_low_level_writer_reader_and_publisher(interface, kvs, key, raw):
+    """They take the manual's path strings and attributes."""
+    writer = reem.Writer(key(), interface)
+    writer.send_to_redis(".", {"a": {}})
+    writer.send_to_redis(".a.b", {"image": np.arange(3)})
+    reader = reem.Reader(top_key_name=key(), interface=interface)
+    assert_same(reader.read_from_redis(".a.b.image"), np.arange(3))
+    assert_same(reader.read_from_redis("."), {"a": {"b": {"image": np.arange(3)}}})
+    reem.Publisher(key(), interface).send_to_redis(".a.b", 1)
+    assert kvs[key()].read() == {"a": {"b": 1}}
+    assert (writer.top_key_name, writer.interface) == (key(), interface)
+    assert_no_orphans(raw, key())
+
+
+def test_handles_can_be_pickled(kvs, pspace, interface, key):
+    """Stores, accessors, publish spaces and interfaces reconnect."""
+    kvs[key()] = {"a": np.arange(3)}
+    store, accessor, publishing, bare = (
+        pickle.loads(pickle.dumps(it)) for it in (kvs, kvs[key()]["a"], pspace, interface)
+    )
+    assert_same(store[key()].read(), {"a": np.arange(3)})
+    assert_same(accessor.read(), np.arange(3))
+    publishing[key()]["a"] = 5
+    assert KeyValueStore(bare)[key()]["a"].read() == 5
+    for opened in (store.interface, publishing.interface, bare):
+        opened.close()
+
+
+# --- threads and visibility ------------------------------------------------------------------------
+
+
+def test_a_write_that_returned_is_visible_everywhere_at_once(kvs, key, server_url):
+    """No sleep is ever needed, for arrays neither."""
+    with contextlib.closing(RedisInterface(server_url)) as other:
+        reading = KeyValueStore(other)
+        for n in range(100):
+            kvs[key()] = {"n": n, "image": np.full(3, n)} if n % 3 else n
+            assert_same(reading[key()].read(), {"n": n, "image": np.full(3, n)} if n % 3 else n)
+
+
+def test_several_threads_share_one_interface(kvs, key, raw):
+    """Each gets its own values, and no increment is lost."""
+    kvs[key()] = {"count": 0}
+    failures = []
+
+    def work(me):
+        try:
+            for n in range(40):
+                value = {"me": me, "n": n, "image": np.full((3, me + 1), n)}
+                kvs[key()][f"t{me}"] = value
+                assert_same(kvs[key()][f"t{me}"].read(), value)
+                kvs[key()]["count"] += 1
+        except BaseException as failure:
+            failures.append(failure)
+
+    threads = [threading.Thread(target=work, args=(me,)) for me in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not failures
+    assert kvs[key()]["count"].read() == 320
+    assert_no_orphans(raw, key())
+
+
+def test_closing_while_other_threads_call_ends_their_calls_with_interface_closed(server_url, key):
+    """Not with a CancelledError, and none hangs."""
+    for _ in range(5):
+        interface = RedisInterface(server_url)
+        kvs = KeyValueStore(interface)
+        kvs[key()] = {"image": np.zeros((200, 300))}
+        ends = []
+
+        def work(kvs=kvs, ends=ends):
+            try:
+                while True:
+                    kvs[key()].read()
+            except BaseException as error:
+                ends.append(error)
+
+        def follow(kvs=kvs, ends=ends):
+            try:
+                while True:
+                    next(iter(kvs[key()].watch()))
+            except BaseException as error:
+                ends.append(error)
+
+        threads = [threading.Thread(target=each, daemon=True) for each in (work, work, follow, follow)]
+        for thread in threads:
+            thread.start()
+        time.sleep(0.1)
+        interface.close()
+        eventually(lambda ends=ends: len(ends) == 4)
+        assert all(isinstance(end, (reem.InterfaceClosed, StopIteration)) for end in ends), ends
+
+
+def test_it_works_inside_a_running_event_loop(server_url, key):
+    """As in Jupyter; the blocking call blocks, nothing else."""
+
+    async def main():
+        with RedisInterface(server_url) as interface:
+            kvs = KeyValueStore(interface)
+            kvs[key()] = {"image": np.arange(3)}
+            return kvs[key()].read()
+
+    assert_same(asyncio.run(main()), {"image": np.arange(3)})
+
+
+def test_a_blocking_call_on_the_loop_thread_is_an_error_not_a_deadlock(kvs, interface, key):
+    """Found the hard way: whatever loop REEM runs is asked to make a blocking call."""
+    kvs[key()] = 1
+    subscriber = reem.SilentSubscriber(key(), interface)
+    subscriber.listen()
+    loops = [it for it in gc.get_objects() if isinstance(it, asyncio.AbstractEventLoop) and it.is_running()]
+    assert loops, "no running loop was found"
+    outcomes = []
+
+    def misuse():
+        try:
+            outcomes.append(kvs[key()].read())
+        except BaseException as error:
+            outcomes.append(error)
+
+    for loop in loops:
+        loop.call_soon_threadsafe(misuse)
+    eventually(lambda: len(outcomes) == len(loops))
+    assert any(isinstance(outcome, reem.WrongLoop) for outcome in outcomes), outcomes
+    assert kvs[key()].read() == 1
+
+
+def test_threads_are_named_daemons_and_gone_after_close(server_url, key):
+    """In a fresh Python: nothing but the main thread is left, and none would keep it alive."""
+    code = (
+        "import sys, threading, time, reem\n"
+        "url, key = sys.argv[1:]\n"
+        "assert threading.active_count() == 1, 'a thread before first use'\n"
+        "interface = reem.RedisInterface(url)\n"
+        "sub = reem.SilentSubscriber(key, interface); sub.listen()\n"
+        "call = reem.CallbackSubscriber(key, interface, lambda data, updated_path: None, {}); call.listen()\n"
+        "reem.PublishSpace(interface)[key] = 1\n"
+        "others = [t for t in threading.enumerate() if t is not threading.main_thread()]\n"
+        "assert others and all(t.daemon for t in others), others\n"
+        "assert all('reem' in t.name.lower() for t in others), others\n"
+        "interface.close()\n"
+        "end = time.monotonic() + 5\n"
+        "while threading.active_count() > 1 and time.monotonic() < end: time.sleep(0.01)\n"
+        "print(threading.active_count())\n"
+    )
+    done = python(code, server_url, key())
+    assert (done.stdout.strip(), done.stderr) == ("1", "")
+
+
+LEAVING = {
+    "closed": "interface.close()",
+    "not closed": "pass",
+    "sys.exit": "sys.exit(0)",
+    "an accessor kept in a global cycle": "loop = [kvs]; loop.append(loop)",
+    "a subscriber listening": "sub = reem.SilentSubscriber(key, interface); sub.listen()",
+    "a callback running": (
+        "import time\n"
+        "sub = reem.CallbackSubscriber(key, interface, lambda data, updated_path: time.sleep(0.3), {})\n"
+        "sub.listen(); reem.PublishSpace(interface)[key] = 2; time.sleep(0.05)"
+    ),
+    "a watch half read": "it = iter(kvs[key].watch()); next(it)",
+    "a write in an atexit function": "import atexit; atexit.register(lambda: kvs[key].write(5))",
+    "a thread still working": (
+        "import threading\n"
+        "def work():\n"
+        "    try:\n"
+        "        while True: kvs[key].read()\n"
+        "    except reem.ReemError: pass\n"
+        "threading.Thread(target=work, daemon=True).start()"
+    ),
+}
+
+
+@pytest.mark.parametrize("leaving", LEAVING)
+def test_a_program_ends_quietly_however_it_leaves(server_url, key, leaving):
+    """Within two seconds, with an empty stderr under -X dev -W error."""
+    code = (
+        "import sys, reem\n"
+        "url, key = sys.argv[1:]\n"
+        "interface = reem.RedisInterface(url)\n"
+        "kvs = reem.KeyValueStore(interface)\n"
+        "kvs[key] = 1\n"
+        "print(kvs[key].read(), flush=True)\n"
+    )
+    process = python(code + LEAVING[leaving], server_url, key(), start=True)
+    try:
+        assert process.stdout.readline() == "1\n", process.communicate()[1]
+        began = time.monotonic()
+        _, errors = process.communicate(timeout=PATIENCE)
+        assert (process.returncode, errors) == (0, "")
+        assert time.monotonic() - began < 3
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("blocked", ["for update in kvs[key].watch(): print('got', flush=True)", "sub_loop()"])
+def test_ctrl_c_interrupts_a_blocking_call(server_url, key, blocked):
+    """It raises KeyboardInterrupt in the caller, at once."""
+    code = (
+        "import sys, reem\n"
+        "url, key = sys.argv[1:]\n"
+        "interface = reem.RedisInterface(url)\n"
+        "kvs = reem.KeyValueStore(interface)\n"
+        "kvs[key] = 1\n"
+        "def sub_loop():\n"
+        "    with reem.SilentSubscriber(key, interface) as subscriber:\n"
+        "        for update in subscriber: print('got', flush=True)\n"
+        "print('ready', flush=True)\n"
+        f"try: {blocked}\n"
+        "except KeyboardInterrupt: print('interrupted', kvs[key].read(), flush=True)\n"
+        "interface.close()\n"
+    ).replace("try: for", "try:\n    for")
+    process = python(code, server_url, key(), start=True)
+    try:
+        assert process.stdout.readline() == "ready\n", process.communicate()[1]
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=PATIENCE)
+        assert out.splitlines()[-1] == "interrupted 1", errors
+        assert errors == ""
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_two_blocking_processes_count_together(kvs, key, server_url):
+    """Increments happen on the server."""
+    kvs[key()] = {"n": 0}
+    code = (
+        "import sys, reem\n"
+        "with reem.RedisInterface(sys.argv[1]) as interface:\n"
+        "    for _ in range(200): reem.KeyValueStore(interface)[sys.argv[2]]['n'] += 1\n"
+    )
+    other = python(code, server_url, key(), start=True)
+    for _ in range(200):
+        kvs[key()]["n"] += 1
+    _, errors = other.communicate(timeout=60)
+    assert (other.returncode, errors) == (0, "")
+    assert kvs[key()]["n"].read() == 400

@@ -1,0 +1,390 @@
+"""What the manual of the first REEM documents in chapters 1 to 4 and 7 works, and so do scripts of 0.1.2.
+
+Programs in our own words; where the manual runs for five seconds, these run for a fraction of one.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+from conftest import PATIENCE, assert_no_orphans, assert_same, eventually
+
+import reem
+from reem.connection import RedisInterface
+from reem.datatypes import CallbackSubscriber, KeyValueStore, PublishSpace, SilentSubscriber
+from reem.ships import NumpyShip, SpecialDatatypeShip
+
+A_WHILE = 0.5
+"""Seconds that a chapter 4 program runs here."""
+
+
+@pytest.fixture
+def opened(server_url, key):
+    """Makes interfaces as the manual does, and closes them in the end."""
+    interfaces = []
+
+    def open_(**options):
+        interfaces.append(RedisInterface(host=server_url, **options))
+        return interfaces[-1]
+
+    yield open_
+    for interface in interfaces:
+        interface.close()
+
+
+# --- chapters 1 and 2 ------------------------------------------------------------------------------
+
+
+def test_the_client_tutorial(opened, key):
+    """Numbers, a string, and then an array under a key that did not exist; no sleep is needed."""
+    interface = opened()
+    interface.initialize()
+    server = KeyValueStore(interface)
+    foo = key("foo")
+
+    server[foo] = {"number": 100.0, "string": "REEM"}
+    assert server[foo].read() == {"number": 100.0, "string": "REEM"}
+    assert server[foo]["number"].read() == 100.0
+
+    numbers = np.random.default_rng().random((3, 4))
+    server[foo]["numpy"] = numbers
+    assert_same(server[foo].read(), {"number": 100.0, "string": "REEM", "numpy": numbers})
+    assert_same(server[foo]["numpy"].read(), numbers)
+
+
+def test_the_key_value_store_chapter(opened, key):
+    """Set a dict, read it and one of its entries."""
+    server = KeyValueStore(opened())
+    server[key("foo")] = {"number": 1000, "string": "REEM"}
+    assert server[key("foo")].read() == {"number": 1000, "string": "REEM"}
+    assert server[key("foo")]["number"].read() == 1000
+
+
+def test_the_limitations_of_the_manual(opened, key):
+    """Keys that are not strings are still refused; arrays in lists are no longer."""
+    server = KeyValueStore(opened())
+    with pytest.raises(reem.BadKey, match=key("foo")):
+        server[key("foo")] = {0: "zero", 1: "one"}
+    server[key("foo")] = {"0": "zero", "1": "one"}
+    assert server[key("foo")]["0"].read() == "zero"
+    server[key("foo")] = {"bar": [np.arange(3), np.arange(4)]}
+    assert_same(server[key("foo")]["bar"][1].read(), np.arange(4))
+    server[key("foo")] = {"bar": {"arr1": np.arange(3), "arr2": np.arange(4)}}
+    assert_same(server[key("foo")].read(), {"bar": {"arr1": np.arange(3), "arr2": np.arange(4)}})
+
+
+def test_a_publish_space_is_a_store_that_cannot_be_read(opened, key):
+    """It publishes whole structures and single entries of them."""
+    interface = opened()
+    publisher = PublishSpace(interface)
+    image = np.random.default_rng().random((64, 48, 3))
+    publisher[key("raw_image")] = {"image": image, "id": 0}
+    publisher[key("raw_image")]["id"] = 1
+    assert_same(KeyValueStore(interface)[key("raw_image")].read(), {"image": image, "id": 1})
+    assert isinstance(publisher, KeyValueStore)
+    with pytest.raises(NotImplementedError):
+        publisher[key("raw_image")].read()
+
+
+def test_the_silent_subscriber_chapter(opened, key):
+    """A local variable that follows; root values may change from dict to number."""
+    interface = opened()
+    publisher = PublishSpace(interface)
+    subscriber = SilentSubscriber(channel=key("silent_channel"), interface=interface)
+    subscriber.listen()
+
+    publisher[key("silent_channel")] = {"number": 5, "string": "REEM"}
+    eventually(lambda: subscriber.value() == {"number": 5, "string": "REEM"})
+    assert subscriber["number"].read() == 5
+
+    publisher[key("silent_channel")] = 5
+    eventually(lambda: subscriber.value() == 5)
+
+
+def test_the_callback_subscriber_chapter(opened, key):
+    """The function is told the data, the path that was updated, and its own keyword arguments."""
+    interface = opened()
+    publisher = PublishSpace(interface)
+    told = []
+
+    def callback(data, updated_path, foo):
+        told.append(f"Foo = {foo}, Updated Path = {updated_path}, Data = {data}")
+
+    subscriber = CallbackSubscriber(
+        channel=key("callback_channel"), interface=interface, callback_function=callback, kwargs={"foo": 5}
+    )
+    subscriber.listen()
+    publisher[key("callback_channel")] = {"number": 5, "string": "REEM"}
+    eventually(lambda: len(told) == 1)
+    publisher[key("callback_channel")]["number"] = 6
+    eventually(lambda: len(told) == 2)
+    name = key("callback_channel")
+    assert told[0].startswith(f"Foo = 5, Updated Path = {name}, ")
+    assert told[1] == f"Foo = 5, Updated Path = {name}.number, Data = {{'number': 6, 'string': 'REEM'}}"
+    assert subscriber.value() == {"number": 6, "string": "REEM"}
+
+
+# --- chapter 3 -------------------------------------------------------------------------------------
+
+
+class HashShip(SpecialDatatypeShip):
+    """Arrays as the manual's ship keeps them: a hash of bytes and of what is needed to rebuild them."""
+
+    def check_fit(self, value):
+        return isinstance(value, np.ndarray)
+
+    def write(self, key, value, client):
+        client.hset(key, "content", value.tobytes())
+        client.hset(key, "kind", value.dtype.str)
+        client.hset(key, "extent", ",".join(map(str, value.shape)))
+
+    def get_label(self):
+        return "hash_of_bytes"
+
+    def read(self, key, client):
+        client.hgetall(key)
+
+    def interpret_read(self, responses):
+        fields = responses[0]
+        assert all(type(name) is bytes for name in fields), "as redis-py gives them"
+        extent = [int(part) for part in fields[b"extent"].decode().split(",") if part]
+        return np.frombuffer(fields[b"content"], fields[b"kind"].decode()).reshape(extent)
+
+
+class Celsius:
+    """A type of the user's own."""
+
+    def __init__(self, degrees):
+        self.degrees = degrees
+
+
+class CelsiusShip(SpecialDatatypeShip):
+    def check_fit(self, value):
+        return isinstance(value, Celsius)
+
+    def write(self, key, value, client):
+        client.set(key, repr(value.degrees))
+
+    def read(self, key, client):
+        client.get(key)
+
+    def interpret_read(self, responses):
+        return Celsius(float(responses[0]))
+
+    def get_label(self):
+        return "celsius"
+
+
+def test_a_ship_written_like_the_manuals(opened, key, raw):
+    """In place of the default one: only arrays are taken, at any place."""
+    server = KeyValueStore(opened(ships=[HashShip()]))
+    document = {"a": np.arange(6.0).reshape(2, 3), "l": [np.arange(3), np.array(2.5)], "n": 1}
+    server[key("foo")] = document
+    assert_same(server[key("foo")].read(), document)
+    server[key("foo")]["l"][0] = np.zeros((0, 2))
+    assert_same(server[key("foo")]["l"][0].read(), np.zeros((0, 2)))
+    assert "hash_of_bytes" in raw.execute_command("JSON.GET", key("foo"))
+    assert_no_orphans(raw, key("foo"))
+
+
+def test_a_custom_ship_beside_the_numpy_ship(opened, key, raw):
+    """The default one is named in the list to keep it."""
+    interface = opened(ships=[reem.ships.NumpyShip(), CelsiusShip()])
+    assert issubclass(NumpyShip, SpecialDatatypeShip)
+    server = KeyValueStore(interface)
+    server[key("foo")] = {"room": Celsius(21.5), "image": np.arange(3)}
+    got = server[key("foo")].read()
+    assert got["room"].degrees == 21.5
+    assert_same(got["image"], np.arange(3))
+    with SilentSubscriber(key("foo"), interface) as mirror:
+        PublishSpace(interface)[key("foo")]["room"] = Celsius(22.0)
+        eventually(lambda: mirror["room"].read().degrees == 22.0)
+    assert_no_orphans(raw, key("foo"))
+
+
+# --- chapter 4 -------------------------------------------------------------------------------------
+
+
+def test_the_image_processing_system(opened, key):
+    """A camera publishes frames, a processor their mean, an actuator hears of it: three interfaces."""
+    camera, processor, actuator = (opened() for _ in range(3))
+    results = PublishSpace(interface=processor)
+    wrong, acted = [], []
+
+    def process(data, updated_path):
+        if updated_path != key("raw_image") or data["image"].mean() != data["images_sent"]:
+            wrong.append((updated_path, data["images_sent"]))
+        results[key("processed_info")] = {
+            "mean": np.mean(data["image"]),
+            "time_stamp": data["time_stamp"],
+            "images_sent": data["images_sent"],
+        }
+
+    def act(data, updated_path):
+        acted.append((data["images_sent"], data["mean"], time.time() - data["time_stamp"]))
+
+    CallbackSubscriber(channel=key("processed_info"), interface=actuator, callback_function=act, kwargs={}).listen()
+    CallbackSubscriber(channel=key("raw_image"), interface=processor, callback_function=process, kwargs={}).listen()
+    frames = PublishSpace(interface=camera)
+    sent = 0
+    deadline = time.time() + A_WHILE
+    while time.time() < deadline or sent < 5:
+        frames[key("raw_image")] = {
+            "image": np.full((640, 480, 3), float(sent)),
+            "images_sent": sent,
+            "time_stamp": time.time(),
+        }
+        sent += 1
+    eventually(lambda: acted and acted[-1][0] == sent - 1)
+    assert not wrong
+    numbers = [number for number, _, _ in acted]
+    assert numbers == sorted(set(numbers)), "in order, none twice"
+    assert all(number == mean and 0 <= latency < PATIENCE for number, mean, latency in acted)
+
+
+def _set_points(space, name):
+    """A controller that sets a time stamp at 100 Hz for a while; returns the last one."""
+    deadline = time.time() + A_WHILE
+    while time.time() < deadline:
+        following = time.time() + 0.01
+        command = time.time()
+        space[name] = command
+        time.sleep(max(0.0, following - time.time()))
+    return command
+
+
+def _poll(get, over):
+    """An actuator that looks as often as it can; returns what it saw."""
+    seen = []
+    while not over.is_set():
+        command = get()
+        if command and (not seen or command != seen[-1]):
+            seen.append(command)
+        time.sleep(0.001)
+    return seen
+
+
+@pytest.mark.parametrize("paradigm", ["database", "publish/subscribe"])
+def test_the_arm_actuator(opened, key, paradigm):
+    """Set points at one rate, an actuator that reads them at another: each seen exactly, in order."""
+    if paradigm == "database":
+        controller, actuator = KeyValueStore(interface=opened()), KeyValueStore(opened())
+        controller[key("set_point")] = time.time()
+        get = actuator[key("set_point")].read
+    else:
+        controller = PublishSpace(interface=opened())
+        subscriber = SilentSubscriber(channel=key("set_point"), interface=opened())
+        subscriber.listen()
+        get = subscriber.value
+    over, seen = threading.Event(), []
+    thread = threading.Thread(target=lambda: seen.extend(_poll(get, over)))
+    thread.start()
+    try:
+        last = _set_points(controller, key("set_point"))
+        eventually(lambda: get() == last)
+        time.sleep(0.05)
+    finally:
+        over.set()
+        thread.join()
+    assert len(seen) > 5
+    assert seen == sorted(seen)
+    assert seen[-1] == last
+
+
+# --- REEM 0.1.x ------------------------------------------------------------------------------------
+
+
+def test_a_script_of_reem_0_1_2(server_url, key):
+    """List indexes, del, augmented assignment, append, len, type, get: on accessors and on the store."""
+    kvs = reem.KeyValueStore(server_url)
+    top = key("robot")
+    kvs[top] = {"joints": [0.0, 0.5, 1.0], "count": 1, "name": "arm", "cfg": {"gain": 2.5}}
+    kvs[top]["joints"][1] = 0.75
+    kvs[top]["joints"].append(1.25)
+    kvs[top]["joints"] += [1.5, 1.75]
+    del kvs[top]["joints"][0]
+    assert kvs[top]["joints"].read() == [0.75, 1.0, 1.25, 1.5, 1.75]
+    assert len(kvs[top]["joints"]) == 5
+    kvs[top]["count"] += 5
+    kvs[top]["count"] -= 2
+    kvs[top]["count"] *= 3
+    kvs[top]["count"] /= 4
+    assert kvs[top]["count"].read() == 3
+    assert kvs[top]["joints"].type() is list
+    assert kvs[top].type() is dict
+    assert len(kvs[top]) == 4
+    held = kvs[top]["cfg"]
+    gain = held["gain"]
+    gain.write(3.5)
+    assert held.read() == {"gain": 3.5}
+    assert held.get("gain", 1) == 3.5
+    assert held.get("absent", 1) == 1
+    assert kvs.get(f"{top}.cfg.gain") == 3.5
+    kvs.set(f"{top}.cfg.gain", 4.5)
+    assert kvs.get(f"{top}.cfg") == {"gain": 4.5}
+    with kvs[top] as robot:
+        robot["name"] = robot["name"].upper()
+    del kvs[top]["cfg"]
+    assert kvs[top].read() == {"joints": [0.75, 1.0, 1.25, 1.5, 1.75], "count": 3, "name": "ARM"}
+    del kvs[top]
+    with pytest.raises(KeyError):
+        kvs[top].read()
+    kvs.interface.close()
+
+
+def test_marshallers_are_ships_by_their_old_names(opened, key):
+    """`reem.marshalling` and `marshallers=`."""
+    from reem.marshalling import NumpyMarshaller, SpecialDatatypeMarshaller
+
+    assert issubclass(NumpyMarshaller, SpecialDatatypeMarshaller)
+    assert issubclass(NumpyMarshaller, SpecialDatatypeShip)
+
+    class CelsiusMarshaller(SpecialDatatypeMarshaller):
+        check_fit = CelsiusShip.check_fit
+        write = CelsiusShip.write
+        read = CelsiusShip.read
+        interpret_read = CelsiusShip.interpret_read
+        get_label = CelsiusShip.get_label
+
+    server = KeyValueStore(opened(marshallers=[NumpyMarshaller(), CelsiusMarshaller()]))
+    server[key()] = {"room": Celsius(20.5), "image": np.arange(3)}
+    assert server[key()]["room"].read().degrees == 20.5
+    assert_same(server[key()]["image"].read(), np.arange(3))
+
+
+def test_a_tolerant_store_creates_missing_parents(opened, key, raw):
+    """Writes need no parent; dotted names and ordinary ones both work."""
+    from reem.marshalling import TolerantKeyValueStore
+
+    interface = opened()
+    tolerant = TolerantKeyValueStore(interface)
+    tolerant[key()]["a"]["b"]["c"] = 1
+    tolerant[key()]["a"]["image"] = np.arange(3)
+    assert_same(tolerant[key()].read(), {"a": {"b": {"c": 1}, "image": np.arange(3)}})
+    tolerant[key("other") + ".x.y"] = 5
+    assert KeyValueStore(interface)[key("other")].read() == {"x": {"y": 5}}
+    assert tolerant[key("other") + ".x.y"].read() == 5
+    tolerant[key()]["a"]["b"]["d"] = 2
+    assert tolerant[key()]["a"]["b"].read() == {"c": 1, "d": 2}
+    assert_no_orphans(raw, key())
+
+
+# --- chapter 7 -------------------------------------------------------------------------------------
+
+
+def test_the_documented_classes_have_the_documented_attributes(opened, key):
+    """`interface` and `top_key_name`; subscribers are built with keywords or by position."""
+    interface = opened()
+    assert KeyValueStore(interface).interface is interface
+    for low in (reem.datatypes.Writer, reem.datatypes.Reader, reem.datatypes.Publisher):
+        made = low(top_key_name=key(), interface=interface)
+        assert (made.top_key_name, made.interface) == (key(), interface)
+    CallbackSubscriber(key(), interface, lambda data, updated_path: None, {})
+    SilentSubscriber(key(), interface)
+    reem.datatypes.Writer(key(), interface).send_to_redis(set_path=".", set_value={"a": np.arange(2)})
+    assert_same(reem.datatypes.Reader(key(), interface).read_from_redis(read_path=".a"), np.arange(2))
+    KeyValueStore(interface).track_schema_changes(set_value=False, keys=[key()])
+    PublishSpace(interface).track_schema_changes(False)

@@ -1,0 +1,152 @@
+"""The two fronts agree: the same names, the same parameters, the same promises in their docstrings."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+
+import pytest
+
+import reem
+import reem_async
+
+CLASSES = [
+    "RedisInterface", "KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber",
+    "Writer", "Reader", "Publisher", "accessor", "watch",
+]  # fmt: skip
+
+SYNTAX = {
+    "__aenter__": {"__enter__"},
+    "__aexit__": {"__exit__"},
+    "__aiter__": {"__iter__"},
+    "__anext__": {"__next__"},
+    "aclose": {"close"},
+    "delete": {"delete", "__delitem__"},
+    "length": {"length", "__len__"},
+    "increment": {"increment", "__iadd__"},
+    "multiply": {"multiply", "__imul__"},
+    "divide": {"divide", "__itruediv__"},
+    "extend": {"extend", "__iadd__"},
+    "edit": {"edit", "__enter__"},
+}
+"""What asyncio spells as a method and Python's own syntax spells in the blocking front."""
+
+ONLY_BLOCKING = {
+    *("__isub__", "__delitem__", "__len__", "__iadd__", "__imul__", "__itruediv__"),
+    *("__enter__", "__exit__", "__iter__", "__next__"),
+}
+
+
+def made(package, name):
+    """A documented class, or that of an accessor or of a loop over updates."""
+    if name not in ("accessor", "watch"):
+        return getattr(package, name)
+    accessor = package.KeyValueStore(package.RedisInterface("localhost"))["foo"]
+    return type(accessor if name == "accessor" else accessor.watch())
+
+
+def public(kind):
+    """The public attributes of a class that it, or a base of ours, defines."""
+    return {
+        name: value
+        for base in reversed(kind.__mro__)
+        if base.__module__.startswith("reem")
+        for name, value in vars(base).items()
+        if not name.startswith("_") or name in SYNTAX or name in ONLY_BLOCKING
+    }
+
+
+def parameters(function):
+    return [
+        (each.name, each.kind, each.default if each.default is each.empty else repr(each.default))
+        for each in inspect.signature(function).parameters.values()
+    ]
+
+
+def summary(thing):
+    return (inspect.getdoc(thing) or "").strip().split("\n")[0]
+
+
+def test_both_packages_export_the_same_names():
+    """Each listed once, in `__all__`, and really there."""
+    assert sorted(reem.__all__) == sorted(set(reem.__all__))
+    assert set(reem.__all__) == set(reem_async.__all__)
+    for package in (reem, reem_async):
+        assert not [name for name in package.__all__ if not hasattr(package, name)]
+
+
+@pytest.mark.parametrize("module", ["connection", "datatypes", "ships", "errors", "server"])
+def test_both_packages_have_the_same_documented_modules(module):
+    """With the same public names."""
+    names = [
+        set(getattr(importlib.import_module(f"{package}.{module}"), "__all__", ()))
+        for package in ("reem", "reem_async")
+    ]
+    assert names[0] == names[1]
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_every_method_has_its_twin(name):
+    """Under the same name, or as Python's own syntax."""
+    blocking, core = public(made(reem, name)), public(made(reem_async, name))
+    missing = [each for each in core if not SYNTAX.get(each, {each}) & set(blocking)]
+    assert not missing, f"only asyncio has {missing}"
+    spelled = set().union(*(SYNTAX.get(each, {each}) for each in core)) | ONLY_BLOCKING
+    assert not set(blocking) - spelled, f"only the blocking front has {set(blocking) - spelled}"
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_twins_take_the_same_parameters(name):
+    """Names, kinds and defaults, the constructor's too."""
+    blocking, core = made(reem, name), made(reem_async, name)
+    if name not in ("accessor", "watch"):
+        assert parameters(blocking.__init__) == parameters(core.__init__)
+    for method in public(core).keys() & public(blocking).keys():
+        ours, theirs = getattr(blocking, method), getattr(core, method)
+        if callable(ours) and not method.startswith("__"):
+            assert parameters(ours) == parameters(theirs), f"{name}.{method}"
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_twins_promise_the_same(name):
+    """Every public class and method has a docstring, and its first line is that of its twin."""
+    blocking, core = made(reem, name), made(reem_async, name)
+    assert summary(blocking)
+    assert summary(blocking) == summary(core)
+    for method in public(core).keys() & public(blocking).keys():
+        if not method.startswith("__"):
+            assert summary(getattr(blocking, method)), f"{name}.{method} has no docstring"
+            assert summary(getattr(blocking, method)) == summary(getattr(core, method)), f"{name}.{method}"
+
+
+def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():
+    """Local calls stay plain in both."""
+    waiting = {
+        "RedisInterface": {"initialize", "close"},
+        "KeyValueStore": {"get", "set"},
+        "accessor": {"read", "write", "get", "delete", "length", "type", "increment", "multiply", "divide"}
+        | {"append", "extend"},
+        "SilentSubscriber": {"listen", "close"},
+        "CallbackSubscriber": {"listen", "close"},
+        "Writer": {"send_to_redis"},
+        "Reader": {"read_from_redis"},
+        "Publisher": {"send_to_redis"},
+    }
+    for name, methods in waiting.items():
+        kind = made(reem_async, name)
+        assert {each for each in public(kind) if inspect.iscoroutinefunction(getattr(kind, each))} >= methods, name
+        kind = made(reem, name)
+        assert not [each for each in public(kind) if inspect.iscoroutinefunction(getattr(kind, each))], name
+    for name in ("value", "track_schema_changes"):
+        for kind in (reem_async.SilentSubscriber, reem_async.KeyValueStore):
+            assert not inspect.iscoroutinefunction(getattr(kind, name, None))
+
+
+def test_errors_policies_and_ships_are_the_very_same_objects():
+    """So that an error raised by one front is caught by the other's name."""
+    for name in reem.__all__:
+        ours, theirs = getattr(reem, name), getattr(reem_async, name)
+        if inspect.isclass(ours) and issubclass(ours, Exception):
+            assert ours is theirs, name
+    for name in ("Newest", "Last", "Every", "Update", "SpecialDatatypeShip", "NumpyShip"):
+        assert getattr(reem, name) is getattr(reem_async, name)

@@ -1,0 +1,266 @@
+"""Types of the user's own: ships written for the first REEM, and ships whose methods are coroutines."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+
+import numpy as np
+import pytest
+from conftest import assert_no_orphans, assert_same, eventually, keys_of, nothing_sent
+
+import reem
+import reem_async
+from reem_async.errors import BadData, BadType
+
+
+class Pose:
+    """What robots have; no JSON type, no array."""
+
+    def __init__(self, x, y, frame="map"):
+        self.x, self.y, self.frame = x, y, frame
+
+    def __eq__(self, other):
+        return isinstance(other, Pose) and vars(self) == vars(other)
+
+    __hash__ = None
+
+    def __repr__(self):
+        return f"Pose({self.x}, {self.y}, {self.frame!r})"
+
+
+class PoseShip(reem.SpecialDatatypeShip):
+    """Old style: plain methods, several commands to write, one to read."""
+
+    def check_fit(self, value):
+        return isinstance(value, Pose)
+
+    def write(self, key, value, client):
+        client.hset(key, "xy", np.array([value.x, value.y], float).tobytes())
+        client.hset(key, mapping={"frame": value.frame})
+
+    def read(self, key, client):
+        client.hmget(key, ["xy", "frame"])
+
+    def interpret_read(self, responses):
+        xy, frame = responses[0]
+        return Pose(*np.frombuffer(xy).tolist(), frame.decode())
+
+    def get_label(self):
+        return "pose"
+
+
+class AsyncPoseShip(reem_async.SpecialDatatypeShip):
+    """The same with coroutine methods, which may wait."""
+
+    async def check_fit(self, value):
+        return isinstance(value, Pose)
+
+    async def write(self, key, value, client):
+        await asyncio.sleep(0)
+        client.set(key, json.dumps(vars(value)))
+
+    async def read(self, key, client):
+        client.get(key)
+
+    async def interpret_read(self, responses):
+        await asyncio.sleep(0)
+        return Pose(**json.loads(responses[0]))
+
+    async def get_label(self):
+        return "async pose"
+
+
+SHIPS = {"synchronous": PoseShip, "async": AsyncPoseShip}
+
+
+@pytest.fixture(params=list(SHIPS))
+def ship(request):
+    return SHIPS[request.param]()
+
+
+@pytest.fixture
+def numpy_ship():
+    return reem_async.NumpyShip()
+
+
+def test_a_ship_carries_its_type_at_any_place(open_front, key, raw, ship, numpy_ship):
+    """As the root, in a dict, in a list, beside arrays, by path; nothing is left when it is replaced."""
+    front = open_front(ships=[numpy_ship, ship])
+    pose = Pose(1.5, 0.9374604873776271, "é")
+    front.write([key()], pose)
+    assert front.read([key()]) == pose
+    assert_no_orphans(raw, key())
+    front.write([key()], {"at": pose, "l": [pose, {"p": Pose(2, 3)}], "image": np.arange(3), "n": 1})
+    got = front.read([key()])
+    assert got["at"] == pose
+    assert got["l"] == [pose, {"p": Pose(2.0, 3.0)}]
+    assert_same(got["image"], np.arange(3))
+    assert front.read([key(), "l", 1, "p"]) == Pose(2.0, 3.0)
+    front.write([key(), "at"], Pose(7.0, 8.0))
+    front.append([key(), "l"], Pose(9.0, 9.0))
+    assert front.read([key(), "at"]) == Pose(7.0, 8.0)
+    assert front.read([key(), "l", -1]) == Pose(9.0, 9.0)
+    assert_no_orphans(raw, key())
+    front.write([key()], {"at": 1})
+    assert keys_of(raw, key()) == set()
+
+
+def test_the_label_and_the_place_show_in_the_document(open_front, key, raw, ship):
+    """JSON.GET tells what is there."""
+    front = open_front(ships=[ship])
+    front.write([key()], {"at": Pose(1, 2)})
+    text = json.loads(raw.execute_command("JSON.GET", key()))["at"]
+    assert text.startswith("$ship ")
+    assert "pose" in text
+    assert ".at" in text
+
+
+def test_the_list_of_ships_replaces_the_default_one(open_front, key, raw, ship):
+    """Without the numpy ship no array is taken; nothing is sent."""
+    front = open_front(ships=[ship])
+    with nothing_sent(raw), pytest.raises(BadType, match=key()):
+        front.write([key()], {"image": np.arange(3)})
+    front.write([key()], {"at": Pose(1.0, 2.0)})
+    assert front.read([key(), "at"]) == Pose(1.0, 2.0)
+
+
+def test_a_value_that_no_ship_takes_is_refused_with_its_path(open_front, key, raw, ship):
+    """Also with no ship at all."""
+    for ships in ([], [ship]):
+        front = open_front(ships=ships)
+        with nothing_sent(raw), pytest.raises(BadType) as caught:
+            front.write([key()], {"a": [1, object()]})
+        assert key() in str(caught.value)
+        assert "ship" in str(caught.value), "the remedy"
+
+
+def test_the_first_ship_that_fits_takes_the_value(open_front, key, raw):
+    """The order of the list decides."""
+    greedy = PoseShip()
+    greedy.get_label = lambda: "greedy"
+    front = open_front(ships=[greedy, PoseShip()])
+    front.write([key()], {"at": Pose(1, 2)})
+    assert "greedy" in raw.execute_command("JSON.GET", key())
+
+
+def test_an_unknown_label_is_said_with_the_remedy(open_front, key):
+    """A program without the ship cannot read what another wrote; the rest of the document is readable."""
+    open_front(ships=[PoseShip()]).write([key()], {"at": Pose(1, 2), "n": 5})
+    without = open_front()
+    for path in ([key()], [key(), "at"]):
+        with pytest.raises(BadData) as caught:
+            without.read(path)
+        assert "pose" in str(caught.value)
+        assert "ships=" in str(caught.value)
+        assert key() in str(caught.value)
+    assert without.read([key(), "n"]) == 5
+    without.write([key(), "at"], 1)
+    assert without.read([key()]) == {"at": 1, "n": 5}
+
+
+def test_a_program_without_the_ship_still_cleans_up_after_it(open_front, key, raw):
+    """Replacing or deleting needs no ship."""
+    open_front(ships=[PoseShip()]).write([key()], {"at": Pose(1, 2), "b": {"at": Pose(1, 2)}})
+    without = open_front()
+    without.delete([key(), "at"])
+    assert_no_orphans(raw, key())
+    without.write([key(), "b"], [])
+    assert keys_of(raw, key()) == set()
+
+
+def test_a_ship_that_fails_to_write_sends_nothing(open_front, key, raw):
+    """Its exception passes through."""
+
+    class Failing(PoseShip):
+        def write(self, key, value, client):
+            client.set(key, "half")
+            raise ZeroDivisionError("on purpose")
+
+    front = open_front(ships=[Failing()])
+    front.write([key()], {"n": 1})
+    with nothing_sent(raw), pytest.raises(ZeroDivisionError):
+        front.write([key()], {"at": Pose(1, 2)})
+    assert front.read([key()]) == {"n": 1}
+
+
+def test_a_ship_may_return_falsy_values(open_front, key):
+    """None or an empty thing from interpret_read is a value."""
+
+    class Nothing(PoseShip):
+        def interpret_read(self, responses):
+            return None
+
+    front = open_front(ships=[Nothing()])
+    front.write([key()], {"at": Pose(1, 2), "l": [Pose(1, 2)]})
+    assert front.read([key()]) == {"at": None, "l": [None]}
+
+
+@pytest.mark.parametrize("kind", list(SHIPS))
+def test_subscribers_see_ships_too(server_url, key, kind):
+    """Mirrors and callbacks of the blocking front."""
+    ship = SHIPS[kind]()
+    with reem.RedisInterface(server_url, ships=[ship, reem.NumpyShip()]) as interface:
+        seen = []
+
+        def hear(data, updated_path):
+            seen.append(data["at"])
+
+        with (
+            reem.SilentSubscriber(key(), interface) as mirror,
+            reem.CallbackSubscriber(key(), interface, hear, {}),
+        ):
+            reem.PublishSpace(interface)[key()] = {"at": Pose(1.0, 2.0), "image": np.arange(2)}
+            eventually(lambda: seen and mirror.value())
+            assert mirror["at"].read() == Pose(1.0, 2.0)
+            reem.PublishSpace(interface)[key()]["at"] = Pose(3.0, 4.0)
+            eventually(lambda: mirror["at"].read() == Pose(3.0, 4.0))
+            eventually(lambda: seen[-1] == Pose(3.0, 4.0))
+
+
+async def test_an_async_subscriber_sees_ships_too(server_url, key):
+    """With the coroutine methods."""
+    async with reem_async.RedisInterface(server_url, ships=[AsyncPoseShip()]) as interface:
+        space = reem_async.PublishSpace(interface)
+        await space[key()].write({"at": Pose(0.0, 0.0)})
+        updates = reem_async.KeyValueStore(interface)[key()].watch()
+        assert (await asyncio.wait_for(anext(updates), 10)).data == {"at": Pose(0.0, 0.0)}
+        await space[key()]["at"].write(Pose(1.0, 1.0))
+        update = await asyncio.wait_for(anext(updates), 10)
+        assert (update.value, update.data) == (Pose(1.0, 1.0), {"at": Pose(1.0, 1.0)})
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        {"dtype": "O"},
+        {"dtype": "__import__('os').system('true')"},
+        {"dtype": "V999999999"},
+        {"shape": "[-1]"},
+        {"shape": "(10**9,)"},
+        {"shape": "[999999999999]"},
+        {"arr": "short"},
+    ],
+    ids=str,
+)
+def test_what_somebody_else_put_in_place_of_an_array_is_not_trusted(front, key, raw, spoil):
+    """Every field of the stored hash is checked before it is used; nothing is ever evaluated."""
+    front.write([key()], {"image": np.arange(8)})
+    (place,) = keys_of(raw, key()) - {"{" + key() + "}:ships"}
+    if raw.type(place) != "hash":
+        raw.set(place, "short")
+    else:
+        (name, value), *_ = spoil.items()
+        fields = raw.hkeys(place)
+        raw.hset(place, mapping=dict.fromkeys([field for field in fields if field == name] or fields, value))
+    with pytest.raises(BadData, match=key()):
+        front.read([key()])
+
+
+def test_an_array_whose_bytes_are_gone_is_bad_data(front, key, raw):
+    """An eviction, or a hand that deleted it: never a wrong value."""
+    front.write([key()], {"image": np.arange(8), "n": 1})
+    raw.unlink(*(keys_of(raw, key()) - {"{" + key() + "}:ships"}))
+    with pytest.raises(BadData, match="image"):
+        front.read([key()])
+    assert front.read([key(), "n"]) == 1

@@ -1,0 +1,456 @@
+"""The key-value store of `reem_async`, as documented, and what both fronts share of it."""
+
+from __future__ import annotations
+
+import asyncio
+import pickle
+
+import numpy as np
+import pytest
+from conftest import ROOT, assert_no_orphans, assert_same, keys_of, nothing_sent, python
+from redis.crc import key_slot
+
+import reem
+import reem_async
+from reem_async.errors import BadKey, Conflict, MissingKey, NotConnected, PathRefused, WriteOnly
+
+# --- asyncio only ----------------------------------------------------------------------------------
+
+
+async def test_write_read_delete_length_and_type_are_awaited(akvs, key):
+    """The five calls of an accessor."""
+    await akvs[key()].write({"number": 100.0, "string": "REEM"})
+    assert await akvs[key()].read() == {"number": 100.0, "string": "REEM"}
+    await akvs[key()]["bar"].write([1, 2])
+    assert await akvs[key()]["bar"].read() == [1, 2]
+    assert await akvs[key()].length() == 3
+    assert await akvs[key()]["bar"].type() is list
+    await akvs[key()]["bar"].delete()
+    assert await akvs[key()].read() == {"number": 100.0, "string": "REEM"}
+    await akvs[key()].delete()
+    with pytest.raises(MissingKey):
+        await akvs[key()].read()
+
+
+async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):
+    """An assignment cannot wait for the server."""
+    with pytest.raises(TypeError, match=r"await .*write\("):
+        akvs[key()] = 1
+    with pytest.raises(TypeError, match=r"await .*write\("):
+        akvs[key()]["bar"] = 1
+
+
+async def test_arithmetic_append_and_extend_are_methods(akvs, key):
+    """The twins of += -= *= /= and += [..]."""
+    await akvs[key()].write({"n": 5, "l": [1]})
+    n, items = akvs[key()]["n"], akvs[key()]["l"]
+    await n.increment(3)
+    await n.multiply(4)
+    assert_same(await n.read(), 32)
+    await n.increment(-2)
+    await n.divide(4)
+    assert await n.read() == 7.5
+    await items.append({"a": np.arange(2)})
+    await items.extend([b"x", 2])
+    assert_same(await items.read(), [1, {"a": np.arange(2)}, b"x", 2])
+
+
+async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):
+    """Also arrays, which are writable copies inside the block."""
+    await akvs[key()].write({"n": 1, "image": np.zeros(3), "gone": np.ones(2)})
+    async with akvs[key()].edit() as value:
+        value["n"] += 1
+        value["image"][1] = 5
+        value["new"] = [np.arange(2)]
+        del value["gone"]
+    expected = {"n": 2, "image": np.array([0.0, 5.0, 0.0]), "new": [np.arange(2)]}
+    assert_same(await akvs[key()].read(), expected)
+    assert_no_orphans(raw, key())
+    async with akvs[key()]["new"].edit() as items:
+        items.append("tail")
+    assert_same(await akvs[key()]["new"].read(), [np.arange(2), "tail"])
+
+
+async def test_an_edit_that_raises_writes_nothing(akvs, key):
+    """The exception passes through."""
+    await akvs[key()].write({"n": 1})
+    with pytest.raises(ZeroDivisionError):  # noqa: PT012
+        async with akvs[key()].edit() as value:
+            value["n"] = 2
+            value["n"] /= 0
+    assert await akvs[key()].read() == {"n": 1}
+
+
+@pytest.mark.parametrize("image", [None, np.zeros(4)], ids=["plain", "array"])
+async def test_an_edit_that_somebody_overtook_is_a_conflict(akvs, kvs, key, image, raw):
+    """Nothing is written; the other's value stands, also if only an array's content changed."""
+    await akvs[key()].write({"n": 1, "image": image})
+    with pytest.raises(Conflict):  # noqa: PT012
+        async with akvs[key()].edit() as value:
+            value["n"] = 2
+            if image is None:
+                kvs[key()]["m"] = 3
+            else:
+                kvs[key()]["image"] = image + 1
+    expected = {"n": 1, "image": None, "m": 3} if image is None else {"n": 1, "image": image + 1}
+    assert_same(await akvs[key()].read(), expected)
+    assert_no_orphans(raw, key())
+
+
+async def test_an_edit_of_something_missing_is_a_key_error(akvs, key):
+    """Before the block runs."""
+    with pytest.raises(MissingKey):
+        async with akvs[key()].edit():
+            pytest.fail("the block ran")
+
+
+async def test_many_edits_at_once_lose_nothing(akvs, key):
+    """Every conflict is reported, so retrying them all counts right."""
+    await akvs[key()].write({"n": 0, "pad": np.zeros(2)})
+
+    async def count():
+        for _ in range(10):
+            while True:
+                try:
+                    async with akvs[key()].edit() as value:
+                        value["n"] += 1
+                    break
+                except Conflict:
+                    await asyncio.sleep(0)
+
+    await asyncio.gather(*(count() for _ in range(4)))
+    assert await akvs[key()]["n"].read() == 40
+
+
+async def test_many_calls_run_at_once_on_one_interface(akvs, key):
+    """Each gets its own reply."""
+    await akvs[key()].write({str(n): n for n in range(200)})
+    assert await asyncio.gather(*(akvs[key()][str(n)].read() for n in range(200))) == list(range(200))
+
+
+async def test_a_cancelled_call_harms_no_other(akvs, key):
+    """Its reply is dropped, not handed to the next caller."""
+    await akvs[key()].write({str(n): n for n in range(50)} | {"image": np.zeros(100_000)})
+    for _ in range(20):
+        tasks = [asyncio.create_task(akvs[key()][str(n)].read()) for n in range(50)]
+        tasks.append(asyncio.create_task(akvs[key()]["image"].read()))
+        await asyncio.sleep(0)
+        for task in tasks[::2]:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        for n, result in enumerate(results[:50]):
+            assert result == n or isinstance(result, asyncio.CancelledError)
+    assert await akvs[key()]["7"].read() == 7
+
+
+async def test_an_async_program_reads_what_a_blocking_one_wrote_and_the_reverse(akvs, kvs, key):
+    """One layout serves both fronts; a blocking call also works inside a running loop."""
+    value = {"n": 0.9374604873776271, "image": np.arange(6.0).reshape(2, 3), "b": b"x", "l": [np.arange(2)]}
+    kvs[key()] = value
+    assert_same(await akvs[key()].read(), value)
+    await akvs[key("back")].write(value)
+    assert_same(kvs[key("back")].read(), value)
+
+
+async def test_async_handles_can_be_pickled(akvs, apspace, key):
+    """They reconnect in the loop that uses them."""
+    await akvs[key()].write({"a": np.arange(3)})
+    store, accessor = pickle.loads(pickle.dumps((akvs, akvs[key()]["a"])))
+    assert_same(await accessor.read(), np.arange(3))
+    assert_same(await store[key()].read(), {"a": np.arange(3)})
+    await store.interface.close()
+    publishing = pickle.loads(pickle.dumps(apspace))
+    await publishing[key()]["a"].write(1)
+    await publishing.interface.close()
+    assert await akvs[key()].read() == {"a": 1}
+
+
+async def test_async_low_level_twins(ainterface, akvs, key):
+    """Writer, Reader and Publisher take the manual's path strings."""
+    await reem_async.Writer(key(), ainterface).send_to_redis(".", {"a": {}})
+    await reem_async.Writer(key(), ainterface).send_to_redis(".a.b", np.arange(3))
+    assert_same(await reem_async.Reader(key(), ainterface).read_from_redis(".a.b"), np.arange(3))
+    await reem_async.Publisher(top_key_name=key(), interface=ainterface).send_to_redis(".a.b", 5)
+    assert await akvs[key()].read() == {"a": {"b": 5}}
+
+
+async def test_the_interface_need_not_be_initialized(server_url, key):
+    """The first call connects; `KeyValueStore` also takes the address itself."""
+    kvs = reem_async.KeyValueStore(server_url)
+    await kvs[key()].write(1)
+    assert await kvs[key()].read() == 1
+    await kvs.interface.close()
+
+
+# --- both fronts -----------------------------------------------------------------------------------
+
+
+def test_a_missing_key_may_have_a_default(front, key):
+    """`accessor.get(default)`, and `accessor.get(key, default)` as in REEM 0.1.2."""
+    front.write([key()], {"a": 1, "none": None})
+
+    def get(path, *arguments):
+        got = front.at(path).get(*arguments)
+        return front.run(got) if hasattr(got, "__await__") else got
+
+    assert get([key(), "a"]) == 1
+    assert get([key(), "b"]) is None
+    assert get([key(), "b"], 5) == 5
+    assert get([key("absent")], "x") == "x"
+    assert get([key(), "none"], 5) is None
+    assert get([key()], "a", 7) == 1
+    assert get([key()], "b", 7) == 7
+
+
+def test_dotted_access(front, key):
+    """`get` and `set` of the store take `foo.bar`; a missing one is a KeyError unless there is a default."""
+    front.set(key(), {"bar": {"n": 1}})
+    front.set(key() + ".bar.image", np.arange(3))
+    assert_same(front.get(key() + ".bar"), {"n": 1, "image": np.arange(3)})
+    assert front.get(key() + ".bar.n") == 1
+    with pytest.raises(MissingKey, match=key()):
+        front.get(key() + ".bar.absent")
+    assert front.get(key() + ".bar.absent", 5) == 5
+    assert front.get(key("absent") + ".x", None) is None
+    with pytest.raises(PathRefused):
+        front.set(key() + ".absent.x", 1)
+
+
+def test_types_are_python_types(front, key):
+    """Of the value as it would be read."""
+    values = {
+        "d": ({"a": 1}, dict),
+        "l": ([1], list),
+        "i": (5, int),
+        "big": (2**64 - 1, int),
+        "f": (5.0, float),
+        "long": (0.9374604873776271, float),
+        "b": (True, bool),
+        "s": ("x", str),
+        "ship": ("$ship x", str),
+        "n": (None, type(None)),
+        "a": (np.arange(3), np.ndarray),
+        "bytes": (b"x", bytes),
+    }
+    front.write([key()], {name: value for name, (value, _) in values.items()})
+    assert front.type([key()]) is dict
+    for name, (value, expected) in values.items():
+        assert front.type([key(), name]) is expected
+        front.write([key(name)], value)
+        assert front.type([key(name)]) is expected
+
+
+def test_lengths(front, key):
+    """Dict entries, list items, characters, bytes, the first dimension of an array."""
+    values = {
+        "d": {"a": 1, "b": 2},
+        "l": [1, np.arange(9), 3],
+        "s": "é🤖x",
+        "b": b"12345",
+        "a": np.zeros((7, 2)),
+    }
+    lengths = {"d": 2, "l": 3, "s": 3, "b": 5, "a": 7}
+    front.write([key()], values | {"ship": "$ship x"})
+    assert front.length([key()]) == 6
+    assert {name: front.length([key(), name]) for name in lengths} == lengths
+    assert front.length([key(), "ship"]) == 7
+    front.write([key("root")], np.zeros((4, 5)))
+    assert front.length([key("root")]) == 4
+
+
+def test_integer_indexes(front, key, raw):
+    """Lists are read, written and deleted by index; negative ones count from the end when reading."""
+    front.write([key()], {"l": [0, np.arange(1), {"x": np.arange(2)}, 3]})
+    assert front.read([key(), "l", 0]) == 0
+    assert front.read([key(), "l", -1]) == 3
+    assert_same(front.read([key(), "l", -2]), {"x": np.arange(2)})
+    assert_same(front.read([key(), "l", 2, "x"]), np.arange(2))
+    front.write([key(), "l", 0], np.arange(5))
+    front.write([key(), "l", 1], "plain")
+    front.write([key(), "l", 2, "y"], np.arange(3))
+    expected = [np.arange(5), "plain", {"x": np.arange(2), "y": np.arange(3)}, 3]
+    assert_same(front.read([key(), "l"]), expected)
+    front.delete([key(), "l", 0])
+    assert_same(front.read([key(), "l"]), expected[1:])
+    with pytest.raises(MissingKey):
+        front.read([key(), 0])
+    assert_no_orphans(raw, key())
+
+
+@pytest.mark.parametrize("index", [3, -4, 100, -100])
+def test_an_index_out_of_range_touches_nothing(front, key, index):
+    """The server itself would take the first or the last item in its place."""
+    front.write([key()], {"l": [0, np.arange(1), {"n": 1}]})
+    for call in (front.read, front.delete, front.length, front.type, lambda path: front.increment(path, 1)):
+        with pytest.raises(MissingKey):
+            call([key(), "l", index])
+    with pytest.raises((PathRefused, BadKey)):
+        front.write([key(), "l", index], 5)
+    with pytest.raises((PathRefused, BadKey)):
+        front.write([key(), "l", index, "n"], np.arange(2))
+    assert_same(front.read([key()]), {"l": [0, np.arange(1), {"n": 1}]})
+
+
+def test_arrays_in_a_list_stay_apart_when_the_list_shifts(front, key, raw):
+    """Deleting an item moves the others; a later append must not take the place of one of them."""
+    arrays = [np.full(3, n) for n in range(6)]
+    front.write([key()], {"l": arrays[:3]})
+    front.delete([key(), "l", 0])
+    front.append([key(), "l"], arrays[3])
+    assert_same(front.read([key(), "l"]), arrays[1:4])
+    front.delete([key(), "l", 1])
+    front.extend([key(), "l"], arrays[4:])
+    assert_same(front.read([key(), "l"]), [arrays[1], arrays[3], arrays[4], arrays[5]])
+    front.write([key(), "l", 1], np.full(2, 99))
+    assert_same(front.read([key(), "l"]), [arrays[1], np.full(2, 99), arrays[4], arrays[5]])
+    assert_no_orphans(raw, key())
+
+
+def test_arrays_under_paths_that_look_alike_stay_apart(front, key, raw):
+    """Dots, quotes, brackets and digits in keys do not make two arrays share one place."""
+    document = {
+        "a.b": np.full(1, 1),
+        "a": {"b": np.full(1, 2), "b.c": np.full(1, 3), "0": np.full(1, 4)},
+        "a.b.c": np.full(1, 5),
+        "l": [np.full(1, 6), {"0": np.full(1, 7)}],
+        "l.0": np.full(1, 8),
+        "l[0]": np.full(1, 9),
+        "": {"": np.full(1, 10)},
+        ".": np.full(1, 11),
+        "'q'": np.full(1, 12),
+        '"q"': np.full(1, 13),
+        "\\": np.full(1, 14),
+        "é\n*$ {}": np.full(1, 15),
+        "ships": np.full(1, 16),
+        ":ships": np.full(1, 17),
+    }
+    front.write([key()], document)
+    assert_same(front.read([key()]), document)
+    assert_same(front.read([key(), "a.b"]), np.full(1, 1))
+    assert_same(front.read([key(), "a", "b"]), np.full(1, 2))
+    front.write([key(), "a"], {"b": {"c": np.full(1, 18)}})
+    document["a"] = {"b": {"c": np.full(1, 18)}}
+    assert_same(front.read([key()]), document)
+    for name in document:
+        if name != "\\":
+            front.delete([key(), name])
+    assert_same(front.read([key()]), {"\\": np.full(1, 14)})
+    front.delete([key()])
+    assert keys_of(raw, key()) == set()
+
+
+@pytest.mark.parametrize("name", ["a.b", "a b", "'", '"', "", "*", "$", "]", "[0]", "0", "é🤖", "\n\t\x01", "\u2028"])
+def test_odd_keys_are_addressed_by_path(front, key, raw, name):
+    """Every character but a backslash, and one kind of quotes."""
+    front.write([key()], {})
+    front.write([key(), name], {"image": np.arange(3)})
+    front.write([key(), name, name], 1.5)
+    assert_same(front.read([key()]), {name: {"image": np.arange(3), name: 1.5}})
+    front.increment([key(), name, name], 1)
+    assert front.read([key(), name, name]) == 2.5
+    front.delete([key(), name, "image"])
+    assert front.length([key(), name]) == 1
+    assert_no_orphans(raw, key())
+
+
+def test_replacing_and_deleting_unlinks_the_arrays(front, key, raw):
+    """Whatever replaces them, and `foobar` is not `foo`."""
+    arrays = {"image": np.arange(3), "deep": {"l": [np.arange(2), b"x"]}, "imagebar": np.arange(9)}
+    front.write([key("foobar")], arrays)
+    for value in (1, {"deep": np.arange(1)}, [np.arange(2)], np.arange(5), "x", {}):
+        front.write([key("foo")], arrays)
+        assert_no_orphans(raw, key("foo"))
+        front.write([key("foo"), "image"], value)
+        front.write([key("foo"), "deep", "l"], value)
+        assert_same(front.read([key("foo"), "imagebar"]), np.arange(9))
+        assert_no_orphans(raw, key("foo"))
+        front.write([key("foo")], value)
+        assert_same(front.read([key("foo")]), value)
+        assert_no_orphans(raw, key("foo"))
+    front.delete([key("foo")])
+    assert keys_of(raw, key("foo")) == set()
+    assert_same(front.read([key("foobar")]), arrays)
+    assert_no_orphans(raw, key("foobar"))
+
+
+def test_a_namespace_prefixes_every_key_and_keeps_programs_apart(open_front, key, raw):
+    """All keys of one document live in one cluster slot, with and without a namespace."""
+    one, two, none = (open_front(namespace=key("one:")), open_front(namespace=key("two:")), open_front())
+    for value, front in enumerate((one, two)):
+        front.write([key("k")], {"n": value, "image": np.full(3, value)})
+    none.write([key("k")], {"image": np.full(3, 9)})
+    assert_same(one.read([key("k")]), {"n": 0, "image": np.full(3, 0)})
+    assert_same(two.read([key("k")]), {"n": 1, "image": np.full(3, 1)})
+    names = list(raw.scan_iter(match=f"*{key('k')}*", count=1000))
+    mine = [name for name in names if key("one:") in name]
+    assert len(mine) == 3
+    assert all(name.lstrip("{").startswith(key("one:")) for name in mine)
+    for group in (mine, [name for name in names if key("one:") not in name and key("two:") not in name]):
+        assert len(group) == 3
+        assert len({key_slot(name.encode()) for name in group}) == 1
+    one.delete([key("k")])
+    assert not [name for name in raw.scan_iter(match=f"*{key('k')}*", count=1000) if key("one:") in name]
+
+
+def test_the_schema_switch_refuses_an_array_where_none_was(open_front, key, raw):
+    """The shape last written is assumed until the switch is turned back on, for all keys or for some."""
+    front = open_front()
+    front.write([key()], {"n": 1, "image": np.zeros(3)})
+    front.write([key("other")], {"n": 1})
+    front.kvs.track_schema_changes(False)
+    front.write([key()], {"n": 2, "image": np.ones(3)})
+    assert_same(front.read([key()]), {"n": 2, "image": np.ones(3)})
+    with nothing_sent(raw), pytest.raises(TypeError):
+        front.write([key("other")], {"n": np.zeros(3)})
+    front.kvs.track_schema_changes(True)
+    front.write([key("other")], {"n": np.zeros(3)})
+    front.write([key("third")], {"n": 1})
+    front.kvs.track_schema_changes(False, keys=[key("third")])
+    front.write([key("other")], {"m": np.zeros(3)})
+    with pytest.raises(TypeError):
+        front.write([key("third")], {"n": np.zeros(3)})
+    assert_same(front.read([key("third")]), {"n": 1})
+
+
+def test_a_publish_space_cannot_be_read(open_front, key):
+    """It is a store that only writes; the error says so."""
+    front = open_front("PublishSpace")
+    assert issubclass(reem.PublishSpace, reem.KeyValueStore)
+    assert issubclass(reem_async.PublishSpace, reem_async.KeyValueStore)
+    front.write([key()], {"a": 1})
+    for call in (front.read, front.length, front.type):
+        with pytest.raises(WriteOnly) as caught:
+            call([key(), "a"])
+        assert isinstance(caught.value, NotImplementedError)
+    with pytest.raises(WriteOnly):
+        front.get(key() + ".a")
+
+
+def test_nobody_listening_is_said_with_a_remedy():
+    """The error names `reem up` and the compose file."""
+    import socket
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    interface = reem.RedisInterface("127.0.0.1", port=port)
+    with pytest.raises(NotConnected, match=r"(?s)reem up.*compose|compose.*reem up"):
+        interface.initialize()
+    interface.close()
+
+
+def test_two_processes_share_the_store(kvs, key, server_url):
+    """A blocking writer here, an async program there."""
+    kvs[key()] = {"image": np.arange(12.0).reshape(3, 4)}
+    code = (
+        "import asyncio, sys, reem_async\n"
+        "async def main(url, key):\n"
+        "    async with reem_async.RedisInterface(url) as interface:\n"
+        "        kvs = reem_async.KeyValueStore(interface)\n"
+        "        image = await kvs[key]['image'].read()\n"
+        "        await kvs[key]['twice'].write(image * 2)\n"
+        "asyncio.run(main(*sys.argv[1:]))\n"
+    )
+    done = python(code, server_url, key())
+    assert (done.returncode, done.stderr) == (0, ""), f"in {ROOT}"
+    assert_same(kvs[key()]["twice"].read(), np.arange(12.0).reshape(3, 4) * 2)
