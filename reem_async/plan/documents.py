@@ -116,9 +116,16 @@ def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
         b"null" in text
         or placeholders.MARK_BYTES in text
         or may_lose(text)
-        or (text.count(b"{") + text.count(b"[") > DEEPEST - above and _levels(value) > DEEPEST - above)
+        or (_has_many_containers(text, DEEPEST - above) and _levels(value) > DEEPEST - above)
         or not _only_plain_types(value)
     )
+
+
+def _has_many_containers(text: bytes, limit: int) -> bool:
+    """Return whether there are more than `limit`; flat documents are told by searches at memory speed."""
+    if text.find(b"{", 1) < 0 and text.find(b"[", 1) < 0:
+        return limit < 1
+    return text.count(b"{") + text.count(b"[") > limit
 
 
 def _only_plain_types(value: Any) -> bool:

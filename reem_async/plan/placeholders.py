@@ -15,6 +15,7 @@ user's string that begins with the mark, `float` for a float no decimal text of 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 from urllib.parse import quote, unquote
 
@@ -45,8 +46,13 @@ class Placeholder:
     summary: str = ""
 
     def __str__(self) -> str:
-        words = [MARK[:-1], quote(self.label, safe=_SAFE), quote(self.suffix, safe=_SAFE), str(self.size)]
-        return " ".join([*words, self.summary] if self.summary else words)
+        return _written(self)
+
+
+@lru_cache(maxsize=4096)
+def _written(it: Placeholder) -> str:
+    words = [MARK[:-1], quote(it.label, safe=_SAFE), quote(it.suffix, safe=_SAFE), str(it.size)]
+    return " ".join([*words, it.summary] if it.summary else words)
 
 
 # Everything but blanks, controls and the percent sign stays readable.
@@ -72,6 +78,7 @@ def inline_float(value: float) -> str:
     return f"{MARK}float {value.hex()}"
 
 
+@lru_cache(maxsize=4096)
 def parse(text: str) -> Placeholder | str | float:
     """Return what the string `text`, which begins with the mark, stands for.
 

@@ -81,7 +81,9 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
         crates = find(holder) if MARK_BYTES in text else []
         if not crates:
             return Sealed(holder, keys.name, [], (command,), (text,))
-        return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
+        met = tuple(crate.placeholder for crate in crates)
+        memory.saw_layout(keys.document, path, met)
+        return _Fetch(keys, path, ships, memory, met).plan()
 
     return Plan([command], decode)
 

@@ -102,6 +102,7 @@ def flat_buffer(word: Any) -> Any:
     return word
 
 
+@lru_cache(maxsize=256)
 def _dtype_name(dtype: np.dtype[Any]) -> str:
     if dtype.names is None:
         return str(dtype)

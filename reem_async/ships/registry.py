@@ -97,7 +97,10 @@ class Ships:
 
     def fits(self, value: Any) -> Registered | None:
         """Return the first ship that takes `value`, or None."""
-        return next((each for each in self._registered if each.ship.check_fit(value)), None)
+        for each in self._registered:
+            if each.ship.check_fit(value):
+                return each
+        return None
 
     async def choices(self, value: Any) -> Callable[[Any], Registered | None]:
         """Return what `fits` would say for everything inside `value`, asking ships that must be awaited."""

@@ -43,7 +43,11 @@ def _packed(command: Command) -> bytes:
 
 
 def _has_large(command: Command) -> bool:
-    return any(type(word) in (bytes, memoryview) and len(word) >= LARGE for word in command)
+    for word in command:
+        kind = type(word)
+        if (kind is bytes or kind is memoryview) and len(word) >= LARGE:
+            return True
+    return False
 
 
 def _pack_large(command: Command, pieces: list[Piece], small: list[bytes]) -> None:

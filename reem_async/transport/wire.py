@@ -20,7 +20,7 @@ from redis._parsers import BaseParser
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
-from .packing import pack
+from .packing import LARGE, Piece, pack
 
 __all__ = ["MORE", "Wire", "new_reader", "open_wire"]
 
@@ -72,6 +72,7 @@ class Wire(asyncio.BufferedProtocol):
         self._reader = new_reader()
         self._buffer = bytearray(BUFFER)
         self._due: collections.deque[_Due] = collections.deque()
+        self._outbox: list[Piece] = []
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._keep: Any = None
@@ -108,13 +109,36 @@ class Wire(asyncio.BufferedProtocol):
             done(self._reason or ConnectionLost("the connection is closed"))
             return
         pieces = pack(commands)
-        if not self._due:
+        idle = not self._due
+        self._due.append(_Due(len(commands), done))
+        if idle and not self._outbox:
             self._last_byte = self._loop.time()
             if self._watch is None:
                 self._watch = self._loop.call_later(self._timeout, self._check_time)
-        self._due.append(_Due(len(commands), done))
-        for piece in pieces:
-            self._transport.write(bytes(piece) if self._keeps_views and type(piece) is memoryview else piece)
+            self._write(pieces)
+            return
+        # Others wait already: what is sent in the same turn of the loop goes out in one system call.
+        if not self._outbox:
+            self._loop.call_soon(self._flush)
+        # A view of an array is copied: its owner may change it before this turn is over.
+        self._outbox.extend(bytes(piece) if type(piece) is memoryview else piece for piece in pieces)
+
+    def _flush(self) -> None:
+        pieces, self._outbox = self._outbox, []
+        if self._reason is None:
+            self._write(pieces)
+
+    def _write(self, pieces: list[Piece]) -> None:
+        assert self._transport is not None
+        start = 0
+        for place, piece in enumerate(pieces):
+            if type(piece) is memoryview or len(piece) >= LARGE:
+                if place > start:
+                    self._transport.write(b"".join(pieces[start:place]))
+                start = place + 1
+                self._transport.write(bytes(piece) if self._keeps_views and type(piece) is memoryview else piece)
+        if start < len(pieces):
+            self._transport.write(pieces[start] if len(pieces) - start == 1 else b"".join(pieces[start:]))
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` and return their replies. Cancelling leaves the connection usable."""
