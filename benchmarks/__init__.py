@@ -1,0 +1,1 @@
+"""Benchmarks of REEM beside the original, peers and floors: `python -m benchmarks`."""

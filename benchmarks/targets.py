@@ -1,0 +1,147 @@
+"""What the figures have to show: ratios of one run, each with what must be and what is hoped for."""
+
+import dataclasses
+from typing import Any
+
+from .results import Results
+
+Place = tuple[str, str]  # case, contender
+NEAR = 1.1  # within a tenth of what must be
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One ratio. With `throughput`, more is better and the ratio is turned round."""
+
+    text: str
+    ours: Place
+    theirs: Place
+    must: float
+    hope: float
+    statistic: str = "median"
+    throughput: bool = False
+
+    def ratio(self, results: Results) -> float | None:
+        """Ours to theirs; None if one of them was not measured."""
+        ours = results.value(*self.ours, self.statistic)
+        theirs = results.value(*self.theirs, self.statistic)
+        if ours is None or theirs is None:
+            return None
+        return theirs / ours if self.throughput else ours / theirs
+
+    def verdict(self, ratio: float | None) -> str:
+        """PASS, near or FAIL; a star where what was hoped for is reached too."""
+        if ratio is None:
+            return "not measured"
+        if self.throughput:
+            met, hoped, near = ratio >= self.must, ratio >= self.hope, ratio * NEAR >= self.must
+        else:
+            met, hoped, near = ratio <= self.must, ratio <= self.hope, ratio <= self.must * NEAR
+        if met:
+            return "PASS *" if hoped else "PASS"
+        return "near" if near else "FAIL"
+
+    def judged(self, results: Results) -> dict[str, Any]:
+        """The row as it is kept and printed."""
+        ratio = self.ratio(results)
+        return {
+            "text": self.text,
+            "ours": list(self.ours),
+            "theirs": list(self.theirs),
+            "statistic": self.statistic,
+            "ratio": ratio,
+            "must": self.must,
+            "hope": self.hope,
+            "throughput": self.throughput,
+            "verdict": self.verdict(ratio),
+        }
+
+
+FRONTS = {"blocking": "reem", "asyncio": "async"}
+
+
+def _small() -> list[Row]:
+    rows = []
+    for operation in ("get", "set"):
+        case = f"small.{operation}"
+        rows += [
+            Row(
+                f"asyncio {operation}, small dict / redis.asyncio",
+                (case, "async"),
+                (case, "redis-asyncio"),
+                0.9,
+                0.75,
+            ),
+            Row(f"blocking {operation}, small dict / original", (case, "reem"), (case, "original"), 0.5, 0.35),
+            Row(
+                f"blocking {operation}, small dict / redis-py + orjson",
+                (case, "reem"),
+                (case, "redis-py"),
+                1.3,
+                1.1,
+            ),
+        ]
+    return rows
+
+
+# text, case, against whom, must, hope: for either front
+_EITHER = [
+    ("400 strings, set", "strings.400.set", "original", 0.2, 0.12),
+    ("400 strings, get", "strings.400.get", "original", 0.5, 0.37),
+    ("40 arrays (3,4), set", "arrays.40.set", "original", 0.3, 0.2),
+    ("40 arrays (3,4), get", "arrays.40.get", "original", 0.3, 0.2),
+    ("array 1000x1000, get", "array.1000.get", "original", 0.2, 0.12),
+    ("array 1000x1000, get", "array.1000.get", "redis-py", 1.2, 1.0),
+    ("array 1000x1000, set", "array.1000.set", "original", 1.0, 0.75),
+    ("array 1000x1000, set", "array.1000.set", "connection", 1.3, 1.1),
+    ("pottery comparison, set", "pottery.set", "pottery", 0.8, 0.5),
+    ("pottery comparison, get", "pottery.get", "pottery", 0.8, 0.5),
+    ("publish to callback, small", "publish.small", "original", 0.4, 0.3),
+    ("publish to callback, small", "publish.small", "redis-py", 1.3, 1.0),
+    ("publish to callback, frame", "publish.frame", "original", 0.35, 0.25),
+    ("publish to callback, frame", "publish.frame", "zenoh", 2.0, 1.2),
+    ("100 subscriber processes", "subscribers.100", "original", 0.5, 0.3),
+]
+
+
+def rows() -> list[Row]:
+    """Every row, in the order of the specification."""
+    found = _small()
+    for text, case, theirs, must, hope in _EITHER:
+        found += [
+            Row(f"{front}: {text} / {theirs}", (case, ours), (case, theirs), must, hope)
+            for front, ours in FRONTS.items()
+        ]
+    found.append(
+        Row(
+            "100 concurrent async reads, throughput / redis.asyncio",
+            ("callers.100", "async"),
+            ("callers.100", "redis-asyncio"),
+            3.0,
+            5.0,
+            throughput=True,
+        )
+    )
+    found += [
+        Row(
+            f"{front}: 1 kHz writer beside 8 MB frames, p99 / alone",
+            ("camera.beside", ours),
+            ("camera.alone", ours),
+            3.0,
+            2.0,
+            statistic="p99",
+        )
+        for front, ours in FRONTS.items()
+    ]
+    found += [
+        Row("import reem / import redis and numpy", ("import", "reem"), ("import", "redis+numpy"), 1.3, 1.1),
+        Row(
+            "8 threads on one interface, throughput / 1 thread",
+            ("threads.8", "reem"),
+            ("threads.1", "reem"),
+            1.0,
+            1.5,
+            throughput=True,
+        ),
+    ]
+    return found

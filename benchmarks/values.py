@@ -1,0 +1,75 @@
+"""The values that are written and read, built alike in every process from a short description."""
+
+import json
+from typing import Any
+
+import numpy as np
+
+Spec = dict[str, Any]
+
+TEXT = "A" * 100
+FRAME_SHAPE = (640, 480, 3)
+
+
+def copies(count: int, data: dict[str, Any]) -> dict[str, Any]:
+    """One flat dictionary holding `data` over and over, as in the manual's listings."""
+    return {f"copy_{index}_{key}": value for index in range(count) for key, value in data.items()}
+
+
+def nested(levels: int, data: dict[str, Any]) -> dict[str, Any]:
+    """Bury `data` below `levels` dictionaries of one key each."""
+    for level in reversed(range(levels)):
+        data = {f"sub_{level}": data}
+    return data
+
+
+def random_array(shape: list[int]) -> np.ndarray[Any, Any]:
+    """A float64 array that no compressor could shrink."""
+    return np.random.default_rng(1).random(shape)
+
+
+def build(spec: Spec) -> Any:
+    """The value a description stands for."""
+    kind = spec["kind"]
+    if kind == "small":
+        return {"number": 1, "string": "REEM"}
+    if kind == "strings":
+        return copies(spec["count"], {"single_key": TEXT})
+    if kind == "floats":
+        return {f"joint_{index}": value for index, value in enumerate(random_array([spec["count"]]).tolist())}
+    if kind == "arrays":
+        return copies(spec["count"], {"single_key": random_array([3, 4])})
+    if kind == "array":
+        return random_array(spec["shape"])
+    if kind == "bytes":
+        return random_array([max(1, spec["count"] // 8)])
+    if kind == "pottery":
+        return nested(5, copies(100, {"single_key": TEXT, "nested_data": {"subkey": TEXT}}))
+    raise ValueError(f"no value of kind {kind!r}")
+
+
+def below(value: Any, path: list[str]) -> Any:
+    """The part of `value` at `path`."""
+    for key in path:
+        value = value[key]
+    return value
+
+
+def same(found: Any, expected: Any) -> bool:
+    """Whether a contender read what was written; raw bytes are compared as what they encode."""
+    if isinstance(found, bytes | bytearray) and isinstance(expected, np.ndarray):
+        return bytes(found) == expected.tobytes()
+    if isinstance(found, bytes | bytearray):
+        return same(json.loads(found), expected)
+    if isinstance(expected, np.ndarray):
+        return isinstance(found, np.ndarray) and bool(np.array_equal(found, expected))
+    if isinstance(expected, dict):
+        return (
+            isinstance(found, dict)
+            and found.keys() == expected.keys()
+            and all(same(found[key], expected[key]) for key in expected)
+        )
+    if isinstance(expected, float):
+        # An older client may lose the last digit; that is no reason to leave it out of a race.
+        return bool(np.isclose(found, expected, rtol=1e-14))
+    return bool(found == expected)

@@ -1,0 +1,1 @@
+"""The programs being measured: one process each, driven over pipes by `benchmarks.process`."""

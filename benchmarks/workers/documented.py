@@ -1,0 +1,66 @@
+"""The documented blocking API, as this REEM and the original both have it."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from ..values import FRAME_SHAPE, random_array
+
+
+def walk(store: Any, path: list[str]) -> Any:
+    """The accessor at `path`, made anew for every call as a user's program does."""
+    for key in path:
+        store = store[key]
+    return store
+
+
+def message_maker(payload: str) -> Callable[[], dict[str, Any]]:
+    """What makes the next stamped message."""
+    if payload == "small":
+        return lambda: {"timestamp": time.monotonic_ns()}
+    image = random_array(list(FRAME_SHAPE))
+    return lambda: {"timestamp": time.monotonic_ns(), "image": image}
+
+
+class DocumentedContender:
+    """Writes, reads and publishes as the manual shows. Subclasses set `interface` and the three classes."""
+
+    asynchronous = False
+    interface: Any
+    store: Any
+    space: Any
+    callback_subscriber: Any
+
+    def writing(self, path: list[str], value: Any) -> Callable[[], None]:
+        """`store["a"]["b"] = value`."""
+        parents, last = path[:-1], path[-1]
+
+        def call() -> None:
+            walk(self.store, parents)[last] = value
+
+        return call
+
+    def reading(self, path: list[str], value: Any) -> Callable[[], Any]:
+        """`store["a"]["b"].read()`."""
+        return lambda: walk(self.store, path).read()
+
+    def publishing(self, channel: str, payload: str) -> Callable[[], None]:
+        """`space["channel"] = {"timestamp": now, ...}`."""
+        message = message_maker(payload)
+
+        def call() -> None:
+            self.space[channel] = message()
+
+        return call
+
+    def subscribe(self, channel: str, payload: str, heard: Callable[[int], None]) -> None:
+        """A `CallbackSubscriber` that hands on the stamp once it has the data."""
+
+        def callback(data: Any, updated_path: Any, **_: Any) -> None:
+            if payload == "small" or data["image"].shape == FRAME_SHAPE:
+                heard(data["timestamp"])
+
+        subscriber = self.callback_subscriber(channel, self.interface, callback, {})
+        subscriber.listen()
+        # Whoever does not hold a subscriber may lose it.
+        self.__dict__.setdefault("subscribers", []).append(subscriber)
