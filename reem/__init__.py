@@ -46,7 +46,7 @@ from .errors import (
     WrongKind,
     WrongLoop,
 )
-from .ships import BytesShip, FieldShip, NumpyShip, SpecialDatatypeShip
+from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 
 __all__ = [
     "BadData",
@@ -54,12 +54,12 @@ __all__ = [
     "BadKey",
     "BadType",
     "BadValue",
+    "BlobShip",
     "BytesShip",
     "CallbackSubscriber",
     "Conflict",
     "ConnectionLost",
     "Every",
-    "FieldShip",
     "InterfaceClosed",
     "KeyValueStore",
     "Last",

@@ -44,7 +44,7 @@ from .errors import (
     WrongLoop,
 )
 from .policy import Every, Last, Newest
-from .ships import BytesShip, FieldShip, NumpyShip, SpecialDatatypeShip
+from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 
 __version__ = "1.0.0"
 
@@ -54,12 +54,12 @@ __all__ = [
     "BadKey",
     "BadType",
     "BadValue",
+    "BlobShip",
     "BytesShip",
     "CallbackSubscriber",
     "Conflict",
     "ConnectionLost",
     "Every",
-    "FieldShip",
     "InterfaceClosed",
     "KeyValueStore",
     "Last",

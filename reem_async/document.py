@@ -219,10 +219,9 @@ class DocumentWriter:
 
     async def _load(self, parcel: Parcel) -> Loaded:
         key, ship = self.keys.tag + parcel.suffix, parcel.ship
-        if ship.fields is not None:
-            fields = ship.fields.pack(parcel.value)
-            words = [word for pair in fields.items() for word in pair]
-            return Loaded(parcel.suffix, ship.label, (("HSET", key, *words),), fields)
+        if ship.blob is not None:
+            blob = ship.blob.pack(parcel.value)
+            return Loaded(parcel.suffix, ship.label, (("SET", key, blob),), blob)
         recorder = self.session.ships.new_recorder()
         result = ship.ship.write(key, parcel.value, recorder)
         if inspect.isawaitable(result):

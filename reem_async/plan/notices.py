@@ -56,21 +56,18 @@ def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted:
 
 
 def with_value(publisher: str, sequence: int, time: float, path: Path, text: bytes, loaded: Sequence[Loaded]) -> bytes:
-    """Return a notice with the value if it is small and made of fields, else without."""
-    size = len(text)
-    for each in loaded:
-        if each.fields is None:
-            return announce(publisher, sequence, time, path)
-        size += sum(len(content) for content in each.fields.values())
-    if size > LARGEST_INLINE:
+    """Return a notice with the value if it is small and made of bytes, else without."""
+    if any(each.blob is None for each in loaded):
         return announce(publisher, sequence, time, path)
-    parts = [
-        [each.label, each.suffix, [[name, len(content)] for name, content in each.fields.items()]]
-        for each in loaded
-        if each.fields is not None
-    ]
-    body = [bytes(content) for each in loaded if each.fields for content in each.fields.values()]
-    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *body])
+    blobs = [b"".join(each.blob) for each in loaded if each.blob is not None and _size(each.blob) <= LARGEST_INLINE]
+    if len(blobs) < len(loaded) or len(text) + sum(map(len, blobs)) > LARGEST_INLINE:
+        return announce(publisher, sequence, time, path)
+    parts = [[each.label, each.suffix, len(blob)] for each, blob in zip(loaded, blobs, strict=True)]
+    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
+
+
+def _size(blob: Sequence[Any]) -> int:
+    return sum(len(piece) for piece in blob)
 
 
 def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
@@ -118,12 +115,10 @@ def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships
     text, position = payload[start : start + size], start + size
     replies: dict[tuple[str, str], Any] = {}
     try:
-        for label, suffix, fields in parts:
-            fetched = {}
-            for name, length in fields:
-                fetched[name.encode()] = payload[position : position + length]
-                position += length
-            replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([fetched])
+        for label, suffix, length in parts:
+            blob = payload[position : position + length]
+            position += length
+            replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([blob])
         holder = [orjson.loads(text)]
         for crate in find(holder) if MARK_BYTES in text else ():
             crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]

@@ -54,9 +54,20 @@ def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
         BadData: With the path, if the ship cannot believe it.
     """
     try:
-        return ship.ship.interpret_read([reply])
+        return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
         raise BadData(f"{name}{crate.placeholder.suffix.partition('~')[0]}: {error}") from None
+
+
+def _plain(reply: Reply) -> Reply:
+    """Return a reply as redis-py would: large strings are bytes there, not bytearrays."""
+    if isinstance(reply, bytearray):
+        return bytes(reply)
+    if isinstance(reply, list):
+        return [_plain(item) for item in reply]
+    if isinstance(reply, dict):
+        return {_plain(key): _plain(item) for key, item in reply.items()}
+    return reply
 
 
 def get_command(keys: Keys, path: Path) -> Command:
@@ -81,9 +92,7 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
         crates = find(holder) if MARK_BYTES in text else []
         if not crates:
             return Sealed(holder, keys.name, [], (command,), (text,))
-        met = tuple(crate.placeholder for crate in crates)
-        memory.saw_layout(keys.document, path, met)
-        return _Fetch(keys, path, ships, memory, met).plan()
+        return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
 
     return Plan([command], decode)
 
@@ -110,6 +119,7 @@ class _Fetch:
     def plan(self) -> Plan:
         where = show(full(self.keys, self.path))
         asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in self.wanted}
+        self.memory.saw_layout(self.keys.document, self.path, self.wanted)
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
         commands = (get_command(self.keys, self.path), *reads)
         bulk = sum(each.size for each in self.wanted) >= BULK
@@ -130,11 +140,11 @@ class _Fetch:
         holder = loads(text, self.keys)
         crates = find(holder)
         met = tuple(crate.placeholder for crate in crates)
-        if met != self.wanted:
-            self.memory.saw_layout(self.keys.document, self.path, met)
         got = dict(zip(asked, replies[1:], strict=True))
         if any((each.label, each.suffix) not in got for each in met):
             return self._again(met)
+        if met != self.wanted:
+            self.memory.saw_layout(self.keys.document, self.path, met)
         crated = [
             (crate, asked[place], checked(got[place], self.keys, self.path))
             for crate in crates

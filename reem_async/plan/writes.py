@@ -43,13 +43,13 @@ class Loaded:
         suffix: The key's name after the tag.
         label: The ship's label.
         commands: What stores it.
-        fields: Its bytes by name, where the ship works that way: they can travel in a notice.
+        blob: Its bytes in pieces, where the ship works that way: they can travel in a notice.
     """
 
     suffix: str
     label: str
     commands: tuple[Command, ...]
-    fields: dict[str, Any] | None = None
+    blob: tuple[Any, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable
 from typing import Any
 
-__all__ = ["FieldShip", "SpecialDatatypeShip"]
+__all__ = ["BlobShip", "SpecialDatatypeShip"]
 
 
 class SpecialDatatypeShip(ABC):
@@ -57,28 +57,29 @@ class SpecialDatatypeShip(ABC):
         return 0, type(value).__name__
 
 
-class FieldShip(SpecialDatatypeShip):
-    """A ship whose value is a few named byte strings, held in one hash.
+class BlobShip(SpecialDatatypeShip):
+    """A ship whose value is one string of bytes under its key.
 
-    Since the fields are plain bytes, small values can also travel inside the notice of an update.
+    Its values are sent and received without being copied, and small ones also travel inside the
+    notice of an update.
     """
 
     @abstractmethod
-    def pack(self, value: Any) -> dict[str, Any]:
-        """Return the fields, each bytes or a flat buffer of bytes."""
+    def pack(self, value: Any) -> tuple[Any, ...]:
+        """Return the bytes as a few pieces, each bytes or a flat buffer of bytes."""
 
     @abstractmethod
-    def unpack(self, fields: Mapping[bytes, bytes]) -> Any:
-        """Return the value; raise `BadData` for fields that `pack` cannot have made."""
+    def unpack(self, blob: Any) -> Any:
+        """Return the value from its bytes (any buffer; None if they are gone); raise `BadData` for others."""
 
     def write(self, key: str, value: Any, client: Any) -> None:
-        """Record one HSET."""
-        client.hset(key, mapping=self.pack(value))
+        """Record one SET."""
+        client.set(key, b"".join(self.pack(value)))
 
     def read(self, key: str, client: Any) -> None:
-        """Record one HGETALL."""
-        client.hgetall(key)
+        """Record one GET."""
+        client.get(key)
 
     def interpret_read(self, responses: list[Any]) -> Any:
-        """Return the value from the reply to HGETALL."""
+        """Return the value from the reply to GET."""
         return self.unpack(responses[0])

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from ..errors import BadData
-from .base import FieldShip
+from .base import BlobShip
 
 __all__ = ["BytesShip"]
 
 
-class BytesShip(FieldShip):
+class BytesShip(BlobShip):
     """Carries bytes; a bytearray comes back as bytes."""
 
     carries = bytes
@@ -28,13 +27,12 @@ class BytesShip(FieldShip):
         """Return the length and the word bytes."""
         return len(value), "bytes"
 
-    def pack(self, value: bytes) -> dict[str, Any]:
-        """Return the one field raw."""
-        return {"raw": bytes(value)}
+    def pack(self, value: bytes) -> tuple[bytes, ...]:
+        """Return the bytes in one piece."""
+        return (bytes(value),)
 
-    def unpack(self, fields: Mapping[bytes, bytes]) -> bytes:
+    def unpack(self, blob: Any) -> bytes:
         """Return the bytes."""
-        try:
-            return fields[b"raw"]
-        except (KeyError, TypeError):
-            raise BadData("stored bytes lack the field raw") from None
+        if blob is None:
+            raise BadData("the bytes are gone from the server (evicted, or removed by a program without REEM)")
+        return bytes(blob)

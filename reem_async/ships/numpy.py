@@ -1,34 +1,39 @@
-"""Numpy arrays: the bytes as they are, beside dtype and shape as JSON.
+"""Numpy arrays: each is an .npy file on the server, the format of numpy.save.
 
-What comes from the server is checked before it is used: the dtype is built from an allow-list of
-plain data types, and shape times item size must be exactly the bytes that are there. Nothing is
-evaluated or unpickled.
+So `redis-cli GET '{foo}.image' > image.npy` gives a file that numpy.load opens. One string and not
+a hash, since servers copy what goes into and comes out of hashes.
+
+What comes from the server is checked before it is used: the header is parsed as a literal, the
+dtype is built from an allow-list of plain data types, and shape times item size must be exactly the
+bytes that are there. Nothing is evaluated or unpickled.
 """
 
 from __future__ import annotations
 
+import ast
 import math
 import re
-from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import orjson
 
 from ..errors import BadData, BadType
-from .base import FieldShip
+from .base import BlobShip
 
 __all__ = ["NumpyShip", "flat", "flat_buffer"]
 
+_MAGIC = b"\x93NUMPY"
+_KINDS = "biufcSUVMm"
 _CODE = re.compile(r"[<>|=][biufcSUVMm]\d{1,9}(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
 _MOST_FIELDS = 1000
 _MOST_DIMENSIONS = 64
 _LARGEST_ITEM = 1 << 20
+_LARGEST_HEADER = 1 << 16
 _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
 
 
-class NumpyShip(FieldShip):
+class NumpyShip(BlobShip):
     """Carries numpy arrays of every dtype that is data: all but object, StringDType and long double.
 
     Arrays come back C-contiguous, of the same dtype (byte order, field names and time units
@@ -52,30 +57,26 @@ class NumpyShip(FieldShip):
             raise BadType(
                 "a masked array would lose its mask; store {'data': a.filled(0), 'mask': np.ma.getmaskarray(a)}"
             )
-        _encode_dtype(value.dtype)
+        _header(value.dtype, value.shape)
         return value.nbytes, f"{_dtype_name(value.dtype)}[{','.join(map(str, value.shape))}]"
 
-    def pack(self, value: np.ndarray[Any, Any]) -> dict[str, Any]:
-        """Return the fields arr, dtype and shape. `arr` shares memory with a contiguous array."""
-        return {"arr": flat(value), "dtype": _encode_dtype(value.dtype), "shape": orjson.dumps(value.shape)}
+    def pack(self, value: np.ndarray[Any, Any]) -> tuple[Any, ...]:
+        """Return an .npy file in two pieces: its header, and the data, shared with a contiguous array."""
+        return _header(value.dtype, value.shape), flat(value)
 
-    def unpack(self, fields: Mapping[bytes, bytes]) -> np.ndarray[Any, Any]:
-        """Return the array, read-only."""
-        try:
-            data, dtype, shape = (
-                fields[b"arr"],
-                decode_dtype(fields[b"dtype"]),
-                _decode_shape(fields[b"shape"]),
-            )
-        except (KeyError, TypeError) as error:
-            raise BadData(f"a stored array lacks the field {error}") from None
-        if math.prod(shape) * dtype.itemsize != len(data):
-            raise BadData(f"a stored array of {dtype} {list(shape)} has {len(data)} bytes; it was not written by REEM")
-        if not data:
-            array = np.zeros(shape, dtype)
-            array.flags.writeable = False
-            return array
-        return np.frombuffer(data, dtype).reshape(shape)
+    def unpack(self, blob: Any) -> np.ndarray[Any, Any]:
+        """Return the array, read-only, sharing memory with `blob`."""
+        if blob is None:
+            raise BadData("the array's bytes are gone from the server (evicted, or removed by a program without REEM)")
+        view = memoryview(blob)
+        size = _header_size(view)
+        dtype, shape = _parse_header(bytes(view[:size]))
+        if math.prod(shape) * dtype.itemsize != len(view) - size:
+            raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
+        empty = len(view) == size
+        array = np.zeros(shape, dtype) if empty else np.frombuffer(view, dtype, offset=size).reshape(shape)
+        array.flags.writeable = False
+        return array
 
 
 def flat(array: np.ndarray[Any, Any]) -> memoryview | bytes:
@@ -110,73 +111,93 @@ def _dtype_name(dtype: np.dtype[Any]) -> str:
     return f"struct({text[:60]}{'...' if len(text) > 60 else ''})"
 
 
-@lru_cache(maxsize=256)
-def _encode_dtype(dtype: np.dtype[Any]) -> bytes:
-    """Return the dtype as JSON; raise BadType if it is not plain data or would come back different."""
-    if dtype.hasobject or dtype.kind not in "biufcSUVMm":
+@lru_cache(maxsize=1024)
+def _header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """Return the header of an .npy file: magic, version, length, a Python literal, blanks up to 64 bytes."""
+    text = f"{{'descr': {_descr(dtype)!r}, 'fortran_order': False, 'shape': {shape!r}, }}"
+    data = text.encode()
+    version, length_size = (b"\x01\x00", 2) if text.isascii() and len(data) < 60_000 else (b"\x03\x00", 4)
+    size = -(-(len(_MAGIC) + 2 + length_size + len(data) + 1) // 64) * 64
+    length = size - len(_MAGIC) - 2 - length_size
+    return _MAGIC + version + length.to_bytes(length_size, "little") + data.ljust(length - 1) + b"\n"
+
+
+def _descr(dtype: np.dtype[Any]) -> Any:
+    """Return numpy's description of a dtype; raise BadType if it is not plain data or would come back different."""
+    if dtype.hasobject or dtype.kind not in _KINDS:
         raise BadType(
             f"an array of dtype {dtype} holds Python objects, not data; use .tolist() or another dtype "
             "(for strings: astype('U'))"
         )
     try:
-        code = orjson.dumps(np.lib.format.dtype_to_descr(dtype))
-        same = decode_dtype(code) == dtype
-    except (BadData, TypeError, ValueError):
+        descr = np.lib.format.dtype_to_descr(dtype)
+        same = _dtype(descr) == dtype
+    except (TypeError, ValueError):
         same = False
     if not same:
         raise BadType(f"the dtype {dtype} cannot be stored exactly (long double, overlapping fields, ...); use astype")
-    return code
+    return descr
 
 
-@lru_cache(maxsize=256)
-def decode_dtype(code: bytes) -> np.dtype[Any]:
-    """Return the dtype that the JSON `code` describes.
+def _header_size(view: memoryview) -> int:
+    """Return how many bytes come before the data."""
+    if len(view) < 10 or bytes(view[:6]) != _MAGIC or view[6] not in (1, 2, 3) or view[7] != 0:
+        raise BadData(f"an array begins with {bytes(view[:16])!r}; REEM did not write it")
+    before = 10 if view[6] == 1 else 12
+    size = before + int.from_bytes(view[8:before], "little")
+    if size > len(view) or size > _LARGEST_HEADER:
+        raise BadData("an array's header is longer than the array; REEM did not write it")
+    return size
 
-    Raises:
-        BadData: Not plain data, or not a description of a dtype.
-    """
+
+@lru_cache(maxsize=1024)
+def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
+    """Return dtype and shape from the header of an .npy file, checked; raises BadData."""
     try:
-        dtype = np.lib.format.descr_to_dtype(_checked(orjson.loads(code), [0]))
-    except (orjson.JSONDecodeError, TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError):
-        raise BadData(f"a stored array has the dtype {code[:60]!r}, which is not plain data") from None
-    if dtype.hasobject or dtype.itemsize > _LARGEST_ITEM or dtype.kind not in "biufcSUVMm":
-        raise BadData(f"a stored array has the dtype {code[:60]!r}, which is not plain data")
+        fields = ast.literal_eval(header[10 if header[6] == 1 else 12 :].decode())
+        if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
+            raise ValueError(fields)
+        return _dtype(fields["descr"]), _check_shape(fields["shape"])
+    except (SyntaxError, TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
+        raise BadData(f"an array has the header {header[10:100]!r}, which is not that of plain data") from None
+
+
+def _dtype(descr: Any) -> np.dtype[Any]:
+    """Return the dtype of a description, built from an allow-list; raises ValueError or TypeError."""
+    dtype: np.dtype[Any] = np.lib.format.descr_to_dtype(_checked(descr, [0]))
+    if dtype.hasobject or dtype.itemsize > _LARGEST_ITEM or dtype.kind not in _KINDS:
+        raise ValueError(descr)
     return dtype
 
 
 def _checked(descr: Any, fields: list[int]) -> Any:
-    """Rebuild a description from JSON, as numpy wants it, refusing all but plain data."""
+    """Return `descr`, refusing all but plain data."""
     if isinstance(descr, str):
         if not _CODE.fullmatch(descr) or int(re.findall(r"\d+", descr)[0]) > _WIDEST.get(descr[1], _LARGEST_ITEM):
             raise ValueError(descr)
         return descr
+    if not isinstance(descr, list):
+        raise TypeError(descr)
     return [_checked_field(field, fields) for field in descr]
 
 
 def _checked_field(field: Any, fields: list[int]) -> tuple[Any, ...]:
     fields[0] += 1
-    if fields[0] > _MOST_FIELDS or len(field) not in (2, 3):
+    if fields[0] > _MOST_FIELDS or not isinstance(field, tuple) or len(field) not in (2, 3):
         raise ValueError(field)
     name, descr, *shape = field
-    title_and_name = tuple(name) if isinstance(name, list) else (name,)
-    if len(title_and_name) > 2 or not all(isinstance(text, str) for text in title_and_name):
+    names = name if isinstance(name, tuple) else (name,)
+    if len(names) > 2 or not all(isinstance(text, str) for text in names):
         raise ValueError(name)
-    checked = (name if isinstance(name, str) else title_and_name, _checked(descr, fields))
+    checked = (name, _checked(descr, fields))
     return (*checked, _check_shape(shape[0])) if shape else checked
-
-
-def _decode_shape(code: bytes) -> tuple[int, ...]:
-    try:
-        return _check_shape(orjson.loads(code))
-    except (orjson.JSONDecodeError, ValueError):
-        raise BadData(f"a stored array has the shape {code[:60]!r}, which is none") from None
 
 
 def _check_shape(shape: Any) -> tuple[int, ...]:
     if (
-        not isinstance(shape, list)
+        not isinstance(shape, tuple)
         or len(shape) > _MOST_DIMENSIONS
         or not all(type(size) is int and 0 <= size < 2**48 for size in shape)
     ):
         raise ValueError(shape)
-    return tuple(shape)
+    return shape

@@ -9,7 +9,7 @@ from typing import Any
 from ..errors import BadData, BadType
 from ..plan import Command
 from ..plan.placeholders import INLINE_LABELS
-from .base import FieldShip, SpecialDatatypeShip
+from .base import BlobShip, SpecialDatatypeShip
 from .bytes import BytesShip
 from .numpy import NumpyShip
 
@@ -33,7 +33,7 @@ def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
 class Registered:
     """A ship with its label and the command that reads, found out once."""
 
-    __slots__ = ("_read", "carries", "fields", "label", "ship")
+    __slots__ = ("_read", "blob", "carries", "label", "ship")
 
     def __init__(self, ship: SpecialDatatypeShip, label: str, read: Command) -> None:
         if not isinstance(label, str) or not label or label in INLINE_LABELS:
@@ -44,7 +44,7 @@ class Registered:
         self.label = label
         self._read = read
         self.carries: type | None = getattr(ship, "carries", None)
-        self.fields: FieldShip | None = ship if isinstance(ship, FieldShip) and not is_asynchronous(ship) else None
+        self.blob: BlobShip | None = ship if isinstance(ship, BlobShip) and not is_asynchronous(ship) else None
 
     def describe(self, value: Any) -> tuple[int, str]:
         """Return bytes and a summary of `value`."""

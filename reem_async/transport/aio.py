@@ -13,7 +13,7 @@ import anyio
 from ..errors import InterfaceClosed, WrongLoop
 from ..plan import Command, Reply
 from .options import Options
-from .packing import LARGE
+from .packing import size_of_largest
 from .wire import Wire, open_wire
 
 __all__ = ["AsyncTransport"]
@@ -48,14 +48,18 @@ class AsyncTransport:
         async with self._opening.setdefault(bulk, anyio.Lock()):
             wire = self._lanes.get(bulk)
             if wire is None or not wire.alive:
-                wire = self._lanes[bulk] = await self._opened()
+                wire = self._lanes[bulk] = await self._opened(large=bulk)
             return wire
 
     async def _opened(
-        self, on_push: Callable[[list[Any]], None] | None = None, on_lost: Callable[[Exception], None] | None = None
+        self,
+        on_push: Callable[[list[Any]], None] | None = None,
+        on_lost: Callable[[Exception], None] | None = None,
+        *,
+        large: bool = False,
     ) -> Wire:
         """Return a new connection, unless the interface was closed while it was made."""
-        wire = await open_wire(self._options, on_push, on_lost)
+        wire = await open_wire(self._options, on_push, on_lost, large=large)
         if self._closed:
             await wire.close()
             self.check()
@@ -107,7 +111,7 @@ class AsyncTransport:
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""
         self.check()
-        return await self._opened(on_push, on_lost)
+        return await self._opened(on_push, on_lost, large=True)
 
     async def close(self) -> None:
         """Close all connections."""
@@ -123,9 +127,4 @@ class AsyncTransport:
 
 def _is_bulk(commands: Sequence[Command]) -> bool:
     """Return whether so much is sent that others should not wait behind it."""
-    return any(
-        type(word) in (bytes, memoryview) and len(word) >= _BULK
-        for command in commands
-        if len(command) > LARGE or any(type(word) in (bytes, memoryview) and len(word) >= LARGE for word in command)
-        for word in command
-    )
+    return any(size_of_largest(command) >= _BULK for command in commands)

@@ -22,11 +22,10 @@ from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
 from .packing import pack
-from .wire import MORE, new_reader
+from .parsing import MORE, LargeReader, Reader, SmallReader
 
 __all__ = ["BlockingTransport"]
 
-_BUFFER = 1 << 17
 _IDLE = 1.0
 
 
@@ -42,9 +41,8 @@ class _Line:
         self._socket: socket.socket = self._connection._sock
         self._timeout = options.timeout
         self._set_timeout()
-        self._reader = new_reader()
-        self._buffer = bytearray(_BUFFER)
-        self._view = memoryview(self._buffer)
+        self._small = SmallReader()
+        self._large: LargeReader | None = None
         self.broken = False
         self.used = time.monotonic()
 
@@ -61,14 +59,18 @@ class _Line:
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies, all on this thread."""
-        return self.exchange(commands)
+        return self.exchange(commands, bulk)
 
-    def exchange(self, commands: Sequence[Command]) -> list[Reply]:
+    def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies."""
         try:
             for piece in pack(commands):
                 self._socket.sendall(piece)
-            return self._replies(len(commands))
+            if not bulk:
+                return self._replies(self._small, len(commands))
+            if self._large is None:
+                self._large = LargeReader()
+            return self._replies(self._large, len(commands))
         except (BlockingIOError, TimeoutError):
             self.close()
             raise ConnectionLost(
@@ -86,16 +88,17 @@ class _Line:
             self.close()
             raise
 
-    def _replies(self, count: int) -> list[Reply]:
+    def _replies(self, reader: Reader, count: int) -> list[Reply]:
+        """Read `count` replies. Nothing is left over: nothing else was asked."""
         replies: list[Reply] = []
-        gets, feed, receive = self._reader.gets, self._reader.feed, self._socket.recv_into
+        gets, receive = reader.gets, self._socket.recv_into
         while True:
             reply = gets()
             if reply is MORE:
-                received = receive(self._view)
+                received = receive(reader.target())
                 if not received:
                     raise ConnectionResetError("closed by the server")
-                feed(self._buffer, 0, received)  # type: ignore[arg-type]
+                reader.received(received)
                 continue
             replies.append(reply)
             if len(replies) == count:
@@ -163,7 +166,7 @@ class BlockingTransport:
         """Send `commands` on a free connection and return their replies."""
         line = self._take()
         try:
-            return line.exchange(commands)
+            return line.exchange(commands, bulk)
         finally:
             self._give(line)
 

@@ -1,7 +1,8 @@
 """Commands -> the pieces that go over the wire.
 
 hiredis packs small commands fastest but copies every argument several times; a large buffer (an
-array's memory) is sent as it is, between a header and a line end.
+array's memory) is sent as it is, between a header and a line end. A word that is a tuple is one
+argument in several pieces.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import hiredis
 
 from ..plan import Command
 
-__all__ = ["Piece", "pack"]
+__all__ = ["LARGE", "Piece", "pack", "size_of_largest"]
 
 Piece = bytes | memoryview
 
@@ -23,12 +24,12 @@ LARGE = 8192
 
 def pack(commands: Sequence[Command]) -> list[Piece]:
     """Return the bytes of `commands`, small ones joined, large buffers as they are."""
-    if len(commands) == 1 and not _has_large(commands[0]):
+    if len(commands) == 1 and size_of_largest(commands[0]) < LARGE:
         return [_packed(commands[0])]
     pieces: list[Piece] = []
     small: list[bytes] = []
     for command in commands:
-        if _has_large(command):
+        if size_of_largest(command) >= LARGE:
             _pack_large(command, pieces, small)
         else:
             small.append(_packed(command))
@@ -37,31 +38,37 @@ def pack(commands: Sequence[Command]) -> list[Piece]:
     return pieces
 
 
-def _packed(command: Command) -> bytes:
-    packed: bytes = hiredis.pack_command(command)
-    return packed
-
-
-def _has_large(command: Command) -> bool:
+def size_of_largest(command: Command) -> int:
+    """Return the bytes of the largest buffer among the words of `command`, 0 if there is none."""
+    largest = 0
     for word in command:
         kind = type(word)
-        if (kind is bytes or kind is memoryview) and len(word) >= LARGE:
-            return True
-    return False
+        if kind is bytes or kind is memoryview:
+            largest = max(largest, len(word))
+        elif kind is tuple:
+            largest = max(largest, sum(map(len, word)))
+    return largest
+
+
+def _packed(command: Command) -> bytes:
+    words: list[Any] = [b"".join(word) if type(word) is tuple else word for word in command]
+    packed: bytes = hiredis.pack_command(tuple(words))
+    return packed
 
 
 def _pack_large(command: Command, pieces: list[Piece], small: list[bytes]) -> None:
     """Append `command`, ending the run of small bytes before each large buffer."""
     small.append(b"*%d\r\n" % len(command))
     for word in command:
-        data = _encoded(word)
-        small.append(b"$%d\r\n" % len(data))
-        if len(data) >= LARGE:
-            pieces.append(b"".join(small))
-            pieces.append(data)
-            small.clear()
-        else:
-            small.append(bytes(data))
+        parts = tuple(map(_encoded, word)) if type(word) is tuple else (_encoded(word),)
+        small.append(b"$%d\r\n" % sum(map(len, parts)))
+        for part in parts:
+            if len(part) >= LARGE:
+                pieces.append(b"".join(small))
+                pieces.append(part)
+                small.clear()
+            else:
+                small.append(bytes(part))
         small.append(b"\r\n")
 
 

@@ -15,29 +15,16 @@ from typing import Any, cast
 
 import hiredis
 import redis.exceptions
-from redis._parsers import BaseParser
 
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
 from .packing import LARGE, Piece, pack
+from .parsing import MORE, LargeReader, Reader, SmallReader
 
-__all__ = ["MORE", "Wire", "new_reader", "open_wire"]
-
-BUFFER = 1 << 18
-"""Bytes read at a time."""
+__all__ = ["Wire", "open_wire"]
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe")
-
-MORE = object()
-"""What the parser says when it needs more bytes; False and None are replies."""
-
-
-def new_reader() -> hiredis.Reader:
-    """Return a parser that hands error replies out as redis-py's exceptions."""
-    return hiredis.Reader(
-        protocolError=redis.exceptions.InvalidResponse, replyError=BaseParser.parse_error, notEnoughData=MORE
-    )
 
 
 class _Due:
@@ -55,22 +42,23 @@ class Wire(asyncio.BufferedProtocol):
     """The protocol over a connection that has shaken hands.
 
     Args:
+        timeout: Seconds without a byte received, while a reply is due, after which it is given up.
+        reader: Parses what is received.
         on_push: Called with each message the server sends unasked.
         on_lost: Called once when the connection is gone, with the reason.
-        timeout: Seconds without a byte received, while a reply is due, after which it is given up.
     """
 
     def __init__(
         self,
         timeout: float,
+        reader: Reader,
         on_push: Callable[[list[Any]], None] | None = None,
         on_lost: Callable[[Exception], None] | None = None,
     ) -> None:
         self._timeout = timeout
         self._on_push = on_push
         self._on_lost = on_lost
-        self._reader = new_reader()
-        self._buffer = bytearray(BUFFER)
+        self._reader = reader
         self._due: collections.deque[_Due] = collections.deque()
         self._outbox: list[Piece] = []
         self._loop = asyncio.get_running_loop()
@@ -173,15 +161,15 @@ class Wire(asyncio.BufferedProtocol):
 
     # What asyncio calls.
 
-    def get_buffer(self, sizehint: int) -> bytearray:
+    def get_buffer(self, sizehint: int) -> memoryview:
         """Return where to put received bytes."""
-        return self._buffer
+        return self._reader.target()
 
     def buffer_updated(self, nbytes: int) -> None:
         """Parse what was received and hand it out."""
         self._last_byte = self._loop.time()
-        self._reader.feed(self._buffer, 0, nbytes)  # type: ignore[arg-type]
         try:
+            self._reader.received(nbytes)
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
         except redis.exceptions.InvalidResponse as error:
@@ -249,8 +237,10 @@ async def open_wire(
     options: Options,
     on_push: Callable[[list[Any]], None] | None = None,
     on_lost: Callable[[Exception], None] | None = None,
+    *,
+    large: bool = False,
 ) -> Wire:
-    """Connect, log in, and return the wire.
+    """Connect, log in, and return the wire; `large` replies are received in place.
 
     Raises:
         NotConnected: Nobody listens there.
@@ -261,6 +251,6 @@ async def open_wire(
         await connection.connect()
     except (redis.exceptions.RedisError, OSError) as error:
         raise options.refused(error) from error
-    wire = Wire(options.timeout, on_push, on_lost)
+    wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
     wire.take_over(connection)
     return wire
