@@ -25,7 +25,7 @@ LONGEST_TOP_KEY = 512
 """Bytes a top-level key may have in UTF-8."""
 
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
-_TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)
+_TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"~]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)
 
 
 def check_element(key: object, parent: Path) -> str | int:

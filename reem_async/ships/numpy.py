@@ -154,7 +154,8 @@ def _header_size(view: memoryview) -> int:
 def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
     """Return dtype and shape from the header of an .npy file, checked; raises BadData."""
     try:
-        fields = ast.literal_eval(header[10 if header[6] == 1 else 12 :].decode())
+        text = header[10 if header[6] == 1 else 12 :].decode("utf-8" if header[6] == 3 else "latin-1")
+        fields = ast.literal_eval(text)
         if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
             raise ValueError(fields)
         return _dtype(fields["descr"]), _check_shape(fields["shape"])

@@ -43,15 +43,20 @@ def size_of_largest(command: Command) -> int:
     largest = 0
     for word in command:
         kind = type(word)
-        if kind is bytes or kind is memoryview:
+        if kind is bytes:
             largest = max(largest, len(word))
+        elif kind is memoryview:
+            largest = max(largest, word.nbytes)
         elif kind is tuple:
             largest = max(largest, sum(map(len, word)))
     return largest
 
 
 def _packed(command: Command) -> bytes:
-    words: list[Any] = [b"".join(word) if type(word) is tuple else word for word in command]
+    words: list[Any] = [
+        b"".join(word) if type(word) is tuple else _encoded(word) if type(word) is memoryview else word
+        for word in command
+    ]
     packed: bytes = hiredis.pack_command(tuple(words))
     return packed
 

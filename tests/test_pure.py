@@ -1,0 +1,243 @@
+"""The parts that talk to nobody: paths, placeholders, floats, packing, parsing, trees."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import hiredis
+import numpy as np
+import orjson
+import pytest
+import redis.exceptions
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reem_async.errors import BadData, BadKey
+from reem_async.plan import placeholders, trees
+from reem_async.plan.floats import _as_parsed, exact_text, may_lose
+from reem_async.plan.paths import below, may_hold, parse, parse_suffix, show, suffix, to_jsonpath
+from reem_async.ships import NumpyShip
+from reem_async.transport.packing import pack
+from reem_async.transport.parsing import MORE, LargeReader, SmallReader
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
+PATHS = st.lists(st.one_of(TEXT, st.integers(0, 99)), max_size=5).map(tuple)
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(PATHS)
+def test_the_text_of_a_path_leads_back_to_it(path):
+    """Whatever the keys are made of; what follows a tilde is not part of it."""
+    assert parse_suffix(suffix(path)) == path
+    assert parse_suffix(suffix(path) + "~1f") == path
+
+
+def test_paths_read_as_people_write_them():
+    """Plain keys with dots, others in quotes."""
+    assert show(("foo", "bar", 0, "a.b", "x")) == 'foo.bar[0]["a.b"].x'
+    assert parse("foo.bar[2].x") == ("foo", "bar", 2, "x")
+    assert parse(".a.b") == ("a", "b")
+    assert parse(".") == () == parse("")
+    assert to_jsonpath(("a", 0, 'say "x"')) == '$["a"][0][\'say "x"\']'
+    for text in ("a..b", "a.", "a[b]", 'a["b', "a[1"):
+        with pytest.raises(BadKey):
+            parse(text)
+
+
+def test_foo_is_not_a_part_of_foobar():
+    """Paths are compared element by element; a list's items may have moved since they were named."""
+    assert below(("foo", "bar"), ("foo",))
+    assert not below(("foobar",), ("foo",))
+    assert may_hold(("a", 0), ("a", 3, "b"))
+    assert not may_hold(("a", "0"), ("a", 0))
+
+
+@given(TEXT.filter(lambda it: it not in placeholders.INLINE_LABELS and it), TEXT, st.integers(0, 10**17), TEXT)
+def test_a_placeholder_says_what_was_put_into_it(label, name, size, summary):
+    """Labels and keys may have blanks in them."""
+    it = placeholders.Placeholder(label, name, size, summary)
+    assert placeholders.parse(str(it)) == it
+
+
+@given(st.one_of(TEXT, TEXT.map(lambda it: placeholders.MARK + it)))
+def test_a_text_that_looks_like_a_placeholder_stays_a_text(text):
+    """It is wrapped, and unwrapped."""
+    holder = [placeholders.inline_text(text)]
+    assert placeholders.find(holder) == []
+    assert holder == [text]
+
+
+@pytest.mark.parametrize(
+    "text", ["$ship ", "$ship x", "$ship x y", "$ship x y -1", "$ship float zz", "$ship a b " + "9" * 30]
+)
+def test_a_broken_placeholder_is_bad_data(text):
+    """Not a guess."""
+    with pytest.raises(BadData):
+        placeholders.find([text])
+
+
+@given(FLOATS)
+def test_exact_text_is_parsed_to_the_very_float(value):
+    """By RedisJSON's procedure and by a correctly rounding parser; where there is no text, it says so."""
+    text = exact_text(value)
+    if text is None:
+        assert placeholders.parse(placeholders.inline_float(value)) == value
+        return
+    assert struct.pack("d", float(text)) == struct.pack("d", value)
+    digits, _, exponent = text.decode().lstrip("-").partition("e")
+    whole, _, fraction = digits.partition(".")
+    assert _as_parsed(int(whole + fraction), int(exponent or 0) - len(fraction)) == abs(value)
+
+
+def test_few_floats_have_no_text():
+    """About two in a thousand."""
+    generator = np.random.default_rng(5)
+    without = sum(exact_text(float(value)) is None for value in generator.uniform(-1, 1, 20_000))
+    assert without < 100
+
+
+@given(FLOATS)
+def test_a_float_that_could_be_changed_is_never_overlooked(value):
+    """The quick search may cry wolf, but not the reverse."""
+    text = orjson.dumps([value])
+    if not may_lose(text):
+        digits, _, exponent = text[1:-1].decode().lstrip("-").partition("e")
+        whole, _, fraction = digits.partition(".")
+        assert _as_parsed(int(whole + fraction), int(exponent or 0) - len(fraction)) == abs(value)
+
+
+WORDS = st.one_of(st.binary(max_size=40), TEXT, st.integers(), st.sampled_from([8191, 8192, 9000, 40_000]).map(bytes))
+
+
+@given(st.lists(st.lists(WORDS, min_size=1, max_size=4).map(tuple), min_size=1, max_size=4))
+def test_packing_gives_what_hiredis_gives(commands):
+    """With large buffers as pieces of their own, and with an argument in several pieces."""
+    expected = b"".join(hiredis.pack_command(command) for command in commands)
+    assert b"".join(bytes(piece) for piece in pack(commands)) == expected
+    views = [tuple(memoryview(word) if type(word) is bytes else word for word in command) for command in commands]
+    assert b"".join(bytes(piece) for piece in pack(views)) == expected
+    split = [tuple((word[:3], word[3:]) if type(word) is bytes else word for word in command) for command in commands]
+    assert b"".join(bytes(piece) for piece in pack(split)) == expected
+
+
+def test_a_buffer_that_is_not_flat_bytes_is_never_sent():
+    """Its len() is not its size, and the rest would be read as commands."""
+    for array in (np.zeros((20, 9000), np.uint8), np.zeros(9000)):
+        with pytest.raises(TypeError):
+            pack([("SET", "k", memoryview(array))])
+
+
+def encoded(value):
+    """Return a value in the protocol."""
+    if value is None:
+        return b"_\r\n"
+    if isinstance(value, bool):
+        return b"#t\r\n" if value else b"#f\r\n"
+    if isinstance(value, int):
+        return b":%d\r\n" % value
+    if isinstance(value, float):
+        return b",%r\r\n" % value
+    if isinstance(value, bytes):
+        return b"$%d\r\n%b\r\n" % (len(value), value)
+    if isinstance(value, dict):
+        return b"%%%d\r\n" % len(value) + b"".join(encoded(key) + encoded(item) for key, item in value.items())
+    return b"*%d\r\n" % len(value) + b"".join(map(encoded, value))
+
+
+REPLIES = st.recursive(
+    st.one_of(
+        st.none(), st.booleans(), st.integers(-(2**63), 2**63 - 1), st.binary(max_size=50), FLOATS,
+        st.sampled_from([32_767, 32_768, 50_000, 140_000]).map(lambda size: b"\r\n" * (size // 2) + b"x" * (size % 2)),
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.binary(max_size=5), inner, max_size=3)),
+    max_leaves=6,
+)  # fmt: skip
+
+
+def received(reader, stream, sizes):
+    """Return what a reader makes of a stream that arrives in slices."""
+    replies, position, turn = [], 0, 0
+    while True:
+        reply = reader.gets()
+        if reply is not MORE:
+            replies.append(reply)
+        elif position == len(stream):
+            return replies
+        else:
+            target = reader.target()
+            count = min(sizes[turn % len(sizes)], len(target), len(stream) - position)
+            target[:count] = stream[position : position + count]
+            reader.received(count)
+            position, turn = position + count, turn + 1
+
+
+@given(st.lists(REPLIES, min_size=1, max_size=4), st.lists(st.integers(1, 70_000), min_size=1, max_size=5))
+def test_both_parsers_read_the_same_however_the_bytes_arrive(replies, sizes):
+    """Replies nested at will, cut anywhere."""
+    stream = b"".join(map(encoded, replies))
+    if len(stream) > 2000:
+        sizes = [max(size, 300) for size in sizes]
+    assert received(SmallReader(), stream, sizes) == replies
+    assert received(LargeReader(), stream, sizes) == replies
+
+
+def test_the_large_parser_knows_errors_pushes_and_nonsense():
+    """As hiredis does."""
+    for reader in (SmallReader(), LargeReader()):
+        stream = b"+OK\r\n-WRONGTYPE no\r\n>3\r\n$7\r\nmessage\r\n$1\r\nc\r\n$1\r\nx\r\n$-1\r\n*-1\r\n"
+        ok, error, push, nothing, null = received(reader, stream, [7])
+        assert (ok, nothing, null) == (b"OK", None, None)
+        assert isinstance(error, redis.exceptions.ResponseError)
+        assert type(push) is hiredis.PushNotification
+        assert push == [b"message", b"c", b"x"]
+        with pytest.raises(redis.exceptions.InvalidResponse):
+            received(reader, b"!?\r\n", [7])
+
+
+def npy(descr="'<f8'", shape="(2,)", order="False", data=bytes(16), magic=b"\x93NUMPY\x01\x00", extra=""):
+    text = f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, {extra}}}\n".encode()
+    return magic + struct.pack("<H", len(text)) + text + data
+
+
+HOSTILE = [
+    npy("'O'"), npy("'|O8'"), npy("'V999999999'"), npy("'<f16'"), npy("'<f8,O'"), npy("[('a', 'O')]"), npy("5"),
+    npy("__import__('os').system('true')"), npy("[('a', '<f8', (-1,))]"), npy("[['a', '<f8']]"), npy("'<U300000000'"),
+    npy(shape="(-2,)"), npy(shape="[2]"), npy(shape="(10**9,)"), npy(shape="(999999999999,)"), npy(shape="(True, 2)"),
+    npy(shape="(2.0,)"), npy(shape=str((1,) * 70)), npy(order="True"), npy(extra="'x': 1,"), npy(data=bytes(15)),
+    npy(data=b""), npy(magic=b"\x93NUMPX\x01\x00"), npy(magic=b"\x93NUMPY\x09\x00"), npy()[:9], npy()[:30], b"", None,
+    b"\x93NUMPY\x01\x00\xff\xff{}", npy("(" * 200 + ")" * 200),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("blob", HOSTILE)
+def test_an_array_that_numpy_did_not_write_is_bad_data(blob):
+    """Nothing of it is evaluated or believed, and nothing is allocated for it."""
+    with pytest.raises(BadData):
+        NumpyShip().unpack(blob)
+
+
+def test_an_array_is_an_npy_file(tmp_path):
+    """What numpy.load opens, and numpy.save has written."""
+    array = np.zeros(3, [("a", "<i4"), ("b", ">f8", (2,)), ("zeit/µs", "<M8[us]")])
+    file = tmp_path / "array.npy"
+    file.write_bytes(b"".join(NumpyShip().pack(array)))
+    assert np.load(file).dtype == array.dtype
+    np.save(file, array)
+    assert NumpyShip().unpack(file.read_bytes()).dtype == array.dtype
+
+
+def test_a_tree_is_replaced_as_the_server_would_and_never_changed():
+    """A missing parent, a scalar on the way and an index out of range refuse; old holders see the old tree."""
+    tree = {"a": {"b": 1}, "l": [1, {"x": 2}]}
+    before = trees.copied(tree)
+    assert trees.replaced(tree, ("a", "c"), 3) == {"a": {"b": 1, "c": 3}, "l": [1, {"x": 2}]}
+    assert trees.replaced(tree, ("l", -1, "x"), 5)["l"] == [1, {"x": 5}]
+    assert trees.removed(tree, ("l", 0))["l"] == [{"x": 2}]
+    assert trees.removed(tree, ("q",)) is tree
+    assert trees.removed(tree, ()) is trees.MISSING
+    for path in (("q", "r"), ("a", "b", "c"), ("l", 2), ("l", "x"), ("a", 0)):
+        with pytest.raises(trees.CannotApply):
+            trees.replaced(tree, path, 0)
+    assert tree == before
+    assert math.isclose(trees.get(tree, ("l", 1, "x")), 2)
