@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -24,14 +25,9 @@ def parser(documentation: str | None, **url: Any) -> argparse.ArgumentParser:
     return made
 
 
-@contextlib.contextmanager
-def server(url: str | None) -> Iterator[str]:
-    """The address of the server given, or of one that lives as long as the block."""
-    if url is not None:
-        yield url
-        return
-    with EmbeddedServer() as own:
-        yield own.url
+def server(url: str | None) -> Any:
+    """For a `with` or `async with`: the server given, or one that lives as long as the block."""
+    return EmbeddedServer() if url is None else contextlib.nullcontext(url)
 
 
 def run(
@@ -51,17 +47,17 @@ def run(
         sys.exit(130)
 
 
-def ticks(rate: float, seconds: float) -> Iterator[float]:
+def ticks(rate: float, seconds: float | None = None) -> Iterator[float]:
     """Yield the time since the start, `rate` times a second; one late tick does not delay the next."""
     start = time.perf_counter()
-    for number in range(round(rate * seconds)):
+    for number in itertools.count() if seconds is None else range(round(rate * seconds)):
         time.sleep(max(0.0, start + number / rate - time.perf_counter()))
         yield time.perf_counter() - start
 
 
-async def aticks(rate: float, seconds: float) -> AsyncIterator[float]:
+async def aticks(rate: float, seconds: float | None = None) -> AsyncIterator[float]:
     """`ticks` for asyncio."""
     start = time.perf_counter()
-    for number in range(round(rate * seconds)):
+    for number in itertools.count() if seconds is None else range(round(rate * seconds)):
         await anyio.sleep(max(0.0, start + number / rate - time.perf_counter()))
         yield time.perf_counter() - start

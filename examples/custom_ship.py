@@ -88,7 +88,7 @@ def report(front: str, written: Scan, back: dict[str, Any]) -> None:
 
 def blocking(options: Namespace) -> None:
     # `ships` replaces the default list, so NumpyShip is named as well.
-    with server(options.url) as url, reem.RedisInterface(url, ships=[ScanShip(), NumpyShip()]) as interface:
+    with server(options.url) as host, reem.RedisInterface(host, ships=[ScanShip(), NumpyShip()]) as interface:
         kvs = reem.KeyValueStore(interface)
         scan = take_scan()
         kvs["room"] = {"pose": [1.0, 2.0, 0.5], "scan": scan}
@@ -97,12 +97,11 @@ def blocking(options: Namespace) -> None:
 
 async def asynchronous(options: Namespace) -> None:
     ships = [CompressedScanShip(), ScanShip(), NumpyShip()]  # the first that fits writes; each reads its own
-    with server(options.url) as url:
-        async with reem_async.RedisInterface(url, ships=ships) as interface:
-            kvs = reem_async.KeyValueStore(interface)
-            scan = take_scan()
-            await kvs["room"].write({"pose": [1.0, 2.0, 0.5], "scan": scan})
-            report(options.front, scan, await kvs["room"].read())
+    async with server(options.url) as host, reem_async.RedisInterface(host, ships=ships) as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        scan = take_scan()
+        await kvs["room"].write({"pose": [1.0, 2.0, 0.5], "scan": scan})
+        report(options.front, scan, await kvs["room"].read())
 
 
 if __name__ == "__main__":

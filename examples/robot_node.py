@@ -15,13 +15,13 @@ import threading
 import time
 from argparse import Namespace
 from collections import Counter
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 
 import anyio
 
 import reem
 import reem_async
-from examples.common import parser, run, server
+from examples.common import aticks, parser, run, server, ticks
 
 
 class Robot:
@@ -51,9 +51,8 @@ class Robot:
 
 
 async def sensor_loop(robot: Robot, pspace: reem_async.PublishSpace) -> None:
-    while True:
+    async for _ in aticks(100):
         await pspace["sensors"].write(robot.sense())
-        await anyio.sleep(0.01)
 
 
 async def control_loop(robot: Robot, kvs: reem_async.KeyValueStore) -> None:
@@ -65,15 +64,13 @@ async def control_loop(robot: Robot, kvs: reem_async.KeyValueStore) -> None:
 
 
 async def heartbeat_loop(robot: Robot, pspace: reem_async.PublishSpace) -> None:
-    while True:
+    async for _ in aticks(5):
         await pspace["heartbeat"].write(robot.beat())
-        await anyio.sleep(0.2)
 
 
 async def operator_loop(pspace: reem_async.PublishSpace) -> None:
-    while True:
-        await pspace["set_point"].write({"speed": math.sin(time.time())})
-        await anyio.sleep(0.05)
+    async for seconds in aticks(20):
+        await pspace["set_point"].write({"speed": math.sin(seconds)})
 
 
 async def stop_on_signal(scope: anyio.CancelScope) -> None:
@@ -84,18 +81,17 @@ async def stop_on_signal(scope: anyio.CancelScope) -> None:
 
 async def asynchronous(options: Namespace) -> None:
     robot = Robot()
-    with server(options.url) as url:
-        async with reem_async.RedisInterface(url) as interface:
-            kvs, pspace = reem_async.KeyValueStore(interface), reem_async.PublishSpace(interface)
-            with anyio.move_on_after(options.seconds):
-                async with anyio.create_task_group() as loops:
-                    loops.start_soon(stop_on_signal, loops.cancel_scope)
-                    loops.start_soon(control_loop, robot, kvs)
-                    loops.start_soon(sensor_loop, robot, pspace)
-                    loops.start_soon(heartbeat_loop, robot, pspace)
-                    loops.start_soon(operator_loop, pspace)
-                    print("running; Ctrl-C stops", flush=True)
-            await pspace["sensors"].write(robot.sense())  # the last word: it stands still
+    async with server(options.url) as host, reem_async.RedisInterface(host) as interface:
+        kvs, pspace = reem_async.KeyValueStore(interface), reem_async.PublishSpace(interface)
+        with anyio.move_on_after(options.seconds):
+            async with anyio.create_task_group() as loops:
+                loops.start_soon(stop_on_signal, loops.cancel_scope)
+                loops.start_soon(control_loop, robot, kvs)
+                loops.start_soon(sensor_loop, robot, pspace)
+                loops.start_soon(heartbeat_loop, robot, pspace)
+                loops.start_soon(operator_loop, pspace)
+                print("running; Ctrl-C stops", flush=True)
+        await pspace["sensors"].write(robot.sense())  # the last word: it stands still
     robot.report()
 
 
@@ -106,21 +102,25 @@ def blocking(options: Namespace) -> None:
     robot, stop = Robot(), threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     signal.signal(signal.SIGINT, lambda *_: stop.set())
-    with server(options.url) as url, reem.RedisInterface(url) as interface:
+    with server(options.url) as host, reem.RedisInterface(host) as interface:
         kvs, pspace = reem.KeyValueStore(interface), reem.PublishSpace(interface)
         set_points = kvs["set_point"].watch()
 
         def sense() -> None:
-            while not stop.wait(0.01):
+            for _ in ticks(100):
                 pspace["sensors"] = robot.sense()
+                if stop.is_set():
+                    return
 
         def control() -> None:
-            for update in set_points:  # ends when it is closed
-                robot.steer(update.data)
-            robot.speed = 0.0
+            try:
+                for update in set_points:  # ends when it is closed
+                    robot.steer(update.data)
+            finally:
+                robot.speed = 0.0
 
         def beat() -> None:
-            while not stop.wait(0.2):
+            while not stop.wait(0.2):  # at once, however slow the loop
                 pspace["heartbeat"] = robot.beat()
 
         def operate() -> None:
@@ -130,7 +130,7 @@ def blocking(options: Namespace) -> None:
         with ThreadPoolExecutor() as threads:
             loops = [threads.submit(loop) for loop in (sense, control, beat, operate)]
             print("running; Ctrl-C stops", flush=True)
-            stop.wait(options.seconds)
+            wait(loops, options.seconds, FIRST_COMPLETED)  # the time is up, a signal came, or a loop failed
             stop.set()
             set_points.close()
         for loop in loops:

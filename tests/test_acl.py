@@ -17,7 +17,7 @@ from reem_async.server import EmbeddedServer
 
 COMMANDS = """
 json.set json.get json.del json.type json.numincrby json.nummultby json.arrappend json.arrlen json.objlen
-hset hgetall unlink type sadd srem smembers
+set get unlink type sadd srem smembers
 multi exec discard watch unwatch
 publish subscribe unsubscribe
 ping hello auth select client|setinfo

@@ -25,28 +25,30 @@ def set_point(seconds: float, more: bool = True) -> dict[str, Any]:
     return {"angle": math.sin(2 * seconds), "time_stamp": time.time(), "more": more}
 
 
-def report(options: Namespace, count: int, seconds: float) -> None:
-    print(f"controller ({options.way}, {options.front}): {count} set points at {count / seconds:.1f} Hz", flush=True)
+def report(options: Namespace, seconds: float) -> None:
+    count = round(RATE * options.seconds)
+    print(
+        f"controller ({options.way}, {options.front}): {count} set points at {(count - 1) / seconds:.1f} Hz", flush=True
+    )
 
 
 def blocking(options: Namespace) -> None:
     with reem.RedisInterface(options.url) as interface:
         store = reem.PublishSpace(interface) if options.way == "publish" else reem.KeyValueStore(interface)
         start = time.perf_counter()
-        for count, seconds in enumerate(ticks(RATE, options.seconds), 1):
+        for seconds in ticks(RATE, options.seconds):
             store["set_point"] = set_point(seconds)
-        report(options, count, time.perf_counter() - start)
+        report(options, time.perf_counter() - start)
         store["set_point"] = set_point(seconds, more=False)
 
 
 async def asynchronous(options: Namespace) -> None:
     async with reem_async.RedisInterface(options.url) as interface:
         store = reem_async.PublishSpace(interface) if options.way == "publish" else reem_async.KeyValueStore(interface)
-        start, count = time.perf_counter(), 0
+        start = time.perf_counter()
         async for seconds in aticks(RATE, options.seconds):
             await store["set_point"].write(set_point(seconds))
-            count += 1
-        report(options, count, time.perf_counter() - start)
+        report(options, time.perf_counter() - start)
         await store["set_point"].write(set_point(seconds, more=False))
 
 

@@ -110,7 +110,8 @@ def save(image: np.ndarray, path: Path) -> None:
 
 
 def demo(options: Namespace, console: Console) -> None:
-    with server(options.url) as url, RedisInterface(url) as interface, contextlib.ExitStack() as stack:
+    with server(options.url) as host, RedisInterface(host) as interface, contextlib.ExitStack() as stack:
+        url = getattr(host, "url", host)
         kvs = KeyValueStore(interface)
         kvs["raw_image"], kvs["processor"], kvs["actuator"] = {"images_sent": 0}, {"ready": False}, {"ready": False}
 
@@ -119,7 +120,7 @@ def demo(options: Namespace, console: Console) -> None:
             stack.callback(program.stop)
             return program
 
-        console.print(f"Camera, processor and actuator: three processes, {options.front} front, {interface.hostname}")
+        console.print(f"Camera, processor and actuator: three processes, {options.front} front")
         programs = [start("processor"), start("actuator")]
         wait_until_ready(kvs, programs)
         programs.append(start("camera", "--seconds", str(options.seconds)))
