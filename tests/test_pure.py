@@ -64,7 +64,7 @@ def test_a_placeholder_says_what_was_put_into_it(label, name, size, summary):
 def test_a_text_that_looks_like_a_placeholder_stays_a_text(text):
     """It is wrapped, and unwrapped."""
     holder = [placeholders.inline_text(text)]
-    assert placeholders.find(holder) == []
+    assert placeholders.find(holder, "k") == []
     assert holder == [text]
 
 
@@ -74,7 +74,7 @@ def test_a_text_that_looks_like_a_placeholder_stays_a_text(text):
 def test_a_broken_placeholder_is_bad_data(text):
     """Not a guess."""
     with pytest.raises(BadData):
-        placeholders.find([text])
+        placeholders.find([text], "k")
 
 
 @given(FLOATS)

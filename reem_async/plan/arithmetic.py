@@ -129,7 +129,7 @@ def _guarded(
 
 def _number(text: bytes, keys: Keys, path: Path) -> Any:
     holder = loads(text, keys)
-    crates = find(holder)
+    crates = find(holder, keys.name)
     number = holder[0]
     if crates or isinstance(number, bool) or not isinstance(number, int | float):
         what = crates[0].placeholder.label if crates else type(number).__name__

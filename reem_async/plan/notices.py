@@ -120,7 +120,7 @@ def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships
             position += length
             replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([blob])
         holder = [orjson.loads(text)]
-        for crate in find(holder) if MARK_BYTES in text else ():
+        for crate in find(holder, "a notice: ") if MARK_BYTES in text else ():
             crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]
     except (orjson.JSONDecodeError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise BadData(f"a notice holds a value that cannot be rebuilt: {error}") from None

@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from ..errors import BadData
-from .paths import shorten
+from .paths import shorten, suffix
 
 __all__ = ["INLINE_LABELS", "MARK", "Crate", "Placeholder", "find", "inline_float", "inline_text", "parse"]  # fmt: skip
 
@@ -103,11 +103,14 @@ def _parse_float(text: str) -> float:
         raise BadData(f"the server holds the float {shorten(text)}, which is not hexadecimal") from None
 
 
-def find(holder: list[Any]) -> list[Crate]:
+def find(holder: list[Any], name: str) -> list[Crate]:
     """Resolve what stands in place inside `holder` and return the placeholders that are left.
 
     `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
     every node, so callers look for the mark in the text first.
+
+    Raises:
+        BadData: A string has the mark but is no placeholder; says where, below the top-level key `name`.
     """
     crates: list[Crate] = []
     stack: list[Any] = [holder]
@@ -118,9 +121,24 @@ def find(holder: list[Any]) -> list[Crate]:
             if kind is dict or kind is list:
                 stack.append(value)
             elif kind is str and value.startswith(MARK):
-                meaning = parse(value)
+                try:
+                    meaning = parse(value)
+                except BadData as error:
+                    raise BadData(f"{name}{_place(holder[0], value)}: {error}") from None
                 if type(meaning) is Placeholder:
                     crates.append(Crate(meaning, container, key))
                 else:
                     container[key] = meaning
     return crates
+
+
+def _place(tree: Any, text: str) -> str:
+    """Return where in `tree` the string `text` is, as people write paths."""
+    pairs = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in pairs:
+        if value == text:
+            return suffix((key,))
+        found = _place(value, text)
+        if found:
+            return suffix((key,)) + found
+    return ""

@@ -89,7 +89,7 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
     def decode(replies: Sequence[Reply]) -> Any:
         text = present(replies[0], keys, path)
         holder = loads(text, keys)
-        crates = find(holder) if MARK_BYTES in text else []
+        crates = find(holder, keys.name) if MARK_BYTES in text else []
         if not crates:
             return Sealed(holder, keys.name, [], (command,), (text,))
         return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
@@ -138,7 +138,7 @@ class _Fetch:
     ) -> Any:
         text = present(replies[0], self.keys, self.path)
         holder = loads(text, self.keys)
-        crates = find(holder)
+        crates = find(holder, self.keys.name)
         met = tuple(crate.placeholder for crate in crates)
         got = dict(zip(asked, replies[1:], strict=True))
         if any((each.label, each.suffix) not in got for each in met):
@@ -176,7 +176,7 @@ def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
 
     def decode_text(replies: Sequence[Reply]) -> Any:
         holder = loads(present(replies[0], keys, path), keys)
-        crates = find(holder)
+        crates = find(holder, keys.name)
         if not crates:
             return type(holder[0])
         return ships.labelled(crates[0].placeholder.label, show(full(keys, path))).carries

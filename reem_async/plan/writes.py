@@ -259,7 +259,7 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
     def look(replies: Sequence[Reply]) -> Any:
         text = None if isinstance(replies[1], Exception) else replies[1]  # a foreign type refers to nothing
         members = frozenset(checked(replies[2], keys, ()))
-        used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys))} if text else set()
+        used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys), keys.name)} if text else set()
         orphans = sorted(members - used)
         memory.saw_members(keys.document, members)
         if not orphans:
