@@ -13,7 +13,7 @@ import decimal
 import enum
 import marshal
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -22,7 +22,7 @@ import orjson
 
 from ..errors import BadKey, BadType, BadValue, TooDeep
 from . import placeholders
-from .floats import exact_text, may_lose
+from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
@@ -30,6 +30,9 @@ __all__ = ["DEEPEST", "Encoded", "Fits", "Parcel", "encode", "number_text"]
 
 DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
+
+_MANY = 32
+"""Floats in a list from which converting them together pays."""
 
 _OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
 _LOWEST, _HIGHEST = -(2**63), 2**64 - 1
@@ -207,7 +210,15 @@ class _Walker:
         self._open.remove(id(value))
         return result
 
-    def _list(self, value: Iterable[Any], path: Path) -> list[Any]:
+    def _list(self, value: Sequence[Any], path: Path) -> Any:
+        if len(value) >= _MANY and set(map(type, value)) == {float}:
+            for index, item in enumerate(value):
+                if not math.isfinite(item):
+                    _check_float(item, (*self._place, *path, index))
+            return [
+                placeholders.inline_float(item) if text is None else orjson.Fragment(text)
+                for item, text in zip(value, exact_list(list(value)), strict=True)
+            ]
         return [self.convert(item, (*path, index)) for index, item in enumerate(value)]
 
     def _dict(self, value: dict[Any, Any], path: Path) -> dict[str, Any]:
