@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from .errors import BadValue, QueueFull
@@ -13,36 +12,41 @@ from .errors import BadValue, QueueFull
 __all__ = ["EMPTY", "Ended", "Every", "Last", "Mailbox", "Newest", "Policy"]
 
 
-@dataclass(frozen=True)
 class Policy:
     """How many updates wait at most, and what happens to the next one. Use one of the subclasses.
 
-    Attributes:
+    Args:
         bound: How many updates may wait.
-        fails: More than that end the iterator with QueueFull; else the oldest is dropped.
+
+    Attributes:
+        fails: One more ends the iterator with QueueFull; else the oldest is dropped.
     """
 
-    bound: int
     fails = False
 
-    def __post_init__(self) -> None:
-        if self.bound < 1:
-            raise BadValue(f"{type(self).__name__}({self.bound}) keeps nothing; use at least 1")
+    def __init__(self, bound: int) -> None:
+        if bound < 1:
+            raise BadValue(f"{type(self).__name__}({bound}) keeps nothing; use at least 1")
+        self.bound = bound
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.bound})"
 
 
-@dataclass(frozen=True)
 class Newest(Policy):
     """Keep only the newest update: a slow loop skips what is out of date."""
 
-    bound: int = 1
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def __repr__(self) -> str:
+        return "Newest()"
 
 
-@dataclass(frozen=True)
 class Last(Policy):
     """Keep the last `bound` updates and drop older ones."""
 
 
-@dataclass(frozen=True)
 class Every(Policy):
     """Keep every update, up to `bound`; one more raises QueueFull in the loop that should take them."""
 

@@ -8,8 +8,7 @@ Whoever owns a connection drives it, blocking or not, so both fronts run the ver
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 __all__ = ["Command", "Plan", "Reply", "unwrap", "wire_commands"]
 
@@ -23,8 +22,7 @@ _MULTI: Command = ("MULTI",)
 _EXEC: Command = ("EXEC",)
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+class Plan(NamedTuple):
     """One round trip, and what to make of its replies.
 
     Attributes:

@@ -14,8 +14,7 @@ import enum
 import marshal
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import orjson
@@ -56,8 +55,7 @@ class Carrier(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True)
-class Parcel:
+class Parcel(NamedTuple):
     """A value that a ship stores under a key of its own."""
 
     suffix: str
@@ -65,8 +63,7 @@ class Parcel:
     value: Any
 
 
-@dataclass(frozen=True, slots=True)
-class Encoded:
+class Encoded(NamedTuple):
     """A value ready to be sent: the document's text and what goes by ship."""
 
     text: bytes

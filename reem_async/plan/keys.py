@@ -6,14 +6,13 @@ that one transaction can hold it all.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 __all__ = ["Keys", "keys_of"]
 
 
-@dataclass(frozen=True, slots=True)
-class Keys:
+class Keys(NamedTuple):
     """The server-side names of one top-level key.
 
     Attributes:

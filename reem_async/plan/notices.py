@@ -8,8 +8,7 @@ announced. What arrives is not trusted: anything unexpected is refused as `BadDa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import orjson
 
@@ -29,8 +28,7 @@ ANNOUNCED = object()
 """In place of a value that is to be fetched."""
 
 
-@dataclass(frozen=True, slots=True)
-class Notice:
+class Notice(NamedTuple):
     """One update, as a subscriber got to know of it.
 
     Attributes:

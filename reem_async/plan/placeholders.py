@@ -14,9 +14,8 @@ user's string that begins with the mark, `float` for a float no decimal text of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
 
 from ..errors import BadData
@@ -29,8 +28,7 @@ MARK_BYTES = b"$ship "
 INLINE_LABELS = frozenset({"text", "float"})
 
 
-@dataclass(frozen=True, slots=True)
-class Placeholder:
+class Placeholder(NamedTuple):
     """What a document says of a value that a ship holds under a key of its own.
 
     Attributes:
@@ -59,8 +57,7 @@ def _written(it: Placeholder) -> str:
 _SAFE = "".join(chr(code) for code in range(33, 127) if chr(code) != "%")
 
 
-@dataclass(slots=True)
-class Crate:
+class Crate(NamedTuple):
     """A placeholder found in a decoded tree, and where: `container[key]` is to be replaced."""
 
     placeholder: Placeholder

@@ -8,8 +8,7 @@ read is done again with what they name: a mixture is never returned.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import BadData, Conflict
 from ..ships.registry import Registered, Ships
@@ -28,8 +27,7 @@ BULK = 1 << 16
 _TRIES = 50
 
 
-@dataclass(slots=True)
-class Sealed:
+class Sealed(NamedTuple):
     """What a read brought, ships' replies not yet interpreted.
 
     Attributes:
@@ -42,9 +40,9 @@ class Sealed:
 
     holder: list[Any]
     name: str
-    crates: list[tuple[Crate, Registered, Reply]] = field(default_factory=list)
-    commands: tuple[Command, ...] = ()
-    raw: tuple[Any, ...] = ()
+    crates: list[tuple[Crate, Registered, Reply]]
+    commands: tuple[Command, ...]
+    raw: tuple[Any, ...]
 
 
 def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
@@ -105,16 +103,18 @@ def present(reply: Reply, keys: Keys, path: Path) -> bytes:
     return text
 
 
-@dataclass(slots=True)
 class _Fetch:
     """Reads document and ships' keys in one transaction, again if the guess was wrong."""
 
-    keys: Keys
-    path: Path
-    ships: Ships
-    memory: Memory
-    wanted: tuple[Placeholder, ...]
-    tries: int = 0
+    __slots__ = ("keys", "memory", "path", "ships", "tries", "wanted")
+
+    def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, wanted: tuple[Placeholder, ...]) -> None:
+        self.keys = keys
+        self.path = path
+        self.ships = ships
+        self.memory = memory
+        self.wanted = wanted
+        self.tries = 0
 
     def plan(self) -> Plan:
         where = show(full(self.keys, self.path))

@@ -10,8 +10,7 @@ removed under WATCH, after a look at what the document refers to.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import BadType, Conflict, MissingKey, PartialWrite
 from . import Command, Plan, Reply
@@ -35,8 +34,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, slots=True)
-class Loaded:
+class Loaded(NamedTuple):
     """A parcel ready to go: the commands its ship recorded.
 
     Attributes:
@@ -52,8 +50,7 @@ class Loaded:
     blob: tuple[Any, ...] | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Change:
+class Change(NamedTuple):
     """One change of a document.
 
     Attributes:
@@ -164,15 +161,19 @@ def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
     return commands
 
 
-@dataclass(slots=True)
 class _Outcome:
     """What became of a change: the result, or the next plan that puts things right and then says so."""
 
-    it: Change
-    memory: Memory
-    commands: Sequence[Command]
-    replies: Sequence[Reply]
-    main: int
+    __slots__ = ("commands", "it", "main", "memory", "replies")
+
+    def __init__(
+        self, it: Change, memory: Memory, commands: Sequence[Command], replies: Sequence[Reply], main: int
+    ) -> None:
+        self.it = it
+        self.memory = memory
+        self.commands = commands
+        self.replies = replies
+        self.main = main
 
     def next(self) -> Any:
         members = self._members()
