@@ -47,7 +47,7 @@ class Accessor:
         """Write, unless this is the end of `x[key] += n`: Python then assigns the accessor to itself."""
         if not isinstance(value, Accessor):
             self.write(value)
-        elif value._core.full_path != self._core.full_path:
+        elif (value._interface, type(value), value.full_path) != (self._interface, type(self), self.full_path):
             raise BadType(f"an accessor cannot be stored: assign {value!r}.read(), its value")
 
     def __delitem__(self, key: str | int) -> None:
@@ -64,7 +64,7 @@ class Accessor:
         return self
 
     def __isub__(self, value: Any) -> Self:
-        self.increment(-value)
+        self.decrement(value)
         return self
 
     def __imul__(self, value: Any) -> Self:
@@ -107,6 +107,10 @@ class Accessor:
     def increment(self, number: float = 1) -> Any:
         """Add to the number here."""
         return self._interface._run(self._core.increment(number))
+
+    def decrement(self, number: float = 1) -> Any:
+        """Subtract from the number here."""
+        return self._interface._run(self._core.decrement(number))
 
     def multiply(self, number: float) -> Any:
         """Multiply the number here."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import threading
 from collections.abc import Callable, Mapping
 from types import TracebackType
@@ -9,6 +11,7 @@ from typing import Any, Self
 
 import reem_async
 from reem_async import subscribe as core
+from reem_async.errors import BadType, InterfaceClosed
 from reem_async.plan.paths import Path
 from reem_async.policy import Ended, Newest, Policy
 
@@ -55,7 +58,8 @@ class Watch:
 
     def close(self) -> None:
         """Stop following and end the loop."""
-        self._interface._wait(self._core.close())
+        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
+            self._interface._wait(self._core.close())
 
     def __iter__(self) -> Self:
         return self
@@ -103,7 +107,8 @@ class SilentSubscriber:
 
     def close(self) -> None:
         """Stop following."""
-        self.interface._wait(self._core.close())
+        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
+            self.interface._wait(self._core.close())
 
     def value(self) -> Any:
         """Return a copy of the value as of now."""
@@ -169,29 +174,27 @@ class CallbackSubscriber(SilentSubscriber):
         super().__init__(channel, interface, policy)
         self._calls = core.CallbackSubscriber(channel, self.interface._followers, callback_function, kwargs, policy)
         self._core = self._calls
-        self._updates: Watch | None = None
         self._thread: threading.Thread | None = None
+        if inspect.iscoroutinefunction(callback_function):
+            raise BadType("callback_function is a coroutine function, which a thread cannot call; use reem_async")
 
     def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
-        if self._thread is None:
-            self._updates = Watch(self.interface, self._calls.interface, self._calls.full_path, self._calls.policy)
-            self._updates.listen()
+        self.interface._wait(self._calls._updates.listen())
+        if self._thread is None or not self._thread.is_alive():
             self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
             self._thread.start()
-        self.interface._wait(core.SilentSubscriber.listen(self._calls))
 
     def _call_all(self) -> None:
-        call, updates = self._calls._caller(), self._updates
-        assert updates is not None
-        for update in updates:
-            with call.logging(update, updates.dropped):
-                call(update)
+        call, updates = self._calls._caller(), self._calls._updates
+        with call.ending(), contextlib.suppress(Ended):
+            while True:
+                update = updates.mailbox.take_waiting()
+                with call.logging(update, updates.dropped):
+                    call(update)
 
     def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
-        if self._updates is not None:
-            self._updates.close()
         super().close()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(1.0)

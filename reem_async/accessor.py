@@ -128,6 +128,12 @@ class Accessor:
         """
         return await self._writer.calculate(self._path, "JSON.NUMINCRBY", operator.add, number)
 
+    async def decrement(self, number: float = 1) -> Any:
+        """Subtract `number` from the number here; returns the result. Raises and costs as `increment`."""
+        plain = number.item() if isinstance(number, np.generic) else number  # unsigned ones have no negative
+        number_text(plain, self.full_path)
+        return await self.increment(-plain)
+
     async def multiply(self, number: float) -> Any:
         """Multiply the number here by `number`; returns the result. Raises and costs as `increment`."""
         return await self._writer.calculate(self._path, "JSON.NUMMULTBY", operator.mul, number)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import BadType, MissingKey, PathRefused
-from .plan import Command, Plan
+from .plan import Command
 from .plan.arithmetic import Operation, calculate, compute
 from .plan.documents import Encoded, Parcel, encode, number_text
 from .plan.paths import Path, counts_from_end, show, suffix
@@ -23,7 +23,6 @@ from .plan.writes import (
     delete_change,
     exchange,
     set_change,
-    static_change,
 )
 from .session import Session
 
@@ -94,7 +93,10 @@ async def resolved(document: DocumentReader | DocumentWriter, path: Path, error:
     """
     for position, key in enumerate(path):
         if isinstance(key, int) and key < 0:
-            count = await document.session.run(length(document.keys, path[:position]))
+            try:
+                count = await document.session.run(length(document.keys, path[:position]))
+            except MissingKey as missing:
+                raise error(str(missing)) from None
             if count is not None and -key > count:
                 raise error(
                     f"{show((document.name, *path))}: the index {key} is out of range, the list has {count} items"
@@ -129,13 +131,14 @@ class DocumentWriter:
         await self._set(path, encoded, loaded)
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
-        await self.session.run(self._plan(set_change(self.keys, path, encoded.text, loaded)))
+        await self._change(set_change(self.keys, path, encoded.text, loaded))
 
     async def delete(self, path: Path) -> None:
         """Remove what is at `path`."""
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
         await self._delete(path)
+        self.session.memory.forget_shapes(self.keys.document)
 
     async def _delete(self, path: Path) -> None:
         await self.session.run(change(delete_change(self.keys, path), self.session.memory))
@@ -175,7 +178,7 @@ class DocumentWriter:
         return await self._run(path, lambda notices: compute(self.keys, path, function, notices))
 
     async def _run(self, path: Path, plan: Any) -> Any:
-        return await self.session.run(plan(()))
+        return await self.session.run(plan(lambda: ()))
 
     async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
@@ -185,23 +188,24 @@ class DocumentWriter:
     async def _exchange(self, it: Change, before: Sealed) -> None:
         await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))
 
-    def _plan(self, it: Change) -> Plan:
-        """Return the plan of a write, the short one where the shape is vouched for."""
-        memory = self.session.memory
-        if not _is_fixed(it.path):
-            return change(it, memory)
-        known = memory.shape(it.keys.document, it.path) if self.static else None
+    async def _change(self, it: Change) -> None:
+        """Make a change that sets a value, without a look at what it replaces where the shape is vouched for."""
+        memory, fixed = self.session.memory, _is_fixed(it.path)
         suffixes = frozenset([each.suffix for each in it.loaded])
-        if known is None:
+        if self.static and fixed:
+            known = memory.shape(it.keys.document, it.path)
+            if known is not None and known != suffixes:
+                raise self._new_shape(min(known ^ suffixes))
+            it = it._replace(looks=known is None)
+        await self.session.run(change(it, memory))
+        if fixed:
             memory.saw_shape(it.keys.document, it.path, suffixes)
-            return change(it, memory)
-        if known != suffixes:
-            odd = min(known ^ suffixes)
-            raise BadType(
-                f"{self.name}{odd}: an array (or other shipped value) where none was, or none where one was, "
-                "but track_schema_changes(False) says that the shape never changes; switch it back on for this write"
-            )
-        return static_change(it)
+
+    def _new_shape(self, suffix: str) -> BadType:
+        return BadType(
+            f"{self.name}{suffix}: an array (or other shipped value) where none was, or none where one was, but "
+            "track_schema_changes(False) says that the shape never changes; switch it back on for this write"
+        )
 
     async def _prepared(self, path: Path, value: Any, unique: str) -> tuple[Encoded, tuple[Loaded, ...]]:
         """Encode `value`, refusing what cannot be stored, and have the ships record their commands."""

@@ -7,16 +7,16 @@ came before a snapshot is in it, what comes after is newer. There is no arithmet
 from __future__ import annotations
 
 import asyncio
-import collections
 import inspect
 import logging
+import os
 import random
 import weakref
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from .errors import BadData, InterfaceClosed, MissingKey, RedisError, ReemError
+from .errors import BadData, InterfaceClosed, MissingKey, RedisError
 from .plan import Plan, Reply, unwrap, wire_commands
 from .plan.keys import Keys
 from .plan.memory import Memory
@@ -47,10 +47,11 @@ class Update:
         value: What was written: the value at `path`, or the part of it below the channel; None if
             it was deleted.
         initial: This is the value that was there when following began.
-        time: When it was published, in seconds since 1970 on the publisher's clock; None if initial.
-        publisher: The id of the interface that published it; None if initial.
-        sequence: Its number among this publisher's updates of the top-level key; None if initial.
-        gap: Updates were lost between this one and the last: a connection broke.
+        time: When it was published, in seconds since 1970 on the publisher's clock; None for a value
+            that was read and not published: the initial one, and the one after a broken connection.
+        publisher: The id of the interface that published it; None likewise.
+        sequence: Its number among this publisher's updates of the top-level key; None likewise.
+        gap: Updates were lost between this one and the last: a connection broke, or one was unreadable.
     """
 
     path: str
@@ -72,6 +73,8 @@ class Follower:
         keys: The top-level key's names.
         path: What is followed, below the top-level key.
         tree: The local copy, never changed in place.
+        mailboxes: Where each update goes.
+        ready: Done when the first snapshot is there.
     """
 
     def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory) -> None:
@@ -83,11 +86,12 @@ class Follower:
         self._ships = ships
         self._memory = memory
         self._wire: Wire | None = None
-        self._fetching = False
-        self._settling = False
-        self._again = False
+        self._reading = 0  # the number of the snapshot on its way, 0 for none
+        self._last_reading = 0
+        self._settling = False  # the snapshot is here and ships are opening it
+        self._behind = False  # an update could not be applied: only a snapshot helps
         self._covered: list[Notice] = []  # arrived while a snapshot was on its way: it has them
-        self._later: list[Notice] = []  # arrived after a snapshot that ships are still opening
+        self._later: list[tuple[Notice, str]] = []  # arrived after a snapshot that ships are still opening
         self._sequences: dict[str, int] = {}
         self._kind = "initial"
 
@@ -96,50 +100,57 @@ class Follower:
         self._wire, self._kind = wire, kind
         self._covered.clear()
         self._later.clear()
-        self._fetching, self._settling = True, False
-        self._send(read(self.keys, self.path, self._ships, self._memory))
+        self._read()
 
-    def lost(self) -> None:
-        """Stop applying: the connection is gone."""
-        self._wire, self._fetching, self._settling = None, False, False
+    def lost(self, reason: Exception) -> None:
+        """Stop applying: the connection is gone. Whoever waits for the first snapshot gets `reason`."""
+        self._wire, self._reading, self._settling = None, 0, False
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_exception(reason)
 
-    def on_notice(self, notice: Notice, gap: bool | None = None) -> None:
+    def doubt(self) -> None:
+        """Take a snapshot: something was published that could not be read."""
+        self._behind = True
+        if self._wire is not None and not self._reading:
+            self._read()
+
+    def on_notice(self, notice: Notice) -> None:
         """Apply one update, or note that a snapshot on its way has it."""
-        if gap is None:
-            gap = self._count(notice)
-            if gap is None:
-                return
-        if self._wire is None or _relation(notice.path, self.path) is None:
+        self._take(notice, self._count(notice))
+
+    def _take(self, notice: Notice, order: str) -> None:
+        if order == "again" or self._wire is None:
             return
         if self._settling:
-            self._later.append(notice)
-        elif self._fetching:
+            self._later.append((notice, order))
+        elif not _concerns(notice, self.path):
+            pass
+        elif self._reading:
             self._covered.append(notice)
-        elif notice.deleted or notice.value is not ANNOUNCED:
-            self._apply(notice, gap)
-        else:
+        elif self._behind or order == "late" or not _is_whole(notice, self.path, self.tree):
             self._fetch(notice)
+        else:
+            self._apply(notice, gap=order == "gap")
 
-    def _count(self, notice: Notice) -> bool | None:
-        """Return whether updates of this publisher are missing; None for one that was already seen."""
+    def _count(self, notice: Notice) -> str:
+        """Return "next", "gap" if updates of this publisher are missing, "late" or "again" for a past one."""
         last = self._sequences.get(notice.publisher)
         if last is not None and notice.sequence <= last:
-            return None
+            return "again" if notice.sequence == last else "late"
         if len(self._sequences) >= _MOST_PUBLISHERS:
             self._sequences.clear()
         self._sequences[notice.publisher] = notice.sequence
-        return last is not None and notice.sequence > last + 1
+        return "next" if last is None or notice.sequence == last + 1 else "gap"
 
-    def _apply(self, notice: Notice, gap: bool) -> None:
-        inner = notice.path[len(self.path) :]
+    def _apply(self, notice: Notice, *, gap: bool) -> None:
         try:
             if len(notice.path) <= len(self.path):
                 rest = self.path[len(notice.path) :]
                 self.tree = MISSING if notice.deleted else get(notice.value, rest)
             elif notice.deleted:
-                self.tree = removed(self.tree, inner)
+                self.tree = removed(self.tree, notice.path[len(self.path) :])
             else:
-                self.tree = replaced(self.tree, inner, notice.value)
+                self.tree = replaced(self.tree, notice.path[len(self.path) :], notice.value)
         except CannotApply:  # the server has refused it too, or this copy is behind: look
             self._fetch(notice)
             return
@@ -147,26 +158,29 @@ class Follower:
 
     def _fetch(self, notice: Notice) -> None:
         self._covered.append(notice)
-        self._fetching = True
+        self._read()
+
+    def _read(self) -> None:
+        self._last_reading += 1
+        self._reading, self._settling = self._last_reading, False
         self._send(read(self.keys, self.path, self._ships, self._memory))
 
     def _send(self, plan: Plan) -> None:
-        wire = self._wire
+        number, wire = self._reading, self._wire
         if wire is not None:
-            wire.send(wire_commands(plan), lambda outcome: self._on_replies(plan, wire, outcome))
+            wire.send(wire_commands(plan), lambda outcome: self._on_replies(plan, number, outcome))
 
-    def _on_replies(self, plan: Plan, wire: Wire, outcome: list[Reply] | Exception) -> None:
+    def _on_replies(self, plan: Plan, number: int, outcome: list[Reply] | Exception) -> None:
         """Go on with a read: called in order with notices, so what has arrived until now is older."""
-        if wire is not self._wire:
-            return
-        if isinstance(outcome, Exception):
-            self._failed(outcome)
+        if number != self._reading:
             return
         try:
+            if isinstance(outcome, Exception):
+                raise outcome
             result = plan.decode(unwrap(plan, outcome))
         except MissingKey:
             self._settle(MISSING)
-        except (ReemError, RedisError) as error:
+        except Exception as error:
             self._failed(error)
         else:
             if isinstance(result, Plan):
@@ -191,50 +205,58 @@ class Follower:
             self._settle(sealed.holder[0])
             return
         self._settling = True
-        _in_background(self._await_ships(sealed, waiting), f"reem ships {self.keys.name}")
+        _in_background(self._await_ships(sealed, waiting, self._reading), f"reem ships {self.keys.name}")
 
-    async def _await_ships(self, sealed: Sealed, waiting: Iterable[tuple[Any, Any, Any]]) -> None:
+    async def _await_ships(self, sealed: Sealed, waiting: Iterable[tuple[Any, Any, Any]], number: int) -> None:
         try:
             for container, key, value in waiting:
                 container[key] = await value
         except Exception as error:
-            self._failed(error)
+            if number == self._reading:
+                self._failed(error)
         else:
-            self._settle(sealed.holder[0])
+            if number == self._reading:
+                self._settle(sealed.holder[0])
 
     def _failed(self, error: Exception) -> None:
         """Report a snapshot that could not be taken; the next update tries again."""
-        self._fetching = self._settling = False
+        self._reading, self._settling, self._behind = 0, False, True
         self._covered.clear()
+        later, self._later = self._later, []
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(error)
         elif self._wire is not None:
-            logger.warning(
-                "%s: an update could not be read and is skipped: %s",
-                show((self.keys.name, *self.path)),
-                error,
-            )
+            where = show((self.keys.name, *self.path))
+            logger.warning("%s: an update could not be read and is skipped: %s", where, error)
+        if later:
+            self._fetch(later[-1][0])
 
     def _settle(self, tree: Any) -> None:
         """Take a snapshot as the local copy; tell of the updates it has, then apply what came later."""
         covered, self._covered = self._covered, []
         later, self._later = self._later, []
-        self.tree, kind, self._kind = tree, self._kind, ""
-        self._fetching = self._settling = False
+        kind, self._kind = ("gap" if self._behind and not self._kind else self._kind), ""
+        self.tree = tree
+        self._reading, self._settling, self._behind = 0, False, False
         if kind == "gap" or (kind == "initial" and tree is not MISSING):
             self._emit_snapshot(initial=kind == "initial")
+        if not kind:
+            self._emit_covered(covered)
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_result(None)
+        for notice, order in later:
+            self._take(notice, order)
+
+    def _emit_covered(self, covered: Iterable[Notice]) -> None:
+        """Tell of the newest update of each path that a snapshot holds; the older ones are skipped."""
         newest: dict[Path, Notice] = {}
-        for notice in covered if not kind else ():
+        for notice in covered:
             if newest.pop(notice.path, None) is not None:
                 for mailbox in self.mailboxes:
-                    mailbox.dropped += 1
+                    mailbox.skip()
             newest[notice.path] = notice
         for notice in newest.values():
             self._emit(notice, False)
-        if self.ready is not None and not self.ready.done():
-            self.ready.set_result(None)
-        for notice in later:
-            self.on_notice(notice, gap=False)
 
     def _emit_snapshot(self, *, initial: bool) -> None:
         for mailbox in self.mailboxes:
@@ -253,15 +275,28 @@ class Follower:
         return None if found is MISSING else copied(found)
 
 
-def _relation(updated: Path, followed: Path) -> bool | None:
-    """Return None if an update at one path leaves the other as it was."""
-    shared = min(len(updated), len(followed))
-    # Indexes may count from either end, so two different ones may mean the same item.
-    alike = all(
-        ours == theirs or (isinstance(ours, int) and isinstance(theirs, int))
-        for ours, theirs in zip(updated[:shared], followed[:shared], strict=True)
-    )
-    return True if alike else None
+def _concerns(notice: Notice, followed: Path) -> bool:
+    """Return whether an update may change what is at the followed path."""
+    for position, (theirs, ours) in enumerate(zip(notice.path, followed, strict=False)):
+        if theirs == ours:
+            continue
+        if not isinstance(theirs, int) or not isinstance(ours, int):
+            return False
+        # Another item of the same list: the same one if we count from the end, and moved if that one is gone.
+        return ours < 0 or (notice.deleted and position == len(notice.path) - 1)
+    return True
+
+
+def _is_whole(notice: Notice, followed: Path, tree: Any) -> bool:
+    """Return whether the notice alone tells what is now at the followed path, given what was there."""
+    if notice.path[: len(followed)] != followed[: len(notice.path)]:
+        return False
+    if notice.deleted:  # deleting an item moves the next one to its place
+        return len(notice.path) > len(followed) or not notice.path or isinstance(notice.path[-1], str)
+    if notice.value is ANNOUNCED:
+        return False
+    # The server may have refused it for want of a parent; where there was something, there is a parent.
+    return not notice.path or len(notice.path) > len(followed) or tree is not MISSING
 
 
 _tasks: set[asyncio.Task[Any]] = set()
@@ -276,18 +311,24 @@ def _in_background(coroutine: Any, name: str) -> asyncio.Task[Any]:
 
 
 class Hub:
-    """The one subscription connection of an interface, and its followers by channel."""
+    """The one subscription connection of an interface in one event loop, and its followers by channel.
+
+    Attributes:
+        place: The process and the event loop it belongs to.
+    """
 
     def __init__(self, transport: AsyncTransport, ships: Ships, memory: Memory) -> None:
         self._transport = transport
         self._ships = ships
         self._memory = memory
         self._wire: Wire | None = None
-        self._channels: dict[bytes, weakref.WeakSet[Follower]] = collections.defaultdict(weakref.WeakSet)
+        self._channels: dict[bytes, weakref.WeakSet[Follower]] = {}
+        self._subscribed: set[bytes] = set()
         self._lock = asyncio.Lock()
         self._reconnecting: asyncio.Task[Any] | None = None
         self._closed = False
         self._warned = False
+        self.place = os.getpid(), asyncio.get_running_loop()
 
     def follower(self, keys: Keys, path: Path) -> Follower:
         """Return a follower of `path` that is not following yet."""
@@ -295,54 +336,73 @@ class Hub:
 
     async def follow(self, follower: Follower) -> None:
         """Subscribe, then take the first snapshot; when this returns, no later update is missed."""
+        self._transport.check()
         await self._ships.ready()
         channel = follower.keys.channel.encode()
-        async with self._lock:
-            self._check()
-            wire = self._wire
-            if wire is None or not wire.alive:
-                wire = self._wire = await self._transport.listen(self._on_push, self._on_lost)
-            known = bool(self._channels[channel])
-            self._channels[channel].add(follower)
-            try:
-                if not known:
+        ready = follower.ready = asyncio.get_running_loop().create_future()
+        try:
+            async with self._lock:
+                if ready.done():
+                    ready.result()
+                wire = await self._connected()
+                if channel not in self._subscribed:
                     await _subscribe(wire, [channel])
-                follower.ready = asyncio.get_running_loop().create_future()
+                    self._subscribed.add(channel)
+                self._channels.setdefault(channel, weakref.WeakSet()).add(follower)
                 follower.start(wire, "initial")
-                await follower.ready
-            except BaseException:
-                self._channels[channel].discard(follower)
-                follower.lost()
-                self._check()
-                raise
-            finally:
-                follower.ready = None
+            await ready
+        except BaseException as error:
+            self._drop(follower)
+            if self._closed and isinstance(error, RedisError):
+                raise InterfaceClosed("this RedisInterface was closed during the call") from None
+            raise
+        finally:
+            follower.ready = None
+            if ready.done() and not ready.cancelled():
+                ready.exception()  # it was raised, or is overtaken by a cancellation
 
-    def _check(self) -> None:
+    async def _connected(self) -> Wire:
+        """Return a live connection, with all channels subscribed and all followers started anew if it is new."""
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
+        if self._wire is not None and self._wire.alive:
+            return self._wire
+        wire = await self._transport.listen(self._on_push, self._on_lost)
+        try:
+            channels = [channel for channel, followers in self._channels.items() if followers]
+            await _subscribe(wire, channels)
+        except BaseException:
+            await wire.close()
+            raise
+        self._wire, self._subscribed = wire, set(channels)
+        for followers in list(self._channels.values()):
+            for follower in list(followers):
+                follower.start(wire, "gap")
+        return wire
 
     async def unfollow(self, follower: Follower) -> None:
         """Stop following. Idempotent."""
-        channel = follower.keys.channel.encode()
-        follower.lost()
+        self._drop(follower)
         for mailbox in follower.mailboxes:
             mailbox.close()
-        if channel in self._channels:
+
+    def _drop(self, follower: Follower) -> None:
+        channel = follower.keys.channel.encode()
+        follower.lost(InterfaceClosed("this subscription was closed before it began"))
+        if follower in self._channels.get(channel, ()):
             self._channels[channel].discard(follower)
             self._forget_if_empty(channel)
 
     def _forget_if_empty(self, channel: bytes) -> None:
-        if not self._channels[channel]:
-            del self._channels[channel]
+        if not self._channels.get(channel):
+            self._channels.pop(channel, None)
+            self._subscribed.discard(channel)
             if self._wire is not None and self._wire.alive:
                 self._wire.send([("UNSUBSCRIBE", channel)], lambda _: None)
 
     def _on_push(self, message: list[Any]) -> None:
         channel, payload = message[-2:]
-        followers = self._channels.get(channel)
-        if followers is None:
-            return
+        followers = list(self._channels.get(channel, ()))
         if not followers:  # all were dropped without closing
             self._forget_if_empty(channel)
             return
@@ -351,44 +411,40 @@ class Hub:
         except BadData as error:
             if not self._warned:
                 self._warned = True
-                logger.warning("a message on %r was ignored: %s (said once)", channel, error)
+                logger.warning("a message on %r could not be read: %s (said once)", channel, error)
+            for follower in followers:
+                follower.doubt()
             return
-        for follower in list(followers):
+        for follower in followers:
             follower.on_notice(notice)
 
-    def _on_lost(self, reason: Exception) -> None:
+    def _on_lost(self, wire: Wire, reason: Exception) -> None:
+        if wire is not self._wire:
+            return
+        self._subscribed.clear()
         for followers in self._channels.values():
-            for follower in followers:
-                follower.lost()
-                if follower.ready is not None and not follower.ready.done():
-                    follower.ready.set_exception(reason)
-        if not self._closed and self._channels and self._reconnecting is None:
+            for follower in list(followers):
+                follower.lost(reason)
+        if not self._closed and self._reconnecting is None:
             logger.warning("the subscription connection was lost and is made again: %s", reason)
             self._reconnecting = _in_background(self._reconnect(), "reem reconnect")
-            self._reconnecting.add_done_callback(self._reconnected)
-
-    def _reconnected(self, task: asyncio.Task[Any]) -> None:
-        self._reconnecting = None
-        if not task.cancelled() and task.exception() is not None:
-            logger.error("reconnecting failed for good", exc_info=task.exception())
 
     async def _reconnect(self) -> None:
         """Connect, subscribe, and have every follower take a snapshot; tries until it works."""
         pause = 0.05
-        while not self._closed:
-            await asyncio.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - only spreads the load
-            pause = min(pause * 2, 1.0)
-            try:
-                async with self._lock:
-                    wire = await self._transport.listen(self._on_push, self._on_lost)
-                    self._wire = wire
-                    await _subscribe(wire, list(self._channels))
-                    for followers in list(self._channels.values()):
-                        for follower in list(followers):
-                            follower.start(wire, "gap")
-                return
-            except (RedisError, OSError) as error:
-                logger.debug("not connected yet: %s", error)
+        try:
+            while not self._closed and any(self._channels.values()) and (self._wire is None or not self._wire.alive):
+                await asyncio.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - only spreads the load
+                pause = min(pause * 2, 1.0)
+                try:
+                    async with self._lock:
+                        await self._connected()
+                except (RedisError, OSError) as error:
+                    logger.debug("not connected yet: %s", error)
+                except InterfaceClosed:
+                    return
+        finally:
+            self._reconnecting = None
 
     async def close(self) -> None:
         """End all followers and the connection. Idempotent."""
@@ -400,12 +456,10 @@ class Hub:
                 await self.unfollow(follower)
         if self._wire is not None:
             await self._wire.close()
-        async with self._lock:  # whoever is just subscribing has now failed
-            self._channels.clear()
 
 
 async def _subscribe(wire: Wire, channels: list[bytes]) -> None:
     """Subscribe and wait until the server has confirmed each channel."""
-    for reply in await wire.roundtrip([("SUBSCRIBE", channel) for channel in channels]):
+    for reply in await wire.roundtrip([("SUBSCRIBE", channel) for channel in channels]) if channels else []:
         if isinstance(reply, Exception):
             raise reply

@@ -65,59 +65,70 @@ class Mailbox:
     """The queue between the event loop, which puts updates in, and whoever takes them out.
 
     Attributes:
-        dropped: How many updates were put in and will never be taken out.
+        dropped: How many updates were skipped and will never be taken out.
         wake: Called after each change, from the putting thread.
     """
 
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
         self._items: collections.deque[Any] = collections.deque()
-        self._lock = threading.Lock()
+        self._changed = threading.Condition(threading.Lock())
         self._end: BaseException | None = None
         self.dropped = 0
         self.wake: Callable[[], None] = lambda: None
 
     def put(self, update: Any) -> None:
         """Add an update, dropping or failing as the policy says."""
-        with self._lock:
+        with self._changed:
             if self._end is not None:
                 return
-            if len(self._items) >= self._policy.bound:
-                self.dropped += 1
-                if self._policy.fails:
-                    self._end = QueueFull(
-                        f"over {self._policy.bound} updates waited; take them faster, use a larger bound, "
-                        "or Last(n), which drops the oldest"
-                    )
-                    self.wake()
-                    return
+            if len(self._items) >= self._policy.bound and self._skip():
                 self._items.popleft()
-            self._items.append(update)
+            if self._end is None:
+                self._items.append(update)
+            self._changed.notify()
         self.wake()
+
+    def skip(self) -> None:
+        """Note that an update will never come: a newer one of the same path has taken its place."""
+        with self._changed:
+            self._skip()
+            self._changed.notify()
+        self.wake()
+
+    def _skip(self) -> bool:
+        """Count a skipped update; return whether the policy allows it."""
+        self.dropped += 1
+        if self._policy.fails and self._end is None:
+            self._end = QueueFull(
+                f"an update was skipped, {self._policy!r} allows none; take them faster, use a larger bound, or "
+                "Last(n), which drops the oldest (of large values, only the newest is ever fetched)"
+            )
+        return not self._policy.fails
 
     def take(self) -> Any:
         """Return the oldest update that waits, or EMPTY; raises Ended after the last, or QueueFull."""
-        with self._lock:
-            if self._items:
-                return self._items.popleft()
-            if self._end is not None:
-                raise self._end
+        with self._changed:
+            return self._take()
+
+    def _take(self) -> Any:
+        if self._items:
+            return self._items.popleft()
+        if self._end is not None:
+            raise self._end
         return EMPTY
 
     def take_waiting(self) -> Any:
-        """As `take`, but block this thread until there is something. One thread at a time."""
-        changed = threading.Event()
-        self.wake = changed.set
-        while True:
-            changed.clear()
-            item = self.take()
-            if item is not EMPTY:
-                return item
-            changed.wait()
+        """As `take`, but block this thread until there is something. Any number of threads may."""
+        with self._changed:
+            while (item := self._take()) is EMPTY:
+                self._changed.wait()
+            return item
 
     def close(self) -> None:
         """End the queue after what waits."""
-        with self._lock:
+        with self._changed:
             if self._end is None:
                 self._end = Ended()
+            self._changed.notify_all()
         self.wake()

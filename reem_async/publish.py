@@ -29,17 +29,21 @@ class DocumentPublisher(DocumentWriter):
     """
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+        call = self._set_in_order(path, encoded, loaded)
+        # A large value goes another way than a small one: it must have arrived before the next may start.
+        await (self.session.transport.whole(call) if loaded else call)
+
+    async def _set_in_order(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            notice = with_value(*self._stamp(path), encoded.text, loaded)
             it = set_change(
                 self.keys,
                 path,
                 encoded.text,
                 loaded,
-                notice=notice,
+                notice=with_value(*self._stamp(path), encoded.text, loaded),
                 retraction=lambda: announce(*self._stamp(path)),
             )
-            await self.session.run(self._plan(it))
+            await self._change(it)
 
     async def _delete(self, path: Path) -> None:
         async with self.session.transport.ordered(self.keys.channel):
@@ -47,20 +51,26 @@ class DocumentPublisher(DocumentWriter):
             await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
+        call = self._append_in_order(path, texts, loaded)
+        await (self.session.transport.whole(call) if loaded else call)
+
+    async def _append_in_order(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             it = append_change(self.keys, path, texts, loaded, notice=announce(*self._stamp(path)))
             await self.session.run(change(it, self.session.memory))
 
-    async def _run(self, path: Path, plan: Callable[[Sequence[Command]], Any]) -> Any:
+    def _notices(self, path: Path) -> list[Command]:
+        return [("PUBLISH", self.keys.channel, announce(*self._stamp(path)))]
+
+    async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Any]) -> Any:
         async with self.session.transport.ordered(self.keys.channel):
-            notice: Command = ("PUBLISH", self.keys.channel, announce(*self._stamp(path)))
-            return await self.session.run(plan((notice,)))
+            return await self.session.run(plan(lambda: self._notices(path)))
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         raise WriteOnly(_cannot_read((self.name, *it.path)))
 
     def _stamp(self, path: Path) -> tuple[str, int, float, Path]:
-        return self.session.publisher_id, self.session.next_sequence(self.keys), time.time(), path
+        return *self.session.stamp(self.keys), time.time(), path
 
 
 def _cannot_read(path: Path) -> str:

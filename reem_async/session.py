@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
 import secrets
 from collections.abc import Callable, Sequence
 from operator import attrgetter
@@ -42,7 +44,6 @@ class Session:
         memory: What is known of the server.
         transport: The way to the server.
         interface: The interface this belongs to: what is pickled in its place.
-        publisher_id: Names this session in the notices of its updates.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Session:
         self.memory = Memory()
         self.transport = new_transport(self.options)
         self.interface: Any = None
-        self.publisher_id = secrets.token_hex(6)
+        self._publisher = secrets.token_hex(6), os.getpid()
         self._sequences: dict[str, int] = {}
         self._hub: Hub | None = None
 
@@ -71,8 +72,10 @@ class Session:
 
     @property
     def hub(self) -> Hub:
-        """The one subscription connection and all that follow updates through it."""
-        if self._hub is None:
+        """The one subscription connection of the running event loop and all that follow updates through it."""
+        self.transport.check()
+        place = os.getpid(), asyncio.get_running_loop()
+        if self._hub is None or self._hub.place != place:
             from .follow import Hub
 
             assert isinstance(self.transport, AsyncTransport)
@@ -91,17 +94,23 @@ class Session:
             (kind,) = await self.transport.roundtrip([("TYPE", error.key)])
             raise WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?") from None
 
-    def next_sequence(self, keys: Keys) -> int:
-        """Return the number of this publisher's next update of a top-level key."""
+    def stamp(self, keys: Keys) -> tuple[str, int]:
+        """Return who publishes, and the number of this publisher's next update of a top-level key."""
+        if self._publisher[1] != os.getpid():  # a forked child is another publisher
+            self._publisher, self._sequences = (secrets.token_hex(6), os.getpid()), {}
         number = self._sequences[keys.channel] = self._sequences.get(keys.channel, 0) + 1
-        return number
+        return self._publisher[0], number
 
     async def initialize(self) -> None:
         """Connect and check that the server has RedisJSON."""
         await self.ships.ready()
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
-        if isinstance(reply, Exception) and "unknown command" in str(reply).lower():
+        if not isinstance(reply, Exception):
+            return
+        if "unknown command" in str(reply).lower():
             raise NoJsonSupport(f"{self.options.address}: {no_json()}")
+        if "run the" in str(reply):  # not allowed to use JSON; that the one key is out of bounds means nothing
+            raise reply
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""

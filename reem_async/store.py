@@ -79,14 +79,14 @@ class KeyValueStore:
     def __getitem__(self, key: str) -> Accessor:
         return self._accessor(*self._entry(key), ())
 
-    def _entry(self, key: str) -> tuple[DocumentReader, DocumentWriter]:
-        try:
-            return self._entries[key]
-        except (KeyError, TypeError):
-            session = self.interface.session
-            entry = DocumentReader(session, key), self._writer(session, key)
-            entry[1].static = self._static
-            return self._entries.setdefault(key, entry)
+    def _entry(self, key: object) -> tuple[DocumentReader, DocumentWriter]:
+        if type(key) is str and (known := self._entries.get(key)):
+            return known
+        session = self.interface.session
+        name = session.keys(key).name
+        entry = DocumentReader(session, name), self._writer(session, name)
+        entry[1].static = self._static
+        return self._entries.setdefault(name, entry)
 
     def __setitem__(self, key: str, value: Any) -> None:
         raise BadType(f"assignment cannot wait for the server; use: await store[{key!r}].write(value)")
@@ -99,8 +99,8 @@ class KeyValueStore:
 
     def at(self, path: str) -> Accessor:
         """Return the accessor of a dotted path such as "foo.bar" or "foo.tiles[2]"; sends nothing."""
-        key, *rest = parse(path)
-        return self._accessor(*self._entry(key), tuple(rest))  # type: ignore[arg-type]
+        key, *rest = parse(path) or ("",)
+        return self._accessor(*self._entry(key), tuple(rest))
 
     async def get(self, path: str, default: Any = _NOTHING) -> Any:
         """Return the value at a dotted path, or `default` if given and nothing is there.

@@ -11,8 +11,8 @@ from types import TracebackType
 from typing import Any, NoReturn, Self
 
 from .connection import RedisInterface
-from .errors import BadType, InterfaceClosed, MissingKey, ReadOnly
-from .follow import Follower, Update
+from .errors import BadType, InterfaceClosed, MissingKey, QueueFull, ReadOnly
+from .follow import Follower, Hub, Update
 from .plan.keys import Keys
 from .plan.paths import Path, check_element, parse, show
 from .plan.trees import MISSING, copied, get
@@ -22,6 +22,44 @@ from .session import Session
 __all__ = ["CallbackSubscriber", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
 
 logger = logging.getLogger("reem.subscribe")
+
+
+class _Link:
+    """A follower and the hub it is at: made by the first `follow`, anew after a fork or in another loop."""
+
+    def __init__(self, session: Session, keys: Keys, path: Path, mailboxes: list[Mailbox]) -> None:
+        self._session = session
+        self._keys = keys
+        self._path = path
+        self._mailboxes = mailboxes
+        self._hub: Hub | None = None
+        self._following: asyncio.Lock | None = None
+        self._closed = False
+        self.follower: Follower | None = None
+
+    async def follow(self) -> None:
+        """Begin to follow, if it has not begun; several callers wait for the same beginning."""
+        if self._closed:
+            raise InterfaceClosed("this subscription is closed; make a new one")
+        hub = self._session.hub
+        if hub is not self._hub:
+            self._hub, self.follower, self._following = hub, None, asyncio.Lock()
+        assert self._following is not None
+        async with self._following:
+            if self.follower is None:
+                self.follower = hub.follower(self._keys, self._path)
+                self.follower.mailboxes = self._mailboxes
+                try:
+                    await hub.follow(self.follower)
+                except BaseException:
+                    self.follower = None
+                    raise
+
+    async def unfollow(self) -> None:
+        """Stop following, for good. Idempotent; also after the interface was closed."""
+        self._closed = True
+        if self._hub is not None and self.follower is not None:
+            await self._hub.unfollow(self.follower)
 
 
 class Watch:
@@ -39,17 +77,15 @@ class Watch:
     """
 
     def __init__(self, session: Session, keys: Keys, path: Path, policy: Policy) -> None:
-        self._session = session
         self.mailbox = Mailbox(policy)
-        self._follower: Follower | None = None
-        self._place = keys, path
         self._closed = False
+        self._link = _Link(session, keys, path, [self.mailbox])
         self._waiter: asyncio.Future[None] | None = None
 
     @property
     def _following(self) -> bool:
         """Whether it follows, or did until it was closed."""
-        return self._follower is not None or self._closed
+        return self._link.follower is not None or self._closed
 
     @property
     def dropped(self) -> int:
@@ -58,24 +94,13 @@ class Watch:
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; two round trips."""
-        if self._closed:
-            raise InterfaceClosed("this subscription is closed; make a new one")
-        if self._follower is None:
-            follower = self._session.hub.follower(*self._place)
-            follower.mailboxes.append(self.mailbox)
-            self._follower = follower
-            try:
-                await self._session.hub.follow(follower)
-            except BaseException:
-                self._follower = None
-                raise
+        await self._link.follow()
 
     async def close(self) -> None:
         """Stop following and end the loop. Idempotent."""
         self._closed = True
         self.mailbox.close()
-        if self._follower is not None:
-            await self._session.hub.unfollow(self._follower)
+        await self._link.unfollow()
 
     aclose = close
 
@@ -141,7 +166,7 @@ class SilentSubscriber:
         self._keys, self._path = self.interface.session.keys(key), tuple(rest)
         self.full_path: Path = (self._keys.name, *rest)
         self.policy = policy or Newest()
-        self._follower: Follower | None = None
+        self._link = _Link(self.interface.session, self._keys, self._path, [])
         self._watches: list[Watch] = []
         self._closed = False
 
@@ -152,27 +177,18 @@ class SilentSubscriber:
             NotConnected: Nobody listens there.
             InterfaceClosed: It was closed before.
         """
-        if self._closed:
-            raise InterfaceClosed("this subscriber is closed; make a new one")
-        if self._follower is None:
-            self._follower = self.interface.session.hub.follower(self._keys, self._path)
-            try:
-                await self.interface.session.hub.follow(self._follower)
-            except BaseException:
-                self._follower = None
-                raise
+        await self._link.follow()
 
     async def close(self) -> None:
         """Stop following; the value stays as it is. Idempotent."""
-        self._closed = True
         for watch in self._watches:
             await watch.close()
-        if self._follower is not None:
-            await self.interface.session.hub.unfollow(self._follower)
+        await self._link.unfollow()
 
     def value(self) -> Any:
         """Return a copy of the value as of now, None if there is none. No round trip; any thread may call."""
-        return None if self._follower is None else self._follower.value()
+        follower = self._link.follower
+        return None if follower is None else follower.value()
 
     def __getitem__(self, key: str | int) -> LocalAccessor:
         return LocalAccessor(self, (check_element(key, (self.channel,)),))
@@ -226,7 +242,7 @@ class LocalAccessor:
         Raises:
             MissingKey: Nothing is here.
         """
-        follower = self._subscriber._follower
+        follower = self._subscriber._link.follower
         found = MISSING if follower is None else get(follower.tree, self._path)
         if found is MISSING:
             what = show((self._subscriber.channel, *self._path))
@@ -289,6 +305,14 @@ class Caller:
         except Exception:
             logger.exception("the callback for %s raised at %s; the subscription goes on", self._channel, update.path)
 
+    @contextmanager
+    def ending(self) -> Iterator[None]:
+        """Log the end of the calls if it is not by closing: the policy allowed no skipped update."""
+        try:
+            yield
+        except QueueFull as error:
+            logger.error("the callback for %s is not called any more: %s", self._channel, error)
+
 
 class CallbackSubscriber(SilentSubscriber):
     """Calls a function for each update of what is published at a path.
@@ -320,16 +344,16 @@ class CallbackSubscriber(SilentSubscriber):
         self.callback_function = callback_function
         self.kwargs = dict(kwargs or {})
         self._task: asyncio.Task[None] | None = None
+        self._updates = self.watch()
+        self._link = self._updates._link  # one follower serves the calls and value()
 
     async def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
-        if self._task is None:
-            updates = self.watch()
-            await updates.listen()
-            self._task = asyncio.get_running_loop().create_task(self._call_all(updates), name=f"reem {self.channel}")
+        await self._updates.listen()
+        if self._task is None or self._task.get_loop() is not asyncio.get_running_loop():
+            self._task = asyncio.get_running_loop().create_task(self._call_all(), name=f"reem {self.channel}")
             _running.add(self._task)
             self._task.add_done_callback(_running.discard)
-        await super().listen()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)
@@ -338,13 +362,14 @@ class CallbackSubscriber(SilentSubscriber):
         """Return what makes the calls."""
         return Caller(self.channel, self.callback_function, self.kwargs)
 
-    async def _call_all(self, updates: Watch) -> None:
+    async def _call_all(self) -> None:
         call = self._caller()
-        async for update in updates:
-            with call.logging(update, updates.dropped):
-                result = call(update)
-                if inspect.isawaitable(result):
-                    await result
+        with call.ending():
+            async for update in self._updates:
+                with call.logging(update, self._updates.dropped):
+                    result = call(update)
+                    if inspect.isawaitable(result):
+                        await result
 
     async def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""

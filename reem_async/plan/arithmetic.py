@@ -23,6 +23,8 @@ from .replies import checked, full, loads
 __all__ = ["calculate", "compute"]
 
 Operation = Callable[[Any, Any], Any]
+Notices = Callable[[], Sequence[Command]]
+"""Makes the commands that tell subscribers, anew for each transaction: notices are numbered."""
 
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 """The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
@@ -35,7 +37,7 @@ def calculate(
     operation: Operation,
     operand: float,
     text: bytes,
-    notices: Sequence[Command],
+    notices: Notices,
 ) -> Plan:
     """Plan `command` (JSON.NUMINCRBY, JSON.NUMMULTBY) with `operand`, in one transaction; returns the new number.
 
@@ -49,7 +51,7 @@ def calculate(
         get_command(keys, path),
         (command, keys.document, place, text),
         get_command(keys, path),
-        *notices,
+        *notices(),
     ]
 
     def decode(replies: Sequence[Reply]) -> Any:
@@ -68,7 +70,7 @@ def calculate(
     return Plan(commands, decode, atomic=True)
 
 
-def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Sequence[Command]) -> Plan:
+def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Notices) -> Plan:
     """Plan to replace the number at `path` by `function` of it; repeats until nobody interferes."""
 
     def look(replies: Sequence[Reply]) -> Any:
@@ -81,7 +83,7 @@ def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Seq
     return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True)
 
 
-def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices: Sequence[Command]) -> Plan:
+def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices: Notices) -> Plan:
     """Plan to replace a wrapped result by the right one, or by the old value if that is out of range."""
     fits = _fits(due)
 
@@ -111,7 +113,7 @@ def _guarded(
     keys: Keys,
     path: Path,
     value: Any,
-    notices: Sequence[Command],
+    notices: Notices,
     again: Callable[[], Plan],
     then: Callable[[], Any] | None = None,
 ) -> Plan:
@@ -124,7 +126,7 @@ def _guarded(
         checked(replies[0], keys, path)
         return then() if then else value
 
-    return Plan([("JSON.SET", keys.document, to_jsonpath(path), text), *notices], decode, atomic=True, held=True)
+    return Plan([("JSON.SET", keys.document, to_jsonpath(path), text), *notices()], decode, atomic=True, held=True)
 
 
 def _number(text: bytes, keys: Keys, path: Path) -> Any:

@@ -33,6 +33,9 @@ DEEPEST = 100
 _MANY = 32
 """Floats in a list from which converting them together pays."""
 
+_PLAIN: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__index__, float: float.__float__}
+"""How to get at what a subclass holds; its own __str__ and the like may say something else."""
+
 _OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
 _LOWEST, _HIGHEST = -(2**63), 2**64 - 1
 
@@ -231,7 +234,7 @@ class _Walker:
             key.isascii() or key.encode()
         except UnicodeEncodeError:
             raise BadKey(f"{show(self._place + path)}: the key {shorten(key)} has half a surrogate pair") from None
-        return str(key)
+        return str.__str__(key)
 
     def _other(self, value: Any, path: Path) -> Any:
         ship = self._fits(value)
@@ -247,12 +250,11 @@ class _Walker:
         raise self._refusal(value, path)
 
     def _subclass(self, value: Any, base: type, path: Path) -> Any:
-        plain = value if base in (dict, list, tuple) else base(value)
         if base is dict:
-            return self._container(plain, path, self._dict)
+            return self._container(value, path, self._dict)
         if base is list or base is tuple:
-            return self._container(plain, path, self._list)
-        return self.convert(plain, path)
+            return self._container(value, path, self._list)
+        return self.convert(_PLAIN[base](value), path)
 
     def _parcel(self, ship: Carrier, value: Any, path: Path) -> str:
         try:

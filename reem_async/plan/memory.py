@@ -46,6 +46,11 @@ class Memory:
         """Return the suffixes of arrays of the last full write at `path`, None if there was none."""
         return self._shapes.get((document, path))
 
+    def forget_shapes(self, document: str) -> None:
+        """Forget the shapes of one document: a part of it was deleted."""
+        for place in [place for place in list(self._shapes) if place[0] == document]:
+            self._shapes.pop(place, None)
+
     def saw_shape(self, document: str, path: Path, suffixes: frozenset[str]) -> None:
         """Remember where the arrays of a full write were."""
         _put(self._shapes, (document, path), suffixes)

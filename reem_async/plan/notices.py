@@ -120,6 +120,6 @@ def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships
         holder = [orjson.loads(text)]
         for crate in find(holder, "a notice: ") if MARK_BYTES in text else ():
             crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]
-    except (orjson.JSONDecodeError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except Exception as error:  # a ship may raise anything over bytes that are not its own
         raise BadData(f"a notice holds a value that cannot be rebuilt: {error}") from None
     return holder[0]

@@ -7,6 +7,7 @@ means comparing tuples, so `foo` has nothing to do with `foobar`.
 
 from __future__ import annotations
 
+import enum
 import re
 from functools import lru_cache
 
@@ -35,13 +36,15 @@ def check_element(key: object, parent: Path) -> str | int:
         BadType: Neither a str nor an int.
         BadKey: A str that the server's paths cannot address.
     """
+    if isinstance(key, enum.Enum):
+        raise BadKey(f"{show(parent)}: {shorten(key)} is an enum; use its .value")
     if isinstance(key, str):
         if "\\" in key or ('"' in key and "'" in key) or not _encodable(key):
             raise BadKey(
                 f"{show(parent)}: the key {shorten(key)} cannot be addressed by a path (it has a backslash, "
                 "both kinds of quotes, or half a surrogate pair); read or write the dict that holds it instead"
             )
-        return str(key)
+        return key if type(key) is str else str.__str__(key)
     if isinstance(key, bool) or not hasattr(key, "__index__"):
         raise BadType(
             f"{show(parent)}: {shorten(key)} ({type(key).__name__}) is neither a key (str) nor a list index (int)"
@@ -51,15 +54,16 @@ def check_element(key: object, parent: Path) -> str | int:
 
 def check_top_key(key: object) -> str:
     """Return `key` if it can name a top-level entry, else raise BadKey."""
-    if not isinstance(key, str):
+    if not isinstance(key, str) or isinstance(key, enum.Enum):
         raise BadKey(f"the top-level key {shorten(key)} is not a str; use str(key)")
+    key = str.__str__(key)
     if not key:
         raise BadKey("the top-level key is empty; give it a name")
     if "{" in key or "}" in key:
         raise BadKey(f"the top-level key {shorten(key)} has a brace; Redis Cluster uses them to place keys")
     if not _encodable(key) or len(key.encode()) > LONGEST_TOP_KEY:
         raise BadKey(f"the top-level key {shorten(key)} is over {LONGEST_TOP_KEY} bytes or not UTF-8; shorten it")
-    return str(key)
+    return key
 
 
 def _encodable(text: str) -> bool:

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadData, Conflict
+from ..errors import BadData, Conflict, WrongKind
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
 from .paths import Path, show, to_jsonpath
 from .placeholders import MARK_BYTES, Crate, Placeholder, find
-from .replies import checked, full, loads, missing, type_name
+from .replies import checked, explained, full, loads, missing, type_name
 
 __all__ = ["BULK", "Sealed", "length", "read", "type_of"]
 
@@ -55,6 +55,9 @@ def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
         return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
         raise BadData(f"{name}{crate.placeholder.suffix.partition('~')[0]}: {error}") from None
+    except Exception as error:
+        where = f"{name}{crate.placeholder.suffix.partition('~')[0]}"
+        raise BadData(f"{where}: the ship {ship.label!r} could not make a value of it: {error!r}") from error
 
 
 def _plain(reply: Reply) -> Reply:
@@ -146,11 +149,20 @@ class _Fetch:
         if met != self.wanted:
             self.memory.saw_layout(self.keys.document, self.path, met)
         crated = [
-            (crate, asked[place], checked(got[place], self.keys, self.path))
+            (crate, asked[place], self._intact(got[place], place[1]))
             for crate in crates
             for place in [(crate.placeholder.label, crate.placeholder.suffix)]
         ]
         return Sealed(holder, self.keys.name, crated, commands, (text, *replies[1:]))
+
+    def _intact(self, reply: Reply, suffix: str) -> Reply:
+        """Return a ship's reply; raise BadData if another type of data is under its key."""
+        if not isinstance(reply, Exception):
+            return reply
+        if isinstance(explained(reply, self.keys, self.path), WrongKind):
+            where = f"{self.keys.name}{suffix.partition('~')[0]}"
+            raise BadData(f"{where}: what is under {self.keys.tag}{suffix} is not what the ship wrote: {reply}")
+        raise reply
 
     def _again(self, met: tuple[Placeholder, ...]) -> Plan:
         self.tries += 1

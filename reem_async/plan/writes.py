@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadType, Conflict, MissingKey, PartialWrite
+from ..errors import BadType, Conflict, MissingKey, PartialWrite, WrongKind
 from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
@@ -30,7 +30,6 @@ __all__ = [
     "exchange",
     "make_parents",
     "set_change",
-    "static_change",
 ]
 
 
@@ -60,6 +59,7 @@ class Change(NamedTuple):
         judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
         loaded: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
+        looks: Whether to look for ships' keys that it replaces; if not, somebody vouches for there being none.
         notice: What to publish in the same transaction, None for nothing.
         retraction: Makes what to publish if the server refuses the change after all.
     """
@@ -70,6 +70,7 @@ class Change(NamedTuple):
     judge: Callable[[Reply], Any]
     loaded: tuple[Loaded, ...] = ()
     replaces: bool = True
+    looks: bool = True
     notice: bytes | None = None
     retraction: Callable[[], bytes] | None = None
 
@@ -122,12 +123,14 @@ def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable
         held: The connection watches keys.
         given_up: Gives the next plan if a watched key changed.
     """
-    stale = _stale(it, memory) if it.replaces else []
+    stale = _stale(it, memory) if it.replaces and it.looks else []
     before = _clearing(it, stale)
     writes = [command for each in it.loaded for command in each.commands]
-    after: list[Command] = [("SMEMBERS", it.keys.registry)]
+    after: list[Command] = []
     if it.loaded:
-        after.insert(0, ("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
+        after.append(("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
+    if it.looks:
+        after.append(("SMEMBERS", it.keys.registry))
     if it.notice is not None:
         after.append(("PUBLISH", it.keys.channel, it.notice))
     commands = [*before, *writes, it.command, *after]
@@ -139,7 +142,7 @@ def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable
             return given_up()
         return _Outcome(it, memory, commands, replies, main).next()
 
-    return Plan(commands, decode, atomic=len(commands) > 2 or held, held=held)
+    return Plan(commands, decode, atomic=len(commands) > (2 if it.looks else 1) or held, held=held)
 
 
 def _stale(it: Change, memory: Memory) -> list[bytes]:
@@ -188,6 +191,8 @@ class _Outcome:
 
     def _members(self) -> frozenset[bytes]:
         """Return what the registry held right after the change."""
+        if not self.it.looks:
+            return frozenset()
         place = self.main + (2 if self.it.loaded else 1)
         members = frozenset(checked(self.replies[place], self.it.keys, self.it.path))
         self.memory.saw_members(self.it.keys.document, members)
@@ -258,7 +263,11 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
     """
 
     def look(replies: Sequence[Reply]) -> Any:
-        text = None if isinstance(replies[1], Exception) else replies[1]  # a foreign type refers to nothing
+        text = replies[1]
+        if isinstance(text, Exception):
+            if not isinstance(explained(text, keys, ()), WrongKind):  # nobody knows what the document refers to
+                return Plan([("UNWATCH",)], lambda _: then(), held=True)
+            text = None  # a foreign type refers to nothing
         members = frozenset(checked(replies[2], keys, ()))
         used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys), keys.name)} if text else set()
         orphans = sorted(members - used)
@@ -277,23 +286,6 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
 
     commands = [("WATCH", keys.document, keys.registry), get_command(keys, ()), ("SMEMBERS", keys.registry)]
     return Plan(commands, look, held=True)
-
-
-def static_change(it: Change) -> Plan:
-    """Plan a change whose shape is vouched for: no look at what it may replace, in one round trip."""
-    commands: list[Command] = [command for each in it.loaded for command in each.commands]
-    main = len(commands)
-    commands.append(it.command)
-    if it.notice is not None:
-        commands.append(("PUBLISH", it.keys.channel, it.notice))
-
-    def decode(replies: Sequence[Reply]) -> Any:
-        for reply in replies:
-            checked(reply, it.keys, it.path)
-        judged = it.judge(replies[main])
-        return diagnose(it.keys, it.path) if judged is REFUSED else judged
-
-    return Plan(commands, decode, atomic=len(commands) > 1)
 
 
 def exchange(it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory) -> Plan:

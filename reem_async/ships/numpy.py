@@ -73,8 +73,12 @@ class NumpyShip(BlobShip):
         dtype, shape = _parse_header(bytes(view[:size]))
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
-        empty = len(view) == size
-        array = np.zeros(shape, dtype) if empty else np.frombuffer(view, dtype, offset=size).reshape(shape)
+        try:
+            array = (
+                np.frombuffer(view, dtype, offset=size).reshape(shape) if len(view) > size else np.empty(shape, dtype)
+            )
+        except ValueError as error:
+            raise BadData(f"an array has the shape {list(shape)}, which cannot be: {error}") from None
         array.flags.writeable = False
         return array
 
@@ -166,7 +170,8 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
 def _dtype(descr: Any) -> np.dtype[Any]:
     """Return the dtype of a description, built from an allow-list; raises ValueError or TypeError."""
     dtype: np.dtype[Any] = np.lib.format.descr_to_dtype(_checked(descr, [0]))
-    if dtype.hasobject or dtype.itemsize > _LARGEST_ITEM or dtype.kind not in _KINDS:
+    # Items of no bytes would let a few bytes claim any number of them.
+    if dtype.hasobject or not 0 < dtype.itemsize <= _LARGEST_ITEM or dtype.kind not in _KINDS:
         raise ValueError(descr)
     return dtype
 

@@ -30,6 +30,12 @@ def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
     return any(inspect.iscoroutinefunction(getattr(ship, name, None)) for name in _METHODS)
 
 
+def _is_plain_blob(ship: BlobShip) -> bool:
+    """Return whether `pack` and `unpack` are all there is to it."""
+    kind = type(ship)
+    return all(getattr(kind, name) is getattr(BlobShip, name) for name in ("write", "read", "interpret_read"))
+
+
 class Registered:
     """A ship with its label and the command that reads, found out once."""
 
@@ -44,7 +50,7 @@ class Registered:
         self.label = label
         self._read = read
         self.carries: type | None = getattr(ship, "carries", None)
-        self.blob: BlobShip | None = ship if isinstance(ship, BlobShip) and not is_asynchronous(ship) else None
+        self.blob: BlobShip | None = ship if isinstance(ship, BlobShip) and _is_plain_blob(ship) else None
 
     def describe(self, value: Any) -> tuple[int, str]:
         """Return bytes and a summary of `value`."""
@@ -72,26 +78,26 @@ class Ships:
         self._by_label: dict[str, Registered] = {}
         if not self.asynchronous:
             for ship in self.given:
-                self._register(ship, ship.get_label(), self._recorded(ship.read))
+                recorder = new_recorder()
+                ship.read(_STAND_IN, recorder)
+                label: Any = ship.get_label()
+                self._register(Registered(ship, label, _only(recorder.commands, ship)))
 
     async def ready(self) -> None:
         """Ask asynchronous ships for their labels and read commands; does nothing the second time."""
         if len(self._registered) == len(self.given):
             return
-        self._registered.clear()
+        found = []
         for ship in self.given:
             recorder = self.new_recorder()
             await _settled(ship.read(_STAND_IN, recorder))
-            label = await _settled(ship.get_label())
-            self._register(ship, label, _only(recorder.commands, ship))
+            found.append(Registered(ship, await _settled(ship.get_label()), _only(recorder.commands, ship)))
+        # Another task may have been here meanwhile: what it found is the same, and is replaced at once.
+        self._registered, self._by_label = [], {}
+        for registered in found:
+            self._register(registered)
 
-    def _recorded(self, read: Callable[[str, Any], Any]) -> Command:
-        recorder = self.new_recorder()
-        read(_STAND_IN, recorder)
-        return _only(recorder.commands, read)
-
-    def _register(self, ship: SpecialDatatypeShip, label: Any, read: Command) -> None:
-        registered = Registered(ship, label, read)
+    def _register(self, registered: Registered) -> None:
         self._registered.append(registered)
         self._by_label.setdefault(registered.label, registered)
 

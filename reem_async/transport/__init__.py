@@ -6,7 +6,7 @@ event loop, `BlockingTransport` a plain thread; both are handed the same plans b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
@@ -28,6 +28,10 @@ class Transport(Held, Protocol):
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
+        ...
+
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled; return its result."""
         ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -54,7 +54,7 @@ class AsyncTransport:
     async def _opened(
         self,
         on_push: Callable[[list[Any]], None] | None = None,
-        on_lost: Callable[[Exception], None] | None = None,
+        on_lost: Callable[[Wire, Exception], None] | None = None,
         *,
         large: bool = False,
     ) -> Wire:
@@ -93,6 +93,8 @@ class AsyncTransport:
     async def hold(self) -> AsyncIterator[Wire]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled."""
         self.check()
+        while self._spare and not self._spare[-1].alive:
+            self._spare.pop()
         wire = self._spare.pop() if self._spare else await self._opened()
         try:
             yield wire
@@ -104,11 +106,20 @@ class AsyncTransport:
         else:
             await wire.close()
 
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled: what comes after it must not overtake it."""
+        task = asyncio.get_running_loop().create_task(call)
+        try:
+            return await asyncio.shield(task)
+        except asyncio.CancelledError:
+            task.add_done_callback(lambda done: done.cancelled() or done.exception())
+            raise
+
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
         return self._orders.setdefault(key, anyio.Lock())
 
-    async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Exception], None]) -> Wire:
+    async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""
         self.check()
         return await self._opened(on_push, on_lost, large=True)

@@ -12,7 +12,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -63,14 +63,15 @@ class _Line:
 
     def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies."""
+        self.broken = True  # until all is read: a Ctrl-C anywhere must not leave a reply for the next caller
         try:
             for piece in pack(commands):
                 self._socket.sendall(piece)
-            if not bulk:
-                return self._replies(self._small, len(commands))
-            if self._large is None:
+            if bulk and self._large is None:
                 self._large = LargeReader()
-            return self._replies(self._large, len(commands))
+            replies = self._replies((bulk and self._large) or self._small, len(commands))
+            self.broken = False
+            return replies
         except (BlockingIOError, TimeoutError):
             self.close()
             raise ConnectionLost(
@@ -138,12 +139,15 @@ class BlockingTransport:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
 
-    def _take(self) -> _Line:
-        self.check()
+    def _notice_fork(self) -> None:
         if self._pid != os.getpid():
-            # After a fork the sockets are the parent's: use new ones. (redis-py closes only the child's
+            # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
             # descriptors, without a word to the server.)
             self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
+
+    def _take(self) -> _Line:
+        self.check()
+        self._notice_fork()
         while True:
             try:
                 line = self._idle.pop()
@@ -155,6 +159,7 @@ class BlockingTransport:
 
     def _give(self, line: _Line) -> None:
         if line.broken:
+            line.close()
             return
         if self._closed:
             line.close()
@@ -181,8 +186,13 @@ class BlockingTransport:
             raise
         self._give(line)
 
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call`; nothing can cancel it half way."""
+        return await call
+
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""
+        self._notice_fork()
         return _Locked(self._orders.setdefault(key, threading.Lock()))
 
     async def close(self) -> None:

@@ -37,9 +37,10 @@ class Options:
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
         self.timeout = timeout
         self.settings = {**_address(host), **options}
-        self.settings.setdefault("protocol", 3)  # notices and replies on one connection
-        self.settings.setdefault("socket_timeout", None)  # the transports watch the time themselves
-        self.settings.setdefault("socket_connect_timeout", max(timeout, 1.0))
+        if self.settings.setdefault("protocol", 3) not in (3, "3"):
+            raise BadValue("REEM speaks protocol 3 (notices and replies share a connection); leave protocol= out")
+        self.handshake_timeout = max(timeout, 1.0)
+        self.settings.setdefault("socket_connect_timeout", self.handshake_timeout)
         self.tls = bool(self.settings.pop("ssl", False))
         self.socket_path: str | None = self.settings.pop("unix_socket_path", self.settings.pop("path", None))
         if self.socket_path is not None:
@@ -64,19 +65,26 @@ class Options:
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
         module: Any = redis.asyncio.connection
+        # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12.
+        settings = {"socket_timeout": None, **self.settings}
         if self.socket_path is not None:
-            return module.UnixDomainSocketConnection(path=self.socket_path, **self.settings)
-        return (module.SSLConnection if self.tls else module.Connection)(**self.settings)
+            return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
+        return (module.SSLConnection if self.tls else module.Connection)(**settings)
 
     def blocking_connection(self) -> Any:
         """Return a fresh connection of redis, not yet connected."""
         module: Any = redis.connection
+        settings = {"socket_timeout": self.handshake_timeout, **self.settings}
         if self.socket_path is not None:
-            return module.UnixDomainSocketConnection(path=self.socket_path, **self.settings)
-        return (module.SSLConnection if self.tls else module.Connection)(**self.settings)
+            return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
+        return (module.SSLConnection if self.tls else module.Connection)(**settings)
 
     def refused(self, error: Exception) -> Exception:
         """Return the error to raise when connecting failed with `error`."""
+        if "HELLO must be called" in str(error) or "NOAUTH" in str(error):
+            return redis.exceptions.AuthenticationError(
+                f"the server at {self.address} needs a password: RedisInterface(..., username=..., password=...)"
+            )
         if isinstance(error, redis.exceptions.AuthenticationError | ReemError):
             return error
         reason = error.__cause__ if isinstance(error.__cause__, OSError) else error
@@ -108,8 +116,11 @@ def _address(host: Any) -> dict[str, Any]:
         raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")
     try:
         settings: dict[str, Any] = {**parse_url(host)}
-    except ValueError as error:
-        raise BadValue(f"the URL of the server is wrong: {error}") from None
+    except ValueError:  # its text may hold a part of the password
+        raise BadValue(
+            "the URL of the server is wrong; write it like redis://user:password@host:6379/0, special characters "
+            "of the password percent-encoded"
+        ) from None
     if settings.pop("connection_class", None) is redis.asyncio.connection.SSLConnection:
         settings["ssl"] = True
     return settings

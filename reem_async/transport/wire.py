@@ -24,6 +24,7 @@ from .parsing import MORE, LargeReader, Reader, SmallReader
 
 __all__ = ["Wire", "open_wire"]
 
+_NOTHING_SENT = float("inf")
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe")
 
 
@@ -53,7 +54,7 @@ class Wire(asyncio.BufferedProtocol):
         timeout: float,
         reader: Reader,
         on_push: Callable[[list[Any]], None] | None = None,
-        on_lost: Callable[[Exception], None] | None = None,
+        on_lost: Callable[[Wire, Exception], None] | None = None,
     ) -> None:
         self._timeout = timeout
         self._on_push = on_push
@@ -66,6 +67,7 @@ class Wire(asyncio.BufferedProtocol):
         self._keep: Any = None
         self._watch: asyncio.TimerHandle | None = None
         self._last_byte = 0.0
+        self._unsent: float = _NOTHING_SENT
         self._reason: Exception | None = None
         self._gone = self._loop.create_future()
         # What the socket does not take at once is copied by asyncio of Python 3.11; later versions and
@@ -93,6 +95,9 @@ class Wire(asyncio.BufferedProtocol):
 
     def send(self, commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]) -> None:
         """Send `commands`; `done` is called with their replies, in order with pushed messages, or with an error."""
+        if not commands:
+            done([])
+            return
         if self._transport is None or self._reason is not None:
             done(self._reason or ConnectionLost("the connection is closed"))
             return
@@ -209,15 +214,19 @@ class Wire(asyncio.BufferedProtocol):
         self._watch = None
         if not self._due:
             return
+        unsent = self._transport.get_write_buffer_size() if self._transport is not None else 0
+        if unsent < self._unsent:  # a large value on its way up is progress too
+            self._last_byte = self._loop.time()
+        self._unsent = unsent or _NOTHING_SENT
         left = self._last_byte + self._timeout - self._loop.time()
         if left <= 0:
             self.abort(
                 ConnectionLost(
-                    f"the server sent nothing for {self._timeout} s; the call was applied once or not at all"
+                    f"the server moved no byte for {self._timeout} s; the call was applied once or not at all"
                 )
             )
         else:
-            self._watch = self._loop.call_later(left, self._check_time)
+            self._watch = self._loop.call_later(max(left, 0.01), self._check_time)
 
     def _fail(self, reason: Exception) -> None:
         if self._reason is not None:
@@ -230,13 +239,13 @@ class Wire(asyncio.BufferedProtocol):
         for due in waiting:
             due.done(reason)
         if self._on_lost is not None:
-            self._on_lost(reason)
+            self._on_lost(self, reason)
 
 
 async def open_wire(
     options: Options,
     on_push: Callable[[list[Any]], None] | None = None,
-    on_lost: Callable[[Exception], None] | None = None,
+    on_lost: Callable[[Wire, Exception], None] | None = None,
     *,
     large: bool = False,
 ) -> Wire:
@@ -248,7 +257,11 @@ async def open_wire(
     """
     connection = options.asynchronous_connection()
     try:
-        await connection.connect()
+        async with asyncio.timeout(options.handshake_timeout):
+            await connection.connect()
+    except TimeoutError as error:
+        await connection.disconnect(nowait=True)
+        raise options.refused(error) from error
     except (redis.exceptions.RedisError, OSError) as error:
         raise options.refused(error) from error
     wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
