@@ -2,6 +2,11 @@
 
 Notices and replies share that connection (RESP3), so all a follower learns is in one order: what
 came before a snapshot is in it, what comes after is newer. There is no arithmetic and no race.
+
+A large snapshot goes another way: servers close a subscribed connection that owes over 32 MB, and
+small updates should not wait behind an image. Then a PING on the subscribed connection fences it:
+what comes after the PONG is newer. Of what came meanwhile, the snapshot has what came up to the
+notice that it says was the last.
 """
 
 from __future__ import annotations
@@ -26,6 +31,7 @@ from .plan.reads import Sealed, interpret, read
 from .plan.trees import MISSING, CannotApply, copied, get, removed, replaced
 from .policy import Mailbox
 from .ships.registry import Ships
+from .transport import Transport
 from .transport.aio import AsyncTransport
 from .transport.wire import Wire
 
@@ -77,7 +83,7 @@ class Follower:
         ready: Done when the first snapshot is there.
     """
 
-    def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory) -> None:
+    def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, transport: Transport) -> None:
         self.keys = keys
         self.path = path
         self.tree: Any = MISSING
@@ -85,12 +91,14 @@ class Follower:
         self.ready: asyncio.Future[None] | None = None
         self._ships = ships
         self._memory = memory
+        self._transport = transport
         self._wire: Wire | None = None
         self._reading = 0  # the number of the snapshot on its way, 0 for none
         self._last_reading = 0
         self._settling = False  # the snapshot is here and ships are opening it
         self._behind = False  # an update could not be applied: only a snapshot helps
         self._covered: list[Notice] = []  # arrived while a snapshot was on its way: it has them
+        self._doubtful: list[Notice] = []  # arrived while a large one was: it has the first of them
         self._later: list[tuple[Notice, str]] = []  # arrived after a snapshot that ships are still opening
         self._sequences: dict[str, int] = {}
         self._kind = "initial"
@@ -99,6 +107,7 @@ class Follower:
         """Take a snapshot over `wire`; `kind` is "initial", or "gap" after a broken connection."""
         self._wire, self._kind = wire, kind
         self._covered.clear()
+        self._doubtful.clear()
         self._later.clear()
         self._read()
 
@@ -144,13 +153,7 @@ class Follower:
 
     def _apply(self, notice: Notice, *, gap: bool) -> None:
         try:
-            if len(notice.path) <= len(self.path):
-                rest = self.path[len(notice.path) :]
-                self.tree = MISSING if notice.deleted else get(notice.value, rest)
-            elif notice.deleted:
-                self.tree = removed(self.tree, notice.path[len(self.path) :])
-            else:
-                self.tree = replaced(self.tree, notice.path[len(self.path) :], notice.value)
+            self.tree = _applied(self.tree, notice, self.path)
         except CannotApply:  # the server has refused it too, or this copy is behind: look
             self._fetch(notice)
             return
@@ -163,12 +166,35 @@ class Follower:
     def _read(self) -> None:
         self._last_reading += 1
         self._reading, self._settling = self._last_reading, False
-        self._send(read(self.keys, self.path, self._ships, self._memory))
+        self._send(read(self.keys, self.path, self._ships, self._memory, (("GET", self.keys.last),)))
 
     def _send(self, plan: Plan) -> None:
         number, wire = self._reading, self._wire
-        if wire is not None:
+        if wire is None:
+            return
+        self._covered += self._doubtful  # what is sent now is newer than all of them
+        self._doubtful = []
+        if plan.bulk:
+            _in_background(self._send_large(plan, number, wire), f"reem fetch {self.keys.name}")
+        else:
             wire.send(wire_commands(plan), lambda outcome: self._on_replies(plan, number, outcome))
+
+    async def _send_large(self, plan: Plan, number: int, wire: Wire) -> None:
+        """Read over the connection for large values, then wait for the fence."""
+        before = len(self._covered)
+        outcome: list[Reply] | Exception
+        try:
+            outcome = await self._transport.roundtrip(wire_commands(plan), bulk=True)
+        except Exception as error:
+            outcome = error
+
+        def fenced(_: list[Reply] | Exception) -> None:
+            if number == self._reading:
+                self._doubtful = self._covered[before:]
+                del self._covered[before:]
+            self._on_replies(plan, number, outcome)
+
+        wire.send([("PING",)], fenced)
 
     def _on_replies(self, plan: Plan, number: int, outcome: list[Reply] | Exception) -> None:
         """Go on with a read: called in order with notices, so what has arrived until now is older."""
@@ -179,6 +205,7 @@ class Follower:
                 raise outcome
             result = plan.decode(unwrap(plan, outcome))
         except MissingKey:
+            self._divide(())
             self._settle(MISSING)
         except Exception as error:
             self._failed(error)
@@ -186,7 +213,16 @@ class Follower:
             if isinstance(result, Plan):
                 self._send(result)
             else:
+                self._divide(result.also)
                 self._open(result)
+
+    def _divide(self, also: tuple[Reply, ...]) -> None:
+        """Tell the updates that a snapshot has from those it has not, by the note of the last one it has."""
+        doubtful, self._doubtful = self._doubtful, []
+        notes = [f"{notice.publisher} {notice.sequence}".encode() for notice in doubtful]
+        known = notes.index(also[0]) + 1 if also and also[0] in notes else 0
+        self._covered += doubtful[:known]
+        self._later += [(notice, "next") for notice in doubtful[known:]]
 
     def _open(self, sealed: Sealed) -> None:
         """Have the ships make values of their replies; those that must be awaited get a task."""
@@ -222,6 +258,7 @@ class Follower:
         """Report a snapshot that could not be taken; the next update tries again."""
         self._reading, self._settling, self._behind = 0, False, True
         self._covered.clear()
+        self._doubtful.clear()
         later, self._later = self._later, []
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(error)
@@ -292,11 +329,24 @@ def _is_whole(notice: Notice, followed: Path, tree: Any) -> bool:
     if notice.path[: len(followed)] != followed[: len(notice.path)]:
         return False
     if notice.deleted:  # deleting an item moves the next one to its place
-        return len(notice.path) > len(followed) or not notice.path or isinstance(notice.path[-1], str)
+        return len(notice.path) > len(followed) or not _deletes_item(notice)
     if notice.value is ANNOUNCED:
         return False
     # The server may have refused it for want of a parent; where there was something, there is a parent.
     return not notice.path or len(notice.path) > len(followed) or tree is not MISSING
+
+
+def _deletes_item(notice: Notice) -> bool:
+    """Return whether an item of a list was deleted, so that those after it have moved."""
+    return bool(notice.path) and isinstance(notice.path[-1], int)
+
+
+def _applied(tree: Any, notice: Notice, followed: Path) -> Any:
+    """Return the local copy after an update; raises CannotApply."""
+    if len(notice.path) <= len(followed):
+        return MISSING if notice.deleted else get(notice.value, followed[len(notice.path) :])
+    inner = notice.path[len(followed) :]
+    return removed(tree, inner) if notice.deleted else replaced(tree, inner, notice.value)
 
 
 _tasks: set[asyncio.Task[Any]] = set()
@@ -332,7 +382,7 @@ class Hub:
 
     def follower(self, keys: Keys, path: Path) -> Follower:
         """Return a follower of `path` that is not following yet."""
-        return Follower(keys, path, self._ships, self._memory)
+        return Follower(keys, path, self._ships, self._memory, self._transport)
 
     async def follow(self, follower: Follower) -> None:
         """Subscribe, then take the first snapshot; when this returns, no later update is missed."""

@@ -12,7 +12,7 @@ from .document import DocumentWriter
 from .errors import WriteOnly
 from .plan import Command
 from .plan.documents import Encoded
-from .plan.notices import announce, with_value
+from .plan.notices import announce, published, with_value
 from .plan.paths import Path, show
 from .plan.reads import Sealed
 from .plan.writes import Change, Loaded, append_change, change, delete_change, set_change
@@ -35,19 +35,16 @@ class DocumentPublisher(DocumentWriter):
 
     async def _set_in_order(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            stamp = self._stamp(path)
+            notices = published(self.keys, *stamp[:2], with_value(*stamp, encoded.text, loaded))
             it = set_change(
-                self.keys,
-                path,
-                encoded.text,
-                loaded,
-                notice=with_value(*self._stamp(path), encoded.text, loaded),
-                retraction=lambda: announce(*self._stamp(path)),
+                self.keys, path, encoded.text, loaded, notices=notices, retraction=lambda: self._announced(path)
             )
             await self._change(it)
 
     async def _delete(self, path: Path) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            it = delete_change(self.keys, path, notice=announce(*self._stamp(path), deleted=True))
+            it = delete_change(self.keys, path, notices=self._announced(path, deleted=True))
             await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
@@ -56,15 +53,17 @@ class DocumentPublisher(DocumentWriter):
 
     async def _append_in_order(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            it = append_change(self.keys, path, texts, loaded, notice=announce(*self._stamp(path)))
+            it = append_change(self.keys, path, texts, loaded, notices=self._announced(path))
             await self.session.run(change(it, self.session.memory))
-
-    def _notices(self, path: Path) -> list[Command]:
-        return [("PUBLISH", self.keys.channel, announce(*self._stamp(path)))]
 
     async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Any]) -> Any:
         async with self.session.transport.ordered(self.keys.channel):
-            return await self.session.run(plan(lambda: self._notices(path)))
+            return await self.session.run(plan(lambda: self._announced(path)))
+
+    def _announced(self, path: Path, *, deleted: bool = False) -> list[Command]:
+        """Return the commands of a notice without the value."""
+        stamp = self._stamp(path)
+        return published(self.keys, *stamp[:2], announce(*stamp, deleted=deleted))
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         raise WriteOnly(_cannot_read((self.name, *it.path)))

@@ -299,7 +299,11 @@ class Caller:
         """Log what is raised inside, and updates that were dropped since the last call."""
         if dropped > self._dropped:
             self._dropped = dropped
-            logger.warning("%s: the callback is too slow, %d updates were dropped so far", self._channel, dropped)
+            logger.warning(
+                "%s: %d updates were skipped so far; newer ones came before the callback was done",
+                self._channel,
+                dropped,
+            )
         try:
             yield
         except Exception:

@@ -356,7 +356,10 @@ def assert_no_orphans(raw, top_key):
     text = raw.execute_command("JSON.GET", top_key)
     found = placeholders(json.loads(text)) if text is not None else []
     registry = "{" + top_key + "}:ships"
-    arrays = {name.removeprefix("{" + top_key + "}") for name in keys_of(raw, top_key) - {registry}}
+    last = "{" + top_key + "}:last"  # which notice was the last: expires by itself
+    assert raw.ttl(last) in range(-2, 61), "the note of the last notice must expire"
+    assert raw.ttl(last) != -1
+    arrays = {name.removeprefix("{" + top_key + "}") for name in keys_of(raw, top_key) - {registry, last}}
     members = set(raw.smembers(registry))
     assert members == arrays, f"registry and arrays differ by {members ^ arrays}"
     assert len(found) == len(arrays), f"placeholders {found} but arrays {arrays}"

@@ -21,6 +21,7 @@ class Keys(NamedTuple):
         tag: What every ship's key begins with: `{foo}`.
         registry: The set of the suffixes of all ships' keys that exist.
         channel: Where notices of updates are published.
+        last: Which notice was published last; kept for a minute.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Keys(NamedTuple):
     tag: str
     registry: str
     channel: str
+    last: str
 
 
 @lru_cache(maxsize=4096)
@@ -36,4 +38,4 @@ def keys_of(name: str, namespace: str = "", database: int = 0) -> Keys:
     tag = "{" + namespace + name + "}"
     # Channels are shared by all databases of a server, keys are not.
     channel = f"{tag}:notices" + (f"@{database}" if database else "")
-    return Keys(name, namespace + name, tag, f"{tag}:ships", channel)
+    return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last")

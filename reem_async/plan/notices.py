@@ -14,11 +14,13 @@ import orjson
 
 from ..errors import BadData
 from ..ships.registry import Ships
+from . import Command
+from .keys import Keys
 from .paths import Path
 from .placeholders import MARK_BYTES, find
 from .writes import Loaded
 
-__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "with_value"]
+__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "published", "with_value"]
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14
@@ -46,6 +48,15 @@ class Notice(NamedTuple):
     path: Path
     deleted: bool
     value: Any
+
+
+def published(keys: Keys, publisher: str, sequence: int, payload: bytes) -> list[Command]:
+    """Return the commands that publish a notice, and note that it was the last.
+
+    Of a snapshot that holds this note one can tell which notices it has: those up to this one. It
+    expires, since it only matters while a snapshot is on its way.
+    """
+    return [("SET", keys.last, f"{publisher} {sequence}", "EX", 60), ("PUBLISH", keys.channel, payload)]
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False) -> bytes:

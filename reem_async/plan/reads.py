@@ -36,6 +36,7 @@ class Sealed(NamedTuple):
         crates: Where each ship's value goes, the ship, and the reply to interpret.
         commands: What was asked in the end, and
         raw: what was received for it, to tell later whether anything changed.
+        also: The replies to what was asked besides, if it was asked for.
     """
 
     holder: list[Any]
@@ -43,6 +44,7 @@ class Sealed(NamedTuple):
     crates: list[tuple[Crate, Registered, Reply]]
     commands: tuple[Command, ...]
     raw: tuple[Any, ...]
+    also: tuple[Any, ...] = ()
 
 
 def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
@@ -76,14 +78,14 @@ def get_command(keys: Keys, path: Path) -> Command:
     return ("JSON.GET", keys.document, to_jsonpath(path))
 
 
-def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
+def read(keys: Keys, path: Path, ships: Ships, memory: Memory, also: tuple[Command, ...] = ()) -> Plan:
     """Plan to read the value at `path`; the result is `Sealed`, or MissingKey is raised.
 
-    One round trip, if the arrays there are those the last read met; else two or more.
+    What is asked `also` goes into the transaction, where there is one. One round trip, if the arrays there are those the last read met; else two or more.
     """
     known = memory.layout(keys.document, path)
     if known:
-        return _Fetch(keys, path, ships, memory, known).plan()
+        return _Fetch(keys, path, ships, memory, known, also).plan()
 
     command = get_command(keys, path)
 
@@ -93,7 +95,8 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
         crates = find(holder, keys.name) if MARK_BYTES in text else []
         if not crates:
             return Sealed(holder, keys.name, [], (command,), (text,))
-        return _Fetch(keys, path, ships, memory, tuple(crate.placeholder for crate in crates)).plan()
+        met = tuple(crate.placeholder for crate in crates)
+        return _Fetch(keys, path, ships, memory, met, also).plan()
 
     return Plan([command], decode)
 
@@ -109,14 +112,23 @@ def present(reply: Reply, keys: Keys, path: Path) -> bytes:
 class _Fetch:
     """Reads document and ships' keys in one transaction, again if the guess was wrong."""
 
-    __slots__ = ("keys", "memory", "path", "ships", "tries", "wanted")
+    __slots__ = ("also", "keys", "memory", "path", "ships", "tries", "wanted")
 
-    def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, wanted: tuple[Placeholder, ...]) -> None:
+    def __init__(
+        self,
+        keys: Keys,
+        path: Path,
+        ships: Ships,
+        memory: Memory,
+        wanted: tuple[Placeholder, ...],
+        also: tuple[Command, ...] = (),
+    ) -> None:
         self.keys = keys
         self.path = path
         self.ships = ships
         self.memory = memory
         self.wanted = wanted
+        self.also = also
         self.tries = 0
 
     def plan(self) -> Plan:
@@ -124,7 +136,7 @@ class _Fetch:
         asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in self.wanted}
         self.memory.saw_layout(self.keys.document, self.path, self.wanted)
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
-        commands = (get_command(self.keys, self.path), *reads)
+        commands = (get_command(self.keys, self.path), *reads, *self.also)
         bulk = sum(each.size for each in self.wanted) >= BULK
         return Plan(
             commands,
@@ -143,7 +155,8 @@ class _Fetch:
         holder = loads(text, self.keys)
         crates = find(holder, self.keys.name)
         met = tuple(crate.placeholder for crate in crates)
-        got = dict(zip(asked, replies[1:], strict=True))
+        end = 1 + len(asked)
+        got = dict(zip(asked, replies[1:end], strict=True))
         if any((each.label, each.suffix) not in got for each in met):
             return self._again(met)
         if met != self.wanted:
@@ -153,7 +166,7 @@ class _Fetch:
             for crate in crates
             for place in [(crate.placeholder.label, crate.placeholder.suffix)]
         ]
-        return Sealed(holder, self.keys.name, crated, commands, (text, *replies[1:]))
+        return Sealed(holder, self.keys.name, crated, commands, (text, *replies[1:end]), tuple(replies[end:]))
 
     def _intact(self, reply: Reply, suffix: str) -> Reply:
         """Return a ship's reply; raise BadData if another type of data is under its key."""

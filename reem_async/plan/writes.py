@@ -60,8 +60,8 @@ class Change(NamedTuple):
         loaded: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
         looks: Whether to look for ships' keys that it replaces; if not, somebody vouches for there being none.
-        notice: What to publish in the same transaction, None for nothing.
-        retraction: Makes what to publish if the server refuses the change after all.
+        notices: What tells subscribers, in the same transaction.
+        retraction: Makes what tells them if the server refuses the change after all.
     """
 
     keys: Keys
@@ -71,8 +71,8 @@ class Change(NamedTuple):
     loaded: tuple[Loaded, ...] = ()
     replaces: bool = True
     looks: bool = True
-    notice: bytes | None = None
-    retraction: Callable[[], bytes] | None = None
+    notices: Sequence[Command] = ()
+    retraction: Callable[[], Sequence[Command]] | None = None
 
 
 REFUSED = object()
@@ -131,8 +131,7 @@ def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable
         after.append(("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
     if it.looks:
         after.append(("SMEMBERS", it.keys.registry))
-    if it.notice is not None:
-        after.append(("PUBLISH", it.keys.channel, it.notice))
+    after.extend(it.notices)
     commands = [*before, *writes, it.command, *after]
     main = len(before) + len(writes)
 
@@ -183,10 +182,8 @@ class _Outcome:
         judged = self._judged()
         refused = judged is REFUSED or isinstance(judged, Exception)
         if refused and self.it.retraction is not None:
-            return Plan(
-                [("PUBLISH", self.it.keys.channel, self.it.retraction())],
-                lambda _: self._settle(members, judged),
-            )
+            retraction = self.it.retraction()
+            return Plan(retraction, lambda _: self._settle(members, judged), atomic=True)
         return self._settle(members, judged)
 
     def _members(self) -> frozenset[bytes]:
