@@ -81,7 +81,8 @@ def get_command(keys: Keys, path: Path) -> Command:
 def read(keys: Keys, path: Path, ships: Ships, memory: Memory, also: tuple[Command, ...] = ()) -> Plan:
     """Plan to read the value at `path`; the result is `Sealed`, or MissingKey is raised.
 
-    What is asked `also` goes into the transaction, where there is one. One round trip, if the arrays there are those the last read met; else two or more.
+    What is asked `also` goes into the transaction, where there is one. One round trip, if the arrays
+    there are those the last read met; else two or more.
     """
     known = memory.layout(keys.document, path)
     if known:
