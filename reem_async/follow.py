@@ -4,9 +4,9 @@ Notices and replies share that connection (RESP3), so all a follower learns is i
 came before a snapshot is in it, what comes after is newer. There is no arithmetic and no race.
 
 A large snapshot goes another way: servers close a subscribed connection that owes over 32 MB, and
-small updates should not wait behind an image. Then a PING on the subscribed connection fences it:
-what comes after the PONG is newer. Of what came meanwhile, the snapshot has what came up to the
-notice that it says was the last.
+small updates should not wait behind an image. Such a snapshot says which notice was the last when it
+was taken, and so which of those that came meanwhile it has. If that one has not arrived yet, a PING
+on the subscribed connection fences it: once the PONG is there, it has.
 """
 
 from __future__ import annotations
@@ -194,7 +194,16 @@ class Follower:
                 del self._covered[before:]
             self._on_replies(plan, number, outcome)
 
-        wire.send([("PING",)], fenced)
+        if self._kind == "" and self._has_heard(outcome):
+            fenced([])
+        else:
+            wire.send([("PING",)], fenced)
+
+    def _has_heard(self, outcome: list[Reply] | Exception) -> bool:
+        """Return whether the notice that a snapshot says was the last has arrived: then so have those before."""
+        note = outcome[-1][-1] if isinstance(outcome, list) and isinstance(outcome[-1], list) else None
+        publisher, _, sequence = note.decode().partition(" ") if isinstance(note, bytes) else ("", "", "")
+        return sequence.isdigit() and self._sequences.get(publisher, 0) >= int(sequence)
 
     def _on_replies(self, plan: Plan, number: int, outcome: list[Reply] | Exception) -> None:
         """Go on with a read: called in order with notices, so what has arrived until now is older."""

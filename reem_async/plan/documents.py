@@ -33,6 +33,8 @@ DEEPEST = 100
 _MANY = 32
 """Floats in a list from which converting them together pays."""
 
+_NOT_BRACKETS = bytes(set(range(256)) - set(b"{}[]"))
+
 _PLAIN: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__index__, float: float.__float__}
 """How to get at what a subclass holds; its own __str__ and the like may say something else."""
 
@@ -114,21 +116,33 @@ def number_text(value: float, place: Path) -> bytes:
 
 
 def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
-    """Return whether the text may differ from the value in meaning; False is certain."""
+    """Return whether the text may differ from the value in meaning; False is certain.
+
+    Each search begins with one byte, which is found at memory speed: most documents lack it.
+    """
     return (
-        b"null" in text
-        or placeholders.MARK_BYTES in text
+        (b"u" in text and b"null" in text)
+        or (b"$" in text and placeholders.MARK_BYTES in text)
         or may_lose(text)
-        or (_has_many_containers(text, DEEPEST - above) and _levels(value) > DEEPEST - above)
+        or _may_be_deep(text, value, DEEPEST - above)
         or not _only_plain_types(value)
     )
 
 
-def _has_many_containers(text: bytes, limit: int) -> bool:
-    """Return whether there are more than `limit`; flat documents are told by searches at memory speed."""
+def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
+    """Return whether containers are nested over `limit` levels."""
     if text.find(b"{", 1) < 0 and text.find(b"[", 1) < 0:
         return limit < 1
-    return text.count(b"{") + text.count(b"[") > limit
+    brackets = text.translate(None, _NOT_BRACKETS)
+    if len(brackets) <= 2 * limit:
+        return False
+    for _ in range(limit // 2):  # each turn strips one or two levels
+        stripped = brackets.replace(b"{}", b"").replace(b"[]", b"")
+        if len(stripped) == len(brackets):
+            break
+        brackets = stripped
+    # What is left are very deep levels, or brackets inside of strings.
+    return bool(brackets) and _levels(value) > limit
 
 
 def _only_plain_types(value: Any) -> bool:

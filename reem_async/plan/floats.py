@@ -31,7 +31,9 @@ _EXPONENT = re.compile(rb"e[-+]\d")
 
 def may_lose(text: bytes) -> bool:
     """Return whether JSON `text` may hold a float that RedisJSON would change. False is certain."""
-    return (b"." in text and _LONG.search(text) is not None) or _EXPONENT.search(text) is not None
+    return (b"." in text and _LONG.search(text) is not None) or (
+        (b"-" in text or b"+" in text) and _EXPONENT.search(text) is not None
+    )
 
 
 def exact_text(value: float) -> bytes | None:

@@ -122,7 +122,7 @@ class AsyncTransport:
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""
         self.check()
-        return await self._opened(on_push, on_lost, large=True)
+        return await self._opened(on_push, on_lost)
 
     async def close(self) -> None:
         """Close all connections."""
