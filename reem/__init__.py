@@ -6,20 +6,12 @@ kvs["foo"] = {"number": 1, "image": np.zeros((480, 640, 3))}
 image = kvs["foo"]["image"].read()
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from reem_async import __version__ as __version__
-from reem_async.policy import Every, Last, Newest
 
 from .connection import RedisInterface
-from .datatypes import (
-    CallbackSubscriber,
-    KeyValueStore,
-    Publisher,
-    PublishSpace,
-    Reader,
-    SilentSubscriber,
-    Update,
-    Writer,
-)
 from .errors import (
     BadData,
     BadInput,
@@ -47,6 +39,33 @@ from .errors import (
     WrongLoop,
 )
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+from .store import KeyValueStore, Reader, Writer
+
+if TYPE_CHECKING:
+    from reem_async.follow import Update
+    from reem_async.policy import Every, Last, Newest
+
+    from .publish import Publisher, PublishSpace
+    from .subscribe import CallbackSubscriber, SilentSubscriber
+
+_LATER = {
+    "CallbackSubscriber": "reem.subscribe",
+    "Every": "reem_async.policy",
+    "Last": "reem_async.policy",
+    "Newest": "reem_async.policy",
+    "PublishSpace": "reem.publish",
+    "Publisher": "reem.publish",
+    "SilentSubscriber": "reem.subscribe",
+    "Update": "reem_async.follow",
+}
+"""Imported when first used: a program that only reads and writes starts sooner."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LATER[name]), name)
+
 
 __all__ = [
     "BadData",

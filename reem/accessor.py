@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from reem_async import accessor as core
 from reem_async.errors import BadType
-from reem_async.policy import Policy
 
 from ._twin import documented_by
 from .connection import RedisInterface
 
 if TYPE_CHECKING:
+    from reem_async.policy import Policy
+
     from .subscribe import Watch
 
 __all__ = ["Accessor", "Edit", "PublishAccessor"]

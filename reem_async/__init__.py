@@ -6,17 +6,10 @@ async with RedisInterface("localhost") as interface:
     image = await kvs["foo"]["image"].read()
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from .connection import RedisInterface
-from .datatypes import (
-    CallbackSubscriber,
-    KeyValueStore,
-    Publisher,
-    PublishSpace,
-    Reader,
-    SilentSubscriber,
-    Update,
-    Writer,
-)
 from .errors import (
     BadData,
     BadInput,
@@ -43,10 +36,35 @@ from .errors import (
     WrongKind,
     WrongLoop,
 )
-from .policy import Every, Last, Newest
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+from .store import KeyValueStore, Reader, Writer
 
 __version__ = "1.0.0"
+
+if TYPE_CHECKING:
+    from .follow import Update
+    from .policy import Every, Last, Newest
+    from .publish import Publisher, PublishSpace
+    from .subscribe import CallbackSubscriber, SilentSubscriber
+
+_LATER = {
+    "CallbackSubscriber": "reem_async.subscribe",
+    "Every": "reem_async.policy",
+    "Last": "reem_async.policy",
+    "Newest": "reem_async.policy",
+    "PublishSpace": "reem_async.publish",
+    "Publisher": "reem_async.publish",
+    "SilentSubscriber": "reem_async.subscribe",
+    "Update": "reem_async.follow",
+}
+"""Imported when first used: a program that only reads and writes starts sooner."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_LATER[name]), name)
+
 
 __all__ = [
     "BadData",

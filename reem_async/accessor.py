@@ -14,10 +14,10 @@ from .document import DocumentReader, DocumentWriter, opened, resolved
 from .errors import BadType, MissingKey
 from .plan.documents import number_text
 from .plan.paths import Path, check_element, counts_from_end, show
-from .policy import Newest, Policy
 
 if TYPE_CHECKING:
     from .plan.reads import Sealed
+    from .policy import Policy
     from .session import Session
     from .subscribe import Watch
 
@@ -193,6 +193,7 @@ class Accessor:
             policy: What to keep for a loop that is slower than the updates: `Newest()` (the
                 default), `Last(n)` or `Every(bound)`.
         """
+        from .policy import Newest
         from .subscribe import Watch
 
         return Watch(self._reader.session, self._reader.keys, self._path, policy or Newest())

@@ -46,7 +46,8 @@ class DocumentReader:
         """Return the value at `path`; raises MissingKey."""
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
-        return await opened(await self.sealed(path))
+        sealed = await self.sealed(path)
+        return await opened(sealed) if sealed.crates else sealed.holder[0]
 
     async def sealed(self, path: Path) -> Sealed:
         """Return what the server has at `path`, ships' replies not yet interpreted."""

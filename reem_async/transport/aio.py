@@ -138,4 +138,7 @@ class AsyncTransport:
 
 def _is_bulk(commands: Sequence[Command]) -> bool:
     """Return whether so much is sent that others should not wait behind it."""
-    return any(size_of_largest(command) >= _BULK for command in commands)
+    for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
+        if size_of_largest(command) >= _BULK:
+            return True
+    return False

@@ -53,11 +53,11 @@ def size_of_largest(command: Command) -> int:
 
 
 def _packed(command: Command) -> bytes:
-    words: list[Any] = [
-        b"".join(word) if type(word) is tuple else _encoded(word) if type(word) is memoryview else word
-        for word in command
-    ]
-    packed: bytes = hiredis.pack_command(tuple(words))
+    try:
+        packed: bytes = hiredis.pack_command(command)
+    except TypeError:  # an argument in several pieces
+        words: list[Any] = [b"".join(word) if type(word) is tuple else word for word in command]
+        packed = hiredis.pack_command(tuple(words))
     return packed
 
 
