@@ -23,7 +23,7 @@ from .transport.options import Options
 from .transport.recorder import CommandRecorder
 
 if TYPE_CHECKING:
-    from .follow import Hub
+    from .hub import Hub
 
 __all__ = ["Session"]
 
@@ -76,7 +76,7 @@ class Session:
         self.transport.check()
         place = os.getpid(), asyncio.get_running_loop()
         if self._hub is None or self._hub.place != place:
-            from .follow import Hub
+            from .hub import Hub
 
             assert isinstance(self.transport, AsyncTransport)
             self._hub = Hub(self.transport, self.ships, self.memory)

@@ -10,9 +10,11 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
+from .background import in_background
 from .connection import RedisInterface
 from .errors import BadType, InterfaceClosed, MissingKey, QueueFull, ReadOnly
-from .follow import Follower, Hub, Update
+from .follow import Follower, Update
+from .hub import Hub
 from .plan.keys import Keys
 from .plan.paths import Path, check_element, parse, show
 from .plan.trees import MISSING, copied, get
@@ -355,9 +357,8 @@ class CallbackSubscriber(SilentSubscriber):
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
         await self._updates.listen()
         if self._task is None or self._task.get_loop() is not asyncio.get_running_loop():
-            self._task = asyncio.get_running_loop().create_task(self._call_all(), name=f"reem {self.channel}")
-            _running.add(self._task)
-            self._task.add_done_callback(_running.discard)
+            # The task keeps a subscriber alive that nobody holds on to: it works until the interface is closed.
+            self._task = in_background(self._call_all(), f"reem {self.channel}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)
@@ -380,7 +381,3 @@ class CallbackSubscriber(SilentSubscriber):
         await super().close()
         if self._task is not None and self._task is not asyncio.current_task():
             await asyncio.wait([self._task])
-
-
-# Keeps subscribers alive that nobody holds on to: they work until the interface is closed.
-_running: set[asyncio.Task[None]] = set()
