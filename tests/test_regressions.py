@@ -1,0 +1,430 @@
+"""Defects that a review found, one test for each: the store, connections, and ships."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import secrets
+import socket
+import time
+import traceback
+import urllib.parse
+import zlib
+
+import numpy as np
+import pytest
+from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent
+
+import reem
+import reem_async
+from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected
+
+A = np.arange(3.0)
+
+
+class SetShip(reem.SpecialDatatypeShip):
+    """Stores a set as a Redis list: written twice without a look it would be doubled."""
+
+    def check_fit(self, value):
+        return isinstance(value, set)
+
+    def write(self, key, value, client):
+        client.rpush(key, *sorted(value))
+
+    def read(self, key, client):
+        client.lrange(key, 0, -1)
+
+    def interpret_read(self, responses):
+        return [int(item) for item in responses[0]]
+
+    def get_label(self):
+        return "set"
+
+
+# --- arrays in lists ------------------------------------------------------------------------------
+
+
+def test_an_array_in_a_list_item_leaves_nothing_when_it_is_replaced(front, key, raw):
+    """By path, by arrays again and again, and by what is no array."""
+    front.write([key()], {"t": [{"img": 0}]})
+    for value in (A, A + 1, {"deep": [A]}, A, 5):
+        front.write([key(), "t", 0, "img"], value)
+        assert_same(front.read([key()]), {"t": [{"img": value}]})
+        assert_no_orphans(raw, key())
+    assert not keys_of(raw, key()) - {"{" + key() + "}:ships"}
+
+
+def test_arrays_below_a_list_item_leave_nothing_when_the_item_is_replaced(front, key, raw):
+    """Whether they were written with the item, below it, or appended with it."""
+    front.write([key()], {"t": [{"img": A, "l": [A]}]})
+    front.append([key(), "t"], {"img": A})
+    for index in (1, 0):
+        front.write([key(), "t", index, "img"], A + 1)
+        front.write([key(), "t", index, "more"], [A, {"x": A}])
+        front.write([key(), "t", index, "more", 1, "x"], 5)
+        assert_no_orphans(raw, key())
+        front.write([key(), "t", index], 5)
+        assert_no_orphans(raw, key())
+    assert front.read([key()]) == {"t": [5, 5]}
+    assert not keys_of(raw, key()) - {"{" + key() + "}:ships"}
+
+
+def test_arrays_of_items_that_a_delete_has_shifted_leave_nothing_when_they_are_replaced(front, key, raw):
+    """The item at [0] bears a name that says [1]."""
+    front.write([key()], {"t": [{"img": A}, {"img": A + 1}, {"img": A + 2}]})
+    front.delete([key(), "t", 0])
+    front.write([key(), "t", 0, "img"], A + 10)
+    assert_no_orphans(raw, key())
+    assert_same(front.read([key()]), {"t": [{"img": A + 10}, {"img": A + 2}]})
+    front.write([key(), "t", 1, "img"], A + 20)
+    front.delete([key(), "t", 0])
+    front.write([key(), "t", 0, "img"], 6)
+    assert_no_orphans(raw, key())
+    front.write([key(), "t", 0], 7)
+    assert_no_orphans(raw, key())
+    assert_same(front.read([key()]), {"t": [7]})
+
+
+def test_an_array_that_an_edit_wrote_anew_leaves_nothing_when_it_is_replaced_by_path(kvs, key, raw):
+    """An edit gives arrays names with a suffix."""
+    kvs[key()] = {"p": {"img": A}}
+    with kvs[key()] as value:
+        value["n"] = 1
+    kvs[key()]["p"]["img"] = 5
+    assert_no_orphans(raw, key())
+    assert kvs[key()].read() == {"p": {"img": 5}, "n": 1}
+
+
+# --- track_schema_changes(False) ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
+def test_a_static_write_after_a_delete_is_registered(open_front, key, raw, space):
+    """The delete has removed the registry's entries with the arrays."""
+    front = open_front(space)
+    front.kvs.track_schema_changes(False)
+    for _ in range(2):
+        front.write([key()], {"img": A, "n": 1})
+        front.write([key()], {"img": A, "n": 1})
+        front.delete([key()])
+        assert_no_orphans(raw, key())
+        front.write([key()], {"img": A, "n": 1})
+        assert_no_orphans(raw, key())
+    front.delete([key()])
+    assert_no_orphans(raw, key())
+    assert not raw.exists(key())
+
+
+@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
+def test_a_refused_static_write_leaves_nothing(open_front, front, key, raw, space):
+    """Somebody else took the parent away."""
+    static = open_front(space)
+    static.kvs.track_schema_changes(False)
+    static.write([key()], {"m": {}})
+    static.write([key(), "m"], {"img": A})
+    front.write([key()], 5)
+    with pytest.raises(reem.PathRefused):
+        static.write([key(), "m"], {"img": A})
+    assert_no_orphans(raw, key())
+    assert front.read([key()]) == 5
+
+
+def test_a_static_write_by_a_ship_that_appends_is_not_doubled(open_front, key):
+    """What was under the ship's key is removed first."""
+    front = open_front(ships=[SetShip()])
+    front.kvs.track_schema_changes(False)
+    for _ in range(3):
+        front.write([key()], {"s": {1, 2}})
+        assert front.read([key()]) == {"s": [1, 2]}
+
+
+# --- rights, numbers, keys ------------------------------------------------------------------------
+
+
+def test_a_client_that_may_not_read_the_document_removes_no_array_of_it(server_url, kvs, key, raw):
+    """Without JSON.GET it cannot know which arrays are still referred to."""
+    name = f"u{secrets.token_hex(4)}"
+    commands = "json.set json.type set sadd srem smembers unlink multi exec watch unwatch hello auth select ping"
+    rules = ["on", ">pw", "~*", "&*", "-@all", "+client|setinfo", *(f"+{word}" for word in commands.split())]
+    raw.execute_command("ACL", "SETUSER", name, *rules)
+    try:
+        kvs[key()] = {"t": [A, A + 1]}
+        parts = urllib.parse.urlsplit(server_url)
+        with reem.RedisInterface(f"redis://{name}:pw@{parts.hostname}:{parts.port}{parts.path}") as limited:
+            reem.KeyValueStore(limited)[key()]["t"][0] = 5
+        assert_same(kvs[key()].read(), {"t": [5, A + 1]})
+        kvs[key()]["t"][0] = 6  # whoever may read cleans up
+        assert_no_orphans(raw, key())
+    finally:
+        raw.execute_command("ACL", "DELUSER", name)
+
+
+@pytest.mark.parametrize("number", [np.uint8(1), np.uint64(1), np.int16(1), np.float32(1)])
+async def test_an_unsigned_number_can_be_subtracted(kvs, akvs, key, number):
+    """numpy has no negative of it."""
+    kvs[key()] = {"n": 10}
+    kvs[key()]["n"] -= number
+    assert await akvs[key()]["n"].read() == 9
+    assert await akvs[key()]["n"].decrement(number) == 8
+
+
+def test_an_accessor_of_another_place_is_refused_and_not_taken_for_the_end_of_an_augmented_assignment(
+    server_url, interface, kvs, pspace, key, raw
+):
+    """Another namespace, another kind of space, another interface, another path."""
+    kvs[key()] = {"x": 1}
+    with (
+        reem.RedisInterface(server_url, namespace=key("other:")) as elsewhere,
+        reem.RedisInterface(server_url) as twin,
+        nothing_sent(raw),
+    ):
+        for space in (reem.KeyValueStore(elsewhere), reem.KeyValueStore(twin), pspace):
+            with pytest.raises(BadType, match="read()"):
+                space[key()] = kvs[key()]
+            with pytest.raises(BadType, match="read()"):
+                space[key()]["x"] = kvs[key()]["x"]
+        with pytest.raises(BadType, match="read()"):
+            kvs[key()]["y"] = kvs[key()]["x"]
+    kvs[key()]["x"] += 1
+    kvs[key()]["x"] *= 3
+    pspace[key()]["x"] += 1
+    same = reem.KeyValueStore(interface)
+    same[key()]["x"] = kvs[key()]["x"]
+    assert kvs[key()].read() == {"x": 7}
+
+
+class Name(str, enum.Enum):
+    """Its str() is "Name.A", what it holds is "aa"."""
+
+    A = "aa"
+
+
+@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
+def test_a_str_enum_is_refused_as_a_key(open_front, key, raw, space):
+    """As an element of a path and as a top-level key: two names for one place would be a trap."""
+    front = open_front(space)
+    front.write([key()], {"aa": 0})
+    with nothing_sent(raw):
+        for path in ([Name.A], [key(), Name.A]):
+            with pytest.raises(BadKey, match="Name"):
+                front.write(path, 1)
+        with pytest.raises(BadKey, match="Name"):
+            front.write([key()], {Name.A: 1})
+
+
+class Tag(str):
+    """Shows itself in brackets."""
+
+    __slots__ = ()
+
+    def __str__(self):
+        return f"<{self[:]}>"
+
+
+def test_a_str_subclass_is_stored_as_what_it_holds(front, key):
+    """Not as what its own __str__ says: as a value, as a key, and in paths."""
+    front.write([Tag(key())], {Tag("k"): Tag("x"), "l": [Tag("y")]})
+    front.write([key(), Tag("m")], Tag("z"))
+    assert_same(front.read([key()]), {"k": "x", "l": ["y"], "m": "z"})
+    assert front.read([Tag(key()), Tag("k")]) == "x"
+
+
+def test_the_empty_path_is_refused_as_a_bad_key(front):
+    """It names no top-level key."""
+    for path in ("", "."):
+        with pytest.raises(BadKey, match="empty"):
+            front.get(path)
+        with pytest.raises(BadKey, match="empty"):
+            front.set(path, 1)
+
+
+# --- connections ----------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def silence():
+    """A server that accepts and never answers; yields its port."""
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen(8)
+        yield listening.getsockname()[1]
+
+
+async def test_a_server_that_accepts_and_never_answers_is_given_up():
+    """In both fronts, for reading and for following."""
+    with silence() as port:
+        start = time.monotonic()
+        direct, followers = reem.RedisInterface("127.0.0.1", port=port), reem.RedisInterface("127.0.0.1", port=port)
+        core = reem_async.RedisInterface("127.0.0.1", port=port)
+        outcomes = await asyncio.wait_for(
+            asyncio.gather(
+                asyncio.to_thread(reem.KeyValueStore(direct)["a"].read),
+                asyncio.to_thread(reem.SilentSubscriber("a", followers).listen),
+                reem_async.KeyValueStore(core)["a"].read(),
+                reem_async.SilentSubscriber("a", core).listen(),
+                return_exceptions=True,
+            ),
+            8.0,
+        )
+        assert time.monotonic() - start < 3.0
+        assert all(isinstance(outcome, NotConnected | ConnectionLost) for outcome in outcomes), outcomes
+        direct.close()
+        followers.close()
+        await core.close()
+
+
+def connections(raw):
+    """The ids of all connections but the one that asks."""
+    return {row["id"] for row in raw.client_list()} - {str(raw.client_id())}
+
+
+async def test_an_edit_works_after_its_connection_was_killed_while_it_lay_idle(server_url, key, raw):
+    """Edits have a connection of their own, which is kept for the next one."""
+    others = connections(raw)
+    async with reem_async.RedisInterface(server_url) as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        await kvs[key()].write({"n": 0})
+        for n in range(1, 4):
+            async with kvs[key()].edit() as value:
+                value["n"] += 1
+            killed = connections(raw) - others
+            for connection in killed:
+                raw.client_kill_filter(_id=connection)
+            await asyncio.sleep(0.05)
+            assert killed, "nothing was kept"
+            assert await kvs[key()]["n"].read() == n
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "redis://user:s3cret@host:notaport/0",
+        "redis://user:s3cret/@host:6379",
+        "redis://user:6379s3cret#@host",
+        "redis://user:s3cret@host:6379/0?db=x",
+        "redis://user:s3cret@[host:6379/0",
+        "http://user:s3cret@host",
+        "redis+tls://user:s3cret@host",
+        "redis://user:s3cret@127.0.0.1:1",
+        "redis://user:s3cret@127.0.0.1:1/0?nonsense=1",
+    ],
+)
+@pytest.mark.parametrize("module", [reem, reem_async])
+async def test_an_error_over_a_url_never_shows_the_password(module, url):
+    """Neither the message nor the traceback that is printed."""
+
+    async def connect():
+        interface = module.RedisInterface(url)
+        try:
+            done = interface.initialize()
+            if done is not None:
+                await done
+        finally:
+            done = interface.close()
+            if done is not None:
+                await done
+
+    with pytest.raises(reem.ReemError) as caught:
+        await connect()
+    lines = traceback.format_exception(caught.value)
+    shown = "".join(line for line in lines if not line.lstrip().startswith("File"))
+    assert "s3cret" not in shown
+    assert "s3cret" not in repr(caught.value)
+
+
+def test_the_older_protocol_is_refused():
+    """Notices and replies share a connection, which only protocol 3 can do."""
+    for module in (reem, reem_async):
+        with pytest.raises(BadValue, match="protocol"):
+            module.RedisInterface("localhost", protocol=2)
+
+
+# --- ships ----------------------------------------------------------------------------------------
+
+
+class Slow(reem_async.SpecialDatatypeShip):
+    """Has to wait for everything."""
+
+    def __init__(self, kind, label):
+        self.kind, self.label = kind, label
+
+    async def check_fit(self, value):
+        await asyncio.sleep(0.001)
+        return isinstance(value, self.kind)
+
+    async def write(self, key, value, client):
+        await asyncio.sleep(0.001)
+        client.set(key, str(value))
+
+    async def read(self, key, client):
+        await asyncio.sleep(0.001)
+        client.get(key)
+
+    async def interpret_read(self, responses):
+        return self.kind(responses[0].decode())
+
+    async def get_label(self):
+        await asyncio.sleep(0.001)
+        return self.label
+
+
+async def test_ships_that_must_be_awaited_may_be_used_by_many_tasks_at_once_from_the_start(server_url, key):
+    """Each is asked for its label while others use it already."""
+
+    class Text(str):
+        __slots__ = ()
+
+    class Other(complex):
+        pass
+
+    ships = [Slow(Other, "other"), Slow(Text, "tag"), Slow(complex, "complex")]
+    interface = reem_async.RedisInterface(server_url, ships=ships)
+    kvs = reem_async.KeyValueStore(interface)
+
+    async def use(number):
+        await asyncio.sleep(number * 0.0007)
+        await kvs[key(str(number))].write([1j * number, 2j])
+        return await kvs[key(str(number))].read()
+
+    try:
+        assert await asyncio.gather(*map(use, range(12))) == [[1j * number, 2j] for number in range(12)]
+    finally:
+        await interface.close()
+
+
+class Zipped(reem.NumpyShip):
+    """Overrides how a NumpyShip writes and reads, not what it packs."""
+
+    def get_label(self):
+        return "zip"
+
+    def write(self, key, value, client):
+        client.set(key, zlib.compress(b"".join(self.pack(value))))
+
+    def interpret_read(self, responses):
+        return self.unpack(zlib.decompress(responses[0]))
+
+
+def test_a_subclass_of_a_blob_ship_may_override_how_it_writes_and_reads(open_front, key, raw):
+    """What it wrote is there, mirrors see it too, and what its methods raise is BadData with the path."""
+    front = open_front(ships=[Zipped()])
+    front.write([key()], {"img": A, "l": [A + 1]})
+    assert_same(front.read([key()]), {"img": A, "l": [A + 1]})
+    assert_no_orphans(raw, key())
+    raw.set("{" + key() + "}.img", "no zip")
+    with pytest.raises(BadData, match=rf"{key()}\.img.*zip"):
+        front.read([key()])
+
+
+@pytest.mark.parametrize("ship", [None, Zipped(), SetShip()])
+def test_a_foreign_type_under_a_ships_key_is_bad_data_with_the_path(open_front, key, raw, ship):
+    """It is not a wrong kind of the document, which is fine."""
+    front = open_front(ships=[ship] if ship else None)
+    front.write([key()], {"d": {"v": {1, 2} if isinstance(ship, SetShip) else A}})
+    raw.unlink("{" + key() + "}.d.v")
+    raw.hset("{" + key() + "}.d.v", "x", 1)
+    with pytest.raises(BadData, match=rf"{key()}\.d\.v"):
+        front.read([key()])
+    front.write([key(), "d", "v"], 5)
+    assert_no_orphans(raw, key())
