@@ -59,11 +59,12 @@ class Hub:
             async with self._lock:
                 if ready.done():
                     ready.result()
+                # Entered before the server confirms: a notice right behind the confirmation must find somebody.
+                self._channels.setdefault(channel, weakref.WeakSet()).add(follower)
                 wire = await self._connected()
                 if channel not in self._subscribed:
                     await _subscribe(wire, [channel])
                     self._subscribed.add(channel)
-                self._channels.setdefault(channel, weakref.WeakSet()).add(follower)
                 follower.start(wire, "initial")
             await ready
         except BaseException as error:

@@ -407,7 +407,7 @@ class Zipped(reem.NumpyShip):
 
 
 def test_a_subclass_of_a_blob_ship_may_override_how_it_writes_and_reads(open_front, key, raw):
-    """What it wrote is there, mirrors see it too, and what its methods raise is BadData with the path."""
+    """What it wrote is there, and what its methods raise is BadData with the path."""
     front = open_front(ships=[Zipped()])
     front.write([key()], {"img": A, "l": [A + 1]})
     assert_same(front.read([key()]), {"img": A, "l": [A + 1]})
