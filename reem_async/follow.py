@@ -74,7 +74,9 @@ class Follower:
 
     Attributes:
         keys: The top-level key's names.
-        path: What is followed, below the top-level key.
+        path: What is kept, below the top-level key: what is followed, up to the first index that counts
+            from the end (the server takes one that is too negative for the first item).
+        rest: What is followed below `path`.
         tree: The local copy, never changed in place.
         mailboxes: Where each update goes.
         ready: Done when the first snapshot is there.
@@ -82,7 +84,8 @@ class Follower:
 
     def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, transport: Transport) -> None:
         self.keys = keys
-        self.path = path
+        end = next((place for place, key in enumerate(path) if isinstance(key, int) and key < 0), len(path))
+        self.path, self.rest = path[:end], path[end:]
         self.tree: Any = MISSING
         self.mailboxes: list[Mailbox] = []
         self.ready: asyncio.Future[None] | None = None
@@ -149,12 +152,14 @@ class Follower:
         return "next" if last is None or notice.sequence == last + 1 else "gap"
 
     def _apply(self, notice: Notice, *, gap: bool) -> None:
+        before = self.at()
         try:
             self.tree = _applied(self.tree, notice, self.path)
         except CannotApply:  # the server has refused it too, or this copy is behind: look
             self._fetch(notice)
             return
-        self._emit(notice, gap)
+        if not self.rest or self.at() is not before:  # what did not change is shared with the old tree
+            self._emit(notice, gap)
 
     def _fetch(self, notice: Notice) -> None:
         self._covered.append(notice)
@@ -281,7 +286,7 @@ class Follower:
         kind, self._kind = ("gap" if self._behind and not self._kind else self._kind), ""
         self.tree = tree
         self._reading, self._settling, self._behind = 0, False, False
-        if kind == "gap" or (kind == "initial" and tree is not MISSING):
+        if kind == "gap" or (kind == "initial" and self.at() is not MISSING):
             self._emit_snapshot(initial=kind == "initial")
         if not kind:
             self._emit_covered(covered)
@@ -304,18 +309,23 @@ class Follower:
     def _emit_snapshot(self, *, initial: bool) -> None:
         for mailbox in self.mailboxes:
             data, value = self.value(), self.value()
-            mailbox.put(Update(show((self.keys.name, *self.path)), data, value, initial=initial, gap=not initial))
+            path = show((self.keys.name, *self.path, *self.rest))
+            mailbox.put(Update(path, data, value, initial=initial, gap=not initial))
 
     def _emit(self, notice: Notice, gap: bool) -> None:
         path = show((self.keys.name, *notice.path))
         for mailbox in self.mailboxes:
-            value = self.value(notice.path[len(self.path) :])
+            value = self.value(() if self.rest else notice.path[len(self.path) :])
             mailbox.put(Update(path, self.value(), value, False, notice.time, notice.publisher, notice.sequence, gap))
 
     def value(self, inner: Path = ()) -> Any:
-        """Return a copy of what is at `inner` below the followed path, None if nothing is. Any thread may."""
-        found = get(self.tree, inner)
+        """Return a copy of what is at `inner` below what is followed, None if nothing is. Any thread may."""
+        found = self.at(inner)
         return None if found is MISSING else copied(found)
+
+    def at(self, inner: Path = ()) -> Any:
+        """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
+        return get(self.tree, (*self.rest, *inner))
 
 
 def _concerns(notice: Notice, followed: Path) -> bool:

@@ -149,9 +149,11 @@ class Hub:
         """Connect, subscribe, and have every follower take a snapshot; tries until it works."""
         pause = 0.05
         try:
-            while not self._closed and any(self._channels.values()) and (self._wire is None or not self._wire.alive):
+            while self._is_wanted():
                 await asyncio.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - only spreads the load
                 pause = min(pause * 2, 1.0)
+                if not self._is_wanted():
+                    return
                 try:
                     async with self._lock:
                         await self._connected()
@@ -161,6 +163,11 @@ class Hub:
                     return
         finally:
             self._reconnecting = None
+
+    def _is_wanted(self) -> bool:
+        """Return whether somebody follows and the connection is gone."""
+        followed = any(self._channels.values()) and not self._closed
+        return followed and (self._wire is None or not self._wire.alive)
 
     async def close(self) -> None:
         """End all followers and the connection. Idempotent."""

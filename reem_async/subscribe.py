@@ -17,7 +17,7 @@ from .follow import Follower, Update
 from .hub import Hub
 from .plan.keys import Keys
 from .plan.paths import Path, check_element, parse, show
-from .plan.trees import MISSING, copied, get
+from .plan.trees import MISSING, copied
 from .policy import EMPTY, Ended, Last, Mailbox, Newest, Policy
 from .session import Session
 
@@ -245,7 +245,7 @@ class LocalAccessor:
             MissingKey: Nothing is here.
         """
         follower = self._subscriber._link.follower
-        found = MISSING if follower is None else get(follower.tree, self._path)
+        found = MISSING if follower is None else follower.at(self._path)
         if found is MISSING:
             what = show((self._subscriber.channel, *self._path))
             raise MissingKey(
