@@ -85,6 +85,8 @@ class Accessor:
     async def write(self, value: Any) -> None:
         """Store `value` here, in place of what was here. One round trip.
 
+        Three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
+
         Raises:
             BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
             PathRefused: The parent is missing or cannot hold this element; nothing was stored.
