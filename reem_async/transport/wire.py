@@ -88,11 +88,6 @@ class Wire(asyncio.BufferedProtocol):
         """Whether commands can be sent."""
         return self._reason is None and self._transport is not None and not self._transport.is_closing()
 
-    @property
-    def idle(self) -> bool:
-        """Whether nobody waits for a reply."""
-        return not self._due
-
     def send(self, commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]) -> None:
         """Send `commands`; `done` is called with their replies, in order with pushed messages, or with an error."""
         if not commands:
