@@ -96,6 +96,10 @@ class KeyValueStore:
         """Return the value at a dotted path."""
         return self.interface._run(self._core.get(path, default))
 
+    def keys(self, pattern: str = "*") -> list[str]:
+        """Return the top-level keys, sorted."""
+        return self.interface._run(self._core.keys(pattern))
+
     def set(self, path: str, value: Any) -> None:
         """Store `value` at a dotted path."""
         self.interface._run(self._core.set(path, value))

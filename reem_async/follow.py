@@ -20,6 +20,7 @@ from typing import Any
 
 from .background import in_background
 from .errors import MissingKey
+from .hub import Topic
 from .plan import Plan, Reply, unwrap, wire_commands
 from .plan.keys import Keys
 from .plan.memory import Memory
@@ -74,6 +75,7 @@ class Follower:
 
     Attributes:
         keys: The top-level key's names.
+        topic: What it subscribes to.
         path: What is kept, below the top-level key: what is followed, up to the first index that counts
             from the end (the server takes one that is too negative for the first item).
         rest: What is followed below `path`.
@@ -84,6 +86,7 @@ class Follower:
 
     def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, transport: Transport) -> None:
         self.keys = keys
+        self.topic = Topic(keys.channel.encode())
         end = next((place for place, key in enumerate(path) if isinstance(key, int) and key < 0), len(path))
         self.path, self.rest = path[:end], path[end:]
         self.tree: Any = MISSING
@@ -123,7 +126,7 @@ class Follower:
         if self._wire is not None and not self._reading:
             self._read()
 
-    def on_notice(self, notice: Notice) -> None:
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Apply one update, or note that a snapshot on its way has it."""
         self._take(notice, self._count(notice))
 

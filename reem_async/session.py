@@ -79,7 +79,7 @@ class Session:
             from .hub import Hub
 
             assert isinstance(self.transport, AsyncTransport)
-            self._hub = Hub(self.transport, self.ships, self.memory)
+            self._hub = Hub(self.transport, self.ships)
         return self._hub
 
     def keys(self, name: object) -> Keys:

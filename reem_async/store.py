@@ -115,6 +115,16 @@ class KeyValueStore:
                 raise
             return default
 
+    async def keys(self, pattern: str = "*") -> list[str]:
+        """Return the top-level keys, sorted; with a pattern, those it names (`*` and `?` stand for others).
+
+        One round trip for about 1000 keys of the server. Not atomic: a key that is written or deleted
+        meanwhile may or may not be among them.
+        """
+        from .catalog import names
+
+        return sorted([name async for name in names(self.interface, pattern)])
+
     async def set(self, path: str, value: Any) -> None:
         """Store `value` at a dotted path; see `Accessor.write`."""
         await self.at(path).write(value)

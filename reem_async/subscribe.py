@@ -18,8 +18,9 @@ from .hub import Hub
 from .plan.keys import Keys
 from .plan.paths import Path, check_element, parse, show
 from .plan.trees import MISSING, copied
-from .policy import EMPTY, Ended, Last, Mailbox, Newest, Policy
+from .policy import Last, Mailbox, Newest, Policy
 from .session import Session
+from .stream import Stream
 
 __all__ = ["CallbackSubscriber", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
 
@@ -49,7 +50,8 @@ class _Link:
         assert self._following is not None
         async with self._following:
             if self.follower is None:
-                self.follower = hub.follower(self._keys, self._path)
+                session = self._session
+                self.follower = Follower(self._keys, self._path, session.ships, session.memory, session.transport)
                 self.follower.mailboxes = self._mailboxes
                 try:
                     await hub.follow(self.follower)
@@ -64,7 +66,7 @@ class _Link:
             await self._hub.unfollow(self.follower)
 
 
-class Watch:
+class Watch(Stream[Update]):
     """Follows one path and yields its updates, one by one: an (async) iterator.
 
     Follows from the first `async for` or `async with` on. The first update is the value that is
@@ -79,20 +81,12 @@ class Watch:
     """
 
     def __init__(self, session: Session, keys: Keys, path: Path, policy: Policy) -> None:
-        self.mailbox = Mailbox(policy)
-        self._closed = False
+        super().__init__(policy)
         self._link = _Link(session, keys, path, [self.mailbox])
-        self._waiter: asyncio.Future[None] | None = None
 
     @property
     def _following(self) -> bool:
-        """Whether it follows, or did until it was closed."""
         return self._link.follower is not None or self._closed
-
-    @property
-    def dropped(self) -> int:
-        """How many updates were skipped since they were not taken in time."""
-        return self.mailbox.dropped
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; two round trips."""
@@ -100,50 +94,8 @@ class Watch:
 
     async def close(self) -> None:
         """Stop following and end the loop. Idempotent."""
-        self._closed = True
-        self.mailbox.close()
+        await super().close()
         await self._link.unfollow()
-
-    aclose = close
-
-    def __aiter__(self) -> Self:
-        return self
-
-    async def __anext__(self) -> Update:
-        if not self._following:
-            await self.listen()
-        while True:
-            try:
-                update = self.mailbox.take()
-            except Ended:
-                raise StopAsyncIteration from None
-            if update is not EMPTY:
-                return update  # type: ignore[no-any-return]
-            await self._changed()
-
-    async def _changed(self) -> None:
-        """Wait until something was put into the mailbox."""
-        if self._waiter is not None:
-            raise BadType("two tasks take updates from one subscription; make one for each")
-        self._waiter = asyncio.get_running_loop().create_future()
-        self.mailbox.wake = self._wake
-        try:
-            await self._waiter
-        finally:
-            self._waiter = None
-
-    def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
-
-    async def __aenter__(self) -> Self:
-        await self.listen()
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self.close()
 
 
 class SilentSubscriber:

@@ -40,6 +40,7 @@ class Notice(NamedTuple):
         path: What was updated, below the top-level key.
         deleted: It was removed.
         value: The value, or ANNOUNCED.
+        size: Bytes of the value, document text and arrays; 0 where only the server knows (arithmetic).
     """
 
     publisher: str
@@ -48,6 +49,7 @@ class Notice(NamedTuple):
     path: Path
     deleted: bool
     value: Any
+    size: int = 0
 
 
 def published(keys: Keys, publisher: str, sequence: int, payload: bytes) -> list[Command]:
@@ -59,24 +61,24 @@ def published(keys: Keys, publisher: str, sequence: int, payload: bytes) -> list
     return [("SET", keys.last, f"{publisher} {sequence}", "EX", 60), ("PUBLISH", keys.channel, payload)]
 
 
-def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False) -> bytes:
-    """Return a notice without the value."""
-    return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], 0)
+def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:
+    """Return a notice without the value, which has `size` bytes."""
+    return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], size)
 
 
 def with_value(publisher: str, sequence: int, time: float, path: Path, text: bytes, loaded: Sequence[Loaded]) -> bytes:
     """Return a notice with the value if it is small and made of bytes, else without."""
-    if any(each.blob is None for each in loaded):
-        return announce(publisher, sequence, time, path)
-    blobs = [b"".join(each.blob) for each in loaded if each.blob is not None and _size(each.blob) <= LARGEST_INLINE]
-    if len(blobs) < len(loaded) or len(text) + sum(map(len, blobs)) > LARGEST_INLINE:
-        return announce(publisher, sequence, time, path)
+    size = len(text) + sum([_size(each) for each in loaded])
+    if size > LARGEST_INLINE or any(each.blob is None for each in loaded):
+        return announce(publisher, sequence, time, path, size=size)
+    blobs = [b"".join(each.blob or ()) for each in loaded]
     parts = [[each.label, each.suffix, len(blob)] for each, blob in zip(loaded, blobs, strict=True)]
     return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
 
 
-def _size(blob: Sequence[Any]) -> int:
-    return sum(len(piece) for piece in blob)
+def _size(it: Loaded) -> int:
+    """Return the bytes a ship sends, as far as it works with bytes."""
+    return sum([len(piece) for piece in it.blob or ()])
 
 
 def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
@@ -98,7 +100,8 @@ def decode(payload: bytes, ships: Ships) -> Notice:
     value: Any = ANNOUNCED
     if kind == "set":
         value = _value(payload, end + 1, size, parts, ships)
-    return Notice(publisher, sequence, float(time), tuple(path), kind == "delete", value)
+        size = len(payload) - end - 1
+    return Notice(publisher, sequence, float(time), tuple(path), kind == "delete", value, size)
 
 
 def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, kind: Any, size: Any, parts: Any) -> None:

@@ -25,7 +25,7 @@ from .parsing import MORE, LargeReader, Reader, SmallReader
 __all__ = ["Wire", "open_wire"]
 
 _NOTHING_SENT = float("inf")
-_CONFIRMATIONS = (b"subscribe", b"unsubscribe")
+_CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe")
 
 
 class _Due:
