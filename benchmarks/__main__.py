@@ -10,7 +10,7 @@ import redis
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import environment, figures, report, results, targets
+from . import environment, figures, page, report, results, targets
 from .measure import Bench, Case
 from .process import Workers
 from .results import Results
@@ -110,6 +110,7 @@ def main() -> None:
     if options.draw:
         found = Results.load(results.FULL)
         figures.draw_all(found, FIGURES)
+        page.rewrite(found)
         report.show(found, console, options.all)
         return
     cases = chosen(options.only, options.quick)
@@ -120,6 +121,8 @@ def main() -> None:
     path, folder = places(found.mode)
     found.save(path)
     figures.draw_all(found, folder)
+    if found.mode == "full":
+        page.rewrite(found)
     report.show(found, console, options.all or bool(options.only))
     console.print(f"kept in {path} and {folder}", highlight=False)
 

@@ -20,6 +20,7 @@ CONTENDERS = {
     "reem": Contender("REEM, blocking", "reem_blocking", "#0b5fa5"),
     "async": Contender("REEM, asyncio", "reem_asyncio", "#19a0a0"),
     "reem-unix": Contender("REEM, blocking, unix socket", "reem_blocking", "#6fa8dc", unix_socket=True),
+    "reem-static": Contender("REEM, blocking, static schema", "reem_static", "#2f3f8f"),
     "async-unix": Contender("REEM, asyncio, unix socket", "reem_asyncio", "#8fd6d6", unix_socket=True),
     "async-uvloop": Contender("REEM, asyncio on uvloop", "reem_asyncio", "#0e7a5f", loop="uvloop"),
     "original": Contender(

@@ -60,6 +60,9 @@ def strings_and_arrays(grown: Grown) -> list[Case]:
         cases += _both(f"strings.{count}", DOCUMENTS, {"kind": "strings", "count": count})
     for count in grown(ARRAYS):
         cases += _both(f"arrays.{count}", (*FRONTS, "original"), {"kind": "arrays", "count": count})
+    both = ("reem", "reem-static")
+    cases.append(CallCase("static.small", both, operation="set", value={"kind": "small"}, count=4000, limit=1.0))
+    cases.append(CallCase("static.arrays", both, operation="set", value={"kind": "arrays", "count": 10}))
     return cases
 
 

@@ -104,6 +104,12 @@ _EITHER = [
 ]
 
 
+_STATIC = [
+    Row(f"static schema, set of {text} / tracked", (case, "reem-static"), (case, "reem"), 1.0, 0.95)
+    for text, case in (("a small dict", "static.small"), ("10 arrays", "static.arrays"))
+]
+
+
 def rows() -> list[Row]:
     """Every row, in the order of the specification."""
     found = _small()
@@ -112,6 +118,7 @@ def rows() -> list[Row]:
             Row(f"{front}: {text} / {theirs}", (case, ours), (case, theirs), must, hope)
             for front, ours in FRONTS.items()
         ]
+    found += _STATIC
     found.append(
         Row(
             "100 concurrent async reads, throughput / redis.asyncio",
@@ -145,3 +152,15 @@ def rows() -> list[Row]:
         ),
     ]
     return found
+
+
+_BARE = {"original": "redis-py", "pottery": "redis-py", "zenoh": "redis-py", "redis-asyncio": "redis-asyncio-uvloop"}
+
+
+def bare(row: Row) -> Row | None:
+    """Return the row with a client in REEM's place that only moves the bytes; None where that says nothing."""
+    client = "redis-py" if row.theirs[1] == row.ours[1] else _BARE.get(row.theirs[1])
+    if client is None or row.throughput or row.ours[0] == "import" or "static" in row.ours[0]:
+        return None
+    theirs = (row.theirs[0], client) if row.theirs[1] == row.ours[1] else row.theirs
+    return dataclasses.replace(row, ours=(row.ours[0], client), theirs=theirs)

@@ -9,10 +9,16 @@ from typing import Any, Self
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport import Transport
-from .transport.aio import AsyncTransport
 from .transport.options import Options
 
 __all__ = ["RedisInterface"]
+
+
+def _on_event_loop(options: Options) -> Transport:
+    """Return a transport for event loops; imported here, so that blocking programs start without it."""
+    from .transport.aio import AsyncTransport
+
+    return AsyncTransport(options)
 
 
 class RedisInterface:
@@ -33,7 +39,7 @@ class RedisInterface:
         BadType, BadValue: An option or URL that means nothing.
     """
 
-    _new_transport: Callable[[Options], Transport] = AsyncTransport
+    _new_transport: Callable[[Options], Transport] = staticmethod(_on_event_loop)
 
     def __init__(
         self,

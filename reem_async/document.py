@@ -5,13 +5,12 @@ from __future__ import annotations
 import inspect
 import secrets
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .errors import BadType, MissingKey, PathRefused
 from .plan import Command
-from .plan.arithmetic import Operation, calculate, compute
 from .plan.documents import Encoded, Parcel, encode, number_text
 from .plan.paths import Path, counts_from_end, show, suffix
 from .plan.reads import Sealed, interpret, length, read, type_of
@@ -25,6 +24,9 @@ from .plan.writes import (
     set_change,
 )
 from .session import Session
+
+if TYPE_CHECKING:
+    from .plan.arithmetic import Operation
 
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
 
@@ -163,6 +165,8 @@ class DocumentWriter:
 
     async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
         """Apply a JSON arithmetic command; returns the new number."""
+        from .plan.arithmetic import calculate
+
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
         text = number_text(operand, (self.name, *path))
@@ -174,6 +178,8 @@ class DocumentWriter:
 
     async def compute(self, path: Path, function: Any) -> Any:
         """Replace the number at `path` by a function of it; returns the new number."""
+        from .plan.arithmetic import compute
+
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
         return await self._run(path, lambda notices: compute(self.keys, path, function, notices))

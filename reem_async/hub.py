@@ -66,6 +66,31 @@ class Listener(Protocol):
         """Take one update."""
 
 
+class _Audience:
+    """Who listens to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
+
+    __slots__ = ("_references",)
+
+    def __init__(self) -> None:
+        self._references: list[weakref.ref[Listener]] = []
+
+    def add(self, listener: Listener) -> None:
+        if listener not in self.present():
+            self._references.append(weakref.ref(listener, self._references.remove))
+
+    def discard(self, listener: Listener) -> None:
+        for reference in tuple(self._references):
+            if reference() is listener:
+                self._references.remove(reference)
+
+    def present(self) -> list[Listener]:
+        # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
+        return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
+
+
+_NOBODY = _Audience()
+
+
 class Hub:
     """The one subscription connection of an interface in one event loop, and who listens, by topic.
 
@@ -77,7 +102,7 @@ class Hub:
         self._transport = transport
         self._ships = ships
         self._wire: Wire | None = None
-        self._topics: dict[Topic, weakref.WeakSet[Listener]] = {}
+        self._topics: dict[Topic, _Audience] = {}
         self._subscribed: set[Topic] = set()
         self._lock = asyncio.Lock()
         self._reconnecting: asyncio.Task[Any] | None = None
@@ -95,7 +120,7 @@ class Hub:
                 if ready.done():
                     ready.result()
                 # Entered before the server confirms: a notice right behind the confirmation must find somebody.
-                self._topics.setdefault(listener.topic, weakref.WeakSet()).add(listener)
+                self._topics.setdefault(listener.topic, _Audience()).add(listener)
                 wire = await self._connected()
                 if listener.topic not in self._subscribed:
                     await _subscribe(wire, [listener.topic])
@@ -120,7 +145,7 @@ class Hub:
             return self._wire
         wire = await self._transport.listen(self._on_push, self._on_lost)
         try:
-            topics = [topic for topic, listeners in self._topics.items() if listeners]
+            topics = [topic for topic, audience in self._topics.items() if audience.present()]
             await _subscribe(wire, topics)
         except BaseException:
             await wire.close()
@@ -131,7 +156,7 @@ class Hub:
         return wire
 
     def _listeners(self) -> list[Listener]:
-        return [listener for listeners in self._topics.values() for listener in listeners]
+        return [listener for audience in list(self._topics.values()) for listener in audience.present()]
 
     async def unfollow(self, listener: Listener) -> None:
         """Stop following. Idempotent."""
@@ -141,22 +166,24 @@ class Hub:
 
     def _drop(self, listener: Listener) -> None:
         listener.lost(InterfaceClosed("this subscription was closed before it began"))
-        if listener in self._topics.get(listener.topic, ()):
-            self._topics[listener.topic].discard(listener)
+        audience = self._topics.get(listener.topic, _NOBODY)
+        if listener in audience.present():
+            audience.discard(listener)
             self._forget_if_empty(listener.topic)
 
     def _forget_if_empty(self, topic: Topic) -> None:
-        if not self._topics.get(topic):
+        if not self._topics.get(topic, _NOBODY).present():
             self._topics.pop(topic, None)
             self._subscribed.discard(topic)
             if self._wire is not None and self._wire.alive:
                 self._wire.send([(f"{topic.prefix}UNSUBSCRIBE", topic.name)], lambda _: None)
 
     def _on_push(self, message: list[Any]) -> None:
-        topic, channel, payload = Topic(message[1], message[0] == b"pmessage"), message[-2], message[-1]
-        listeners = list(self._topics.get(topic, ()))
+        topic: Any = (message[1], message[0] == b"pmessage")  # equal to a Topic, and cheaper to make
+        channel, payload = message[-2:]
+        listeners = self._topics.get(topic, _NOBODY).present()
         if not listeners:  # all were dropped without closing
-            self._forget_if_empty(topic)
+            self._forget_if_empty(Topic(*topic))
             return
         try:
             notice = decode(payload, self._ships)
@@ -204,7 +231,7 @@ class Hub:
 
     def _is_wanted(self) -> bool:
         """Return whether somebody follows and the connection is gone."""
-        followed = any(self._topics.values()) and not self._closed
+        followed = bool(self._listeners()) and not self._closed
         return followed and (self._wire is None or not self._wire.alive)
 
     async def close(self) -> None:

@@ -7,7 +7,7 @@ import os
 import secrets
 from collections.abc import Callable, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from .errors import BadType, NoJsonSupport, WrongKind
 from .plan import Plan
@@ -18,12 +18,12 @@ from .plan.replies import no_json
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive
-from .transport.aio import AsyncTransport
 from .transport.options import Options
 from .transport.recorder import CommandRecorder
 
 if TYPE_CHECKING:
     from .hub import Hub
+    from .transport.aio import AsyncTransport
 
 __all__ = ["Session"]
 
@@ -78,8 +78,7 @@ class Session:
         if self._hub is None or self._hub.place != place:
             from .hub import Hub
 
-            assert isinstance(self.transport, AsyncTransport)
-            self._hub = Hub(self.transport, self.ships)
+            self._hub = Hub(cast("AsyncTransport", self.transport), self.ships)
         return self._hub
 
     def keys(self, name: object) -> Keys:
