@@ -9,6 +9,7 @@ image = kvs["foo"]["image"].read()
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
 
 from .connection import RedisInterface
@@ -102,10 +103,12 @@ __all__ = [
     "ServerMissing",
     "SilentSubscriber",
     "SpecialDatatypeShip",
+    "StateChange",
     "TooDeep",
     "Update",
     "WriteOnly",
     "Writer",
     "WrongKind",
     "WrongLoop",
+    "timeout",
 ]

@@ -6,13 +6,15 @@ import contextlib
 import os
 import threading
 import weakref
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import reem_async
 from reem_async.connection import rebuilt
+from reem_async.policy import Ended
 from reem_async.ships.base import SpecialDatatypeShip
+from reem_async.state import State, StateChange, StateChanges
 from reem_async.transport.blocking import BlockingTransport
 
 from ._portal import Portal, finish
@@ -49,7 +51,9 @@ class _Background:
             self._direct.session.transport.check()
             if self._made is None or self._made[0] != os.getpid():  # threads do not survive a fork
                 host, ships, settings = self._direct._given
-                self._made = os.getpid(), Portal("reem-loop"), reem_async.RedisInterface(host, ships, **settings)
+                interface = reem_async.RedisInterface(host, ships, **settings)
+                interface.session.transport.states = self._direct.session.transport.states
+                self._made = os.getpid(), Portal("reem-loop"), interface
             return self._made[1:]
 
     def close(self) -> None:
@@ -63,6 +67,22 @@ class _Background:
                 with contextlib.suppress(TimeoutError):
                     portal.call(interface.close(), timeout=1.0)
             portal.stop()
+
+
+class StateIterator:
+    """Yields the state of an interface as it is, then each change; ends when the interface is closed."""
+
+    def __init__(self, changes: StateChanges) -> None:
+        self._core = changes
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> StateChange:
+        try:
+            return self._core.mailbox.take_waiting()  # type: ignore[no-any-return]
+        except Ended:
+            raise StopIteration from None
 
 
 @documented_by(reem_async.RedisInterface)
@@ -79,7 +99,8 @@ class RedisInterface:
         ships: What carries values that are not JSON, first fit first; replaces the default list of
             `NumpyShip` and `BytesShip`.
         namespace: Goes before every key and channel, so that several robots can share a server.
-        timeout: Seconds without a byte received after which a call is given up.
+        timeout: Seconds without a byte moving after which a call is given up; `reem.timeout` sets another
+            limit for some calls.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ...
 
     Raises:
@@ -109,6 +130,19 @@ class RedisInterface:
     def namespace(self) -> str:
         """What goes before every key and channel."""
         return self._direct.namespace
+
+    @property
+    def state(self) -> State:
+        """What is known of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed"."""
+        return self._direct.state
+
+    def states(self) -> StateIterator:
+        """Return an iterator over the state and its changes."""
+        return StateIterator(self._direct.states())
+
+    def on_state(self, callback: Callable[[StateChange], object]) -> None:
+        """Call `callback` with each change of the state."""
+        self._direct.on_state(callback)
 
     @property
     def _core(self) -> reem_async.RedisInterface:

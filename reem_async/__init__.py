@@ -37,7 +37,9 @@ from .errors import (
     WrongLoop,
 )
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+from .state import StateChange
 from .store import KeyValueStore, Reader, Writer
+from .transport.patience import timeout
 
 __version__ = "1.0.0"
 
@@ -101,10 +103,12 @@ __all__ = [
     "ServerMissing",
     "SilentSubscriber",
     "SpecialDatatypeShip",
+    "StateChange",
     "TooDeep",
     "Update",
     "WriteOnly",
     "Writer",
     "WrongKind",
     "WrongLoop",
+    "timeout",
 ]

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from .session import Session
 from .ships.base import SpecialDatatypeShip
+from .state import State, StateChange, StateChanges
 from .transport import Transport
 from .transport.options import Options
 
@@ -32,7 +33,8 @@ class RedisInterface:
         ships: What carries values that are not JSON, first fit first; replaces the default list of
             `NumpyShip` and `BytesShip`.
         namespace: Goes before every key and channel, so that several robots can share a server.
-        timeout: Seconds without a byte received after which a call is given up.
+        timeout: Seconds without a byte moving after which a call is given up; `reem_async.timeout` sets
+            another limit for some calls.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ...
 
     Raises:
@@ -64,6 +66,29 @@ class RedisInterface:
     def namespace(self) -> str:
         """What goes before every key and channel."""
         return self.session.namespace
+
+    @property
+    def state(self) -> State:
+        """What is known of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed".
+
+        Nothing is sent. A connection that broke is made again by the next call ("lost"),
+        or by itself where somebody follows updates ("reconnecting", for ever, with growing pauses up to 1 s).
+        """
+        return self.session.transport.states.last.state
+
+    def states(self) -> StateChanges:
+        """Return an async iterator over the state as it is and each change; it ends when this is closed.
+
+        A `StateChange` says why, when, and whether the server is another process than before (restarted).
+        """
+        return self.session.transport.states.changes()
+
+    def on_state(self, callback: Callable[[StateChange], object]) -> None:
+        """Call `callback` with each `StateChange` from now on.
+
+        It runs where the change is noticed and must not block; what it raises is logged.
+        """
+        self.session.transport.states.call(callback)
 
     async def initialize(self) -> None:
         """Connect now, and check that the server has RedisJSON. Optional; one round trip, idempotent.

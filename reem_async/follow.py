@@ -29,6 +29,7 @@ from .plan.paths import Path, show
 from .plan.reads import Sealed, interpret, read
 from .plan.trees import MISSING, CannotApply, copied, get, removed, replaced
 from .policy import Mailbox
+from .sequences import Sequences
 from .ships.registry import Ships
 from .transport import Transport
 from .transport.wire import Wire
@@ -36,8 +37,6 @@ from .transport.wire import Wire
 __all__ = ["Follower", "Update"]
 
 logger = logging.getLogger("reem.subscribe")
-
-_MOST_PUBLISHERS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +55,7 @@ class Update:
         publisher: The id of the interface that published it; None likewise.
         sequence: Its number among this publisher's updates of the top-level key; None likewise.
         gap: Updates were lost between this one and the last: a connection broke, or one was unreadable.
+        missed: How many were lost, None if that is not known.
     """
 
     path: str
@@ -66,6 +66,7 @@ class Update:
     publisher: str | None = None
     sequence: int | None = None
     gap: bool = False
+    missed: int | None = 0
 
 
 class Follower:
@@ -76,6 +77,7 @@ class Follower:
     Attributes:
         keys: The top-level key's names.
         topic: What it subscribes to.
+        note: Where the server keeps a note of the last update.
         path: What is kept, below the top-level key: what is followed, up to the first index that counts
             from the end (the server takes one that is too negative for the first item).
         rest: What is followed below `path`.
@@ -87,6 +89,7 @@ class Follower:
     def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, transport: Transport) -> None:
         self.keys = keys
         self.topic = Topic(keys.channel.encode())
+        self.note: str | None = keys.last
         end = next((place for place, key in enumerate(path) if isinstance(key, int) and key < 0), len(path))
         self.path, self.rest = path[:end], path[end:]
         self.tree: Any = MISSING
@@ -103,12 +106,13 @@ class Follower:
         self._covered: list[Notice] = []  # arrived while a snapshot was on its way: it has them
         self._doubtful: list[Notice] = []  # arrived while a large one was: it has the first of them
         self._later: list[tuple[Notice, str]] = []  # arrived after a snapshot that ships are still opening
-        self._sequences: dict[str, int] = {}
+        self._heard = Sequences()
         self._kind = "initial"
 
     def start(self, wire: Wire, kind: str) -> None:
         """Take a snapshot over `wire`; `kind` is "initial", or "gap" after a broken connection."""
         self._wire, self._kind = wire, kind
+        self._heard.begin(broken=kind == "gap")
         self._covered.clear()
         self._doubtful.clear()
         self._later.clear()
@@ -122,13 +126,20 @@ class Follower:
 
     def doubt(self) -> None:
         """Take a snapshot: something was published that could not be read."""
+        self._heard.lose(None)
         self._behind = True
         if self._wire is not None and not self._reading:
             self._read()
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Apply one update, or note that a snapshot on its way has it."""
-        self._take(notice, self._count(notice))
+        self._take(notice, self._heard.count(notice.publisher, notice.sequence))
+
+    def on_note(self, note: bytes | None) -> None:
+        """Compare with the server's note of the last update, asked for in order with notices."""
+        if self._wire is not None and not self._reading and not self._settling and self._heard.lacks(note):
+            self._behind = True
+            self._read()
 
     def _take(self, notice: Notice, order: str) -> None:
         if order == "again" or self._wire is None:
@@ -142,19 +153,9 @@ class Follower:
         elif self._behind or order == "late" or not _is_whole(notice, self.path, self.tree):
             self._fetch(notice)
         else:
-            self._apply(notice, gap=order == "gap")
+            self._apply(notice)
 
-    def _count(self, notice: Notice) -> str:
-        """Return "next", "gap" if updates of this publisher are missing, "late" or "again" for a past one."""
-        last = self._sequences.get(notice.publisher)
-        if last is not None and notice.sequence <= last:
-            return "again" if notice.sequence == last else "late"
-        if len(self._sequences) >= _MOST_PUBLISHERS:
-            self._sequences.clear()
-        self._sequences[notice.publisher] = notice.sequence
-        return "next" if last is None or notice.sequence == last + 1 else "gap"
-
-    def _apply(self, notice: Notice, *, gap: bool) -> None:
+    def _apply(self, notice: Notice) -> None:
         before = self.at()
         try:
             self.tree = _applied(self.tree, notice, self.path)
@@ -162,7 +163,7 @@ class Follower:
             self._fetch(notice)
             return
         if not self.rest or self.at() is not before:  # what did not change is shared with the old tree
-            self._emit(notice, gap)
+            self._emit(notice)
 
     def _fetch(self, notice: Notice) -> None:
         self._covered.append(notice)
@@ -207,8 +208,7 @@ class Follower:
     def _has_heard(self, outcome: list[Reply] | Exception) -> bool:
         """Return whether the notice that a snapshot says was the last has arrived: then so have those before."""
         note = outcome[-1][-1] if isinstance(outcome, list) and isinstance(outcome[-1], list) else None
-        publisher, _, sequence = note.decode().partition(" ") if isinstance(note, bytes) else ("", "", "")
-        return sequence.isdigit() and self._sequences.get(publisher, 0) >= int(sequence)
+        return self._heard.has(note)
 
     def _on_replies(self, plan: Plan, number: int, outcome: list[Reply] | Exception) -> None:
         """Go on with a read: called in order with notices, so what has arrived until now is older."""
@@ -228,6 +228,7 @@ class Follower:
                 self._send(result)
             else:
                 self._divide(result.also)
+                self._heard.snapshot(result.also[0] if result.also else None)
                 self._open(result)
 
     def _divide(self, also: tuple[Reply, ...]) -> None:
@@ -307,19 +308,21 @@ class Follower:
                     mailbox.skip()
             newest[notice.path] = notice
         for notice in newest.values():
-            self._emit(notice, False)
+            self._emit(notice)
 
     def _emit_snapshot(self, *, initial: bool) -> None:
+        missed = 0 if initial else self._heard.lost()[1]
         for mailbox in self.mailboxes:
             data, value = self.value(), self.value()
             path = show((self.keys.name, *self.path, *self.rest))
-            mailbox.put(Update(path, data, value, initial=initial, gap=not initial))
+            mailbox.put(Update(path, data, value, initial=initial, gap=not initial, missed=missed))
 
-    def _emit(self, notice: Notice, gap: bool) -> None:
-        path = show((self.keys.name, *notice.path))
+    def _emit(self, notice: Notice) -> None:
+        path, (gap, missed) = show((self.keys.name, *notice.path)), self._heard.lost()
+        stamp = notice.time, notice.publisher, notice.sequence
         for mailbox in self.mailboxes:
             value = self.value(() if self.rest else notice.path[len(self.path) :])
-            mailbox.put(Update(path, self.value(), value, False, notice.time, notice.publisher, notice.sequence, gap))
+            mailbox.put(Update(path, self.value(), value, False, *stamp, gap, missed))
 
     def value(self, inner: Path = ()) -> Any:
         """Return a copy of what is at `inner` below what is followed, None if nothing is. Any thread may."""

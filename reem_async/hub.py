@@ -8,10 +8,12 @@ import os
 import random
 import weakref
 from collections.abc import Iterable
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from .background import in_background
 from .errors import BadData, InterfaceClosed, RedisError
+from .plan import Reply
 from .plan.notices import Notice, decode
 from .policy import Mailbox
 from .ships.registry import Ships
@@ -21,6 +23,9 @@ from .transport.wire import Wire
 __all__ = ["Hub", "Listener", "Topic"]
 
 logger = logging.getLogger("reem.subscribe")
+
+_HEARTBEAT = 1.0
+"""Seconds between looks at a subscribed connection; one that is dead shows a call's time limit later."""
 
 
 class Topic(NamedTuple):
@@ -45,11 +50,13 @@ class Listener(Protocol):
 
     Attributes:
         topic: What it subscribes to.
+        note: The key where the server keeps a note of the last update, None if there are many.
         ready: Done when it has begun to follow.
         mailboxes: Where each update goes.
     """
 
     topic: Topic
+    note: str | None
     ready: asyncio.Future[None] | None
     mailboxes: list[Mailbox]
 
@@ -64,6 +71,9 @@ class Listener(Protocol):
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Take one update."""
+
+    def on_note(self, note: bytes | None) -> None:
+        """Compare with the server's note of the last update; all before it has been handed over."""
 
 
 class _Audience:
@@ -106,6 +116,7 @@ class Hub:
         self._subscribed: set[Topic] = set()
         self._lock = asyncio.Lock()
         self._reconnecting: asyncio.Task[Any] | None = None
+        self._beating: asyncio.Task[Any] | None = None
         self._closed = False
         self._warned = False
         self.place = os.getpid(), asyncio.get_running_loop()
@@ -151,6 +162,7 @@ class Hub:
             await wire.close()
             raise
         self._wire, self._subscribed = wire, set(topics)
+        self._beating = in_background(self._beat(wire), "reem heartbeat")
         for listener in self._listeners():
             listener.start(wire, "gap")
         return wire
@@ -195,6 +207,23 @@ class Hub:
         for listener in listeners:
             listener.on_notice(notice, channel)
 
+    async def _beat(self, wire: Wire) -> None:
+        """Ask every second for the notes of the last updates: shows a dead connection, and a lost last notice."""
+        while True:
+            await asyncio.sleep(_HEARTBEAT)
+            if wire is not self._wire or not wire.alive:
+                return
+            notes = sorted({listener.note for listener in self._listeners() if listener.note is not None})
+            wire.send([("GET", note) for note in notes] or [("PING",)], partial(self._on_notes, notes))
+
+    def _on_notes(self, names: list[str], notes: list[Reply] | Exception) -> None:
+        if isinstance(notes, Exception):
+            return
+        found = {name: note for name, note in zip(names, notes, strict=False) if not isinstance(note, Exception)}
+        for listener in self._listeners():
+            if listener.note in found:
+                listener.on_note(found[listener.note])
+
     def _warn_unreadable(self, channel: bytes, error: Exception) -> None:
         if not self._warned:
             self._warned = True
@@ -208,6 +237,7 @@ class Hub:
             listener.lost(reason)
         if not self._closed and self._reconnecting is None:
             logger.warning("the subscription connection was lost and is made again: %s", reason)
+            self._transport.states.retrying()
             self._reconnecting = in_background(self._reconnect(), "reem reconnect")
 
     async def _reconnect(self) -> None:
@@ -237,8 +267,9 @@ class Hub:
     async def close(self) -> None:
         """End all listeners and the connection. Idempotent."""
         self._closed = True
-        if self._reconnecting is not None:
-            self._reconnecting.cancel()
+        for task in (self._reconnecting, self._beating):
+            if task is not None:
+                task.cancel()
         for listener in self._listeners():
             await self.unfollow(listener)
         if self._wire is not None:

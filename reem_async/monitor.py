@@ -153,6 +153,7 @@ class _Ear:
     def __init__(self, monitor: Monitor, topic: Topic) -> None:
         self._monitor = monitor
         self.topic = topic
+        self.note: str | None = None
         self.ready: asyncio.Future[None] | None = None
         self.mailboxes: list[Mailbox] = [monitor.mailbox]
 
@@ -174,3 +175,6 @@ class _Ear:
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Hand the update on."""
         self._monitor._heard(notice, channel)
+
+    def on_note(self, note: bytes | None) -> None:
+        """Nothing to compare: many keys have one note each."""

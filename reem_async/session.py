@@ -35,7 +35,7 @@ class Session:
         host: A host name, a URL, or an `EmbeddedServer`.
         ships: What carries values that are not JSON; None for the default list.
         namespace: Goes before every key and channel.
-        timeout: Seconds without a byte received after which a call is given up.
+        timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options.
         new_transport: Makes the transport.
 

@@ -20,7 +20,7 @@ json.set json.get json.del json.type json.numincrby json.nummultby json.arrappen
 set get unlink type sadd srem smembers
 multi exec discard watch unwatch
 publish subscribe unsubscribe
-ping hello auth select client|setinfo
+ping hello auth select info client|setinfo
 """.split()  # noqa: SIM905
 
 FORBIDDEN = [

@@ -11,6 +11,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
 from ..plan import Command, Plan, Reply, unwrap, wire_commands
+from ..state import States
 
 __all__ = ["Held", "Transport", "drive"]
 
@@ -24,7 +25,13 @@ class Held(Protocol):
 
 
 class Transport(Held, Protocol):
-    """A server, as far as plans can see it."""
+    """A server, as far as plans can see it.
+
+    Attributes:
+        states: What the interface's user gets to know of the connections.
+    """
+
+    states: States
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""

@@ -12,6 +12,8 @@ import anyio
 
 from ..errors import InterfaceClosed, WrongLoop
 from ..plan import Command, Reply
+from ..state import States
+from .identity import WHO, who
 from .options import Options
 from .packing import size_of_largest
 from .wire import Wire, open_wire
@@ -23,7 +25,11 @@ _SPARE = 4
 
 
 class AsyncTransport:
-    """Connections of one interface in one event loop, made when first needed."""
+    """Connections of one interface in one event loop, made when first needed.
+
+    Attributes:
+        states: What the interface's user gets to know of the connections.
+    """
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -34,6 +40,7 @@ class AsyncTransport:
         self._opening: dict[bool, anyio.Lock] = {}
         self._spare: list[Wire] = []
         self._orders: dict[str, anyio.Lock] = {}
+        self.states = States()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` on the shared wire, or on the one for large values, and return the replies."""
@@ -59,10 +66,17 @@ class AsyncTransport:
         large: bool = False,
     ) -> Wire:
         """Return a new connection, unless the interface was closed while it was made."""
-        wire = await open_wire(self._options, on_push, on_lost, large=large)
+
+        def gone(wire: Wire, reason: Exception) -> None:
+            self.states.lost(reason)
+            if on_lost is not None:
+                on_lost(wire, reason)
+
+        wire = await open_wire(self._options, on_push, gone, large=large)
         if self._closed:
             await wire.close()
             self.check()
+        wire.send([WHO], lambda replies: self.states.opened(self._options.address, who(replies)))
         return wire
 
     def check(self) -> None:
@@ -129,6 +143,7 @@ class AsyncTransport:
         if self._closed:
             return
         self._closed = True
+        self.states.closed()
         wires = [*self._lanes.values(), *self._spare]
         self._forget()
         if self._loop is asyncio.get_running_loop():

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import collections
 import os
+import select
 import socket
 import struct
 import threading
-import time
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
@@ -20,19 +20,21 @@ import redis.exceptions
 
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
+from ..state import States
+from .identity import WHO, who
 from .options import Options
 from .packing import pack
 from .parsing import MORE, LargeReader, Reader, SmallReader
+from .patience import patience, unsent
 
 __all__ = ["BlockingTransport"]
-
-_IDLE = 1.0
 
 
 class _Line:
     """One blocking connection, used by one caller at a time."""
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Options, states: States) -> None:
+        self._states = states
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
@@ -40,22 +42,28 @@ class _Line:
             raise options.refused(error) from error
         self._socket: socket.socket = self._connection._sock
         self._timeout = options.timeout
-        self._set_timeout()
+        self._unsent = 0  # bytes of a large value that were on their way up when last looked at
+        self._limit = 0.0
+        self._set_limit(self._timeout)
+        self._poll = select.poll() if hasattr(select, "poll") else None
+        if self._poll is not None:
+            self._poll.register(self._socket, select.POLLIN)
         self._small = SmallReader()
         self._large: LargeReader | None = None
         self.broken = False
-        self.used = time.monotonic()
+        self._states.opened(options.address, who(self.exchange([WHO])))
 
-    def _set_timeout(self) -> None:
+    def _set_limit(self, limit: float) -> None:
         """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
+        self._limit = limit
         if hasattr(self._socket, "context"):  # TLS: its reads need Python's timeout
-            self._socket.settimeout(self._timeout)
+            self._socket.settimeout(limit)
             return
         self._socket.settimeout(None)
-        whole, part = divmod(self._timeout, 1)
-        limit = struct.pack("ll", int(whole), int(part * 1e6))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+        whole, part = divmod(limit, 1)
+        packed = struct.pack("ll", int(whole), max(int(part * 1e6), 0 if whole else 1))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, packed)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, packed)
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies, all on this thread."""
@@ -64,27 +72,29 @@ class _Line:
     def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies."""
         self.broken = True  # until all is read: a Ctrl-C anywhere must not leave a reply for the next caller
+        limit = patience(self._timeout)
+        if limit != self._limit:
+            self._set_limit(limit)
         try:
-            for piece in pack(commands):
+            pieces = pack(commands)
+            for piece in pieces:
                 self._socket.sendall(piece)
+            self._unsent = unsent(self._socket) if len(pieces) > 1 else 0
             if bulk and self._large is None:
                 self._large = LargeReader()
             replies = self._replies((bulk and self._large) or self._small, len(commands))
             self.broken = False
             return replies
         except (BlockingIOError, TimeoutError):
-            self.close()
-            raise ConnectionLost(
-                f"the server moved no byte for {self._timeout} s; the call was applied once or not at all"
+            raise self.lost(
+                f"the server moved no byte for {limit:g} s; the call was applied once or not at all"
             ) from None
         except OSError as error:
-            self.close()
-            raise ConnectionLost(
+            raise self.lost(
                 f"the connection broke before the reply came ({error}); the call was applied once or not at all"
             ) from error
         except redis.exceptions.InvalidResponse as error:
-            self.close()
-            raise ConnectionLost(f"the server sent something that is not its protocol: {error}") from error
+            raise self.lost(f"the server sent something that is not its protocol: {error}") from error
         except BaseException:  # Ctrl-C: the reply is still on its way and must not meet the next caller
             self.close()
             raise
@@ -92,11 +102,11 @@ class _Line:
     def _replies(self, reader: Reader, count: int) -> list[Reply]:
         """Read `count` replies. Nothing is left over: nothing else was asked."""
         replies: list[Reply] = []
-        gets, receive = reader.gets, self._socket.recv_into
+        gets = reader.gets
         while True:
             reply = gets()
             if reply is MORE:
-                received = receive(reader.target())
+                received = self._receive(reader.target())
                 if not received:
                     raise ConnectionResetError("closed by the server")
                 reader.received(received)
@@ -105,18 +115,34 @@ class _Line:
             if len(replies) == count:
                 return replies
 
+    def _receive(self, target: memoryview) -> int:
+        """Receive into `target`; a large value that is still on its way up is progress too."""
+        while True:
+            try:
+                return self._socket.recv_into(target)
+            except (BlockingIOError, TimeoutError):
+                before, self._unsent = self._unsent, unsent(self._socket)
+                if self._unsent >= before:
+                    raise
+
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
-        if time.monotonic() - self.used < _IDLE:
-            return True
+        if self._poll is not None:
+            return not self._poll.poll(0)  # nothing is due: an event is a stray reply, or the server has closed
         try:
-            # Nothing is due: bytes mean a stray reply, none means the server has closed.
             self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
         except BlockingIOError:
             return True
         except (OSError, ValueError):
             return False
         return False
+
+    def lost(self, reason: str) -> ConnectionLost:
+        """Close the connection and return the error that says why."""
+        self.close()
+        error = ConnectionLost(reason)
+        self._states.lost(error)
+        return error
 
     def close(self) -> None:
         """Close the connection."""
@@ -125,7 +151,11 @@ class _Line:
 
 
 class BlockingTransport:
-    """Connections for the threads of one process: as many as there are calls at the same time."""
+    """Connections for the threads of one process: as many as there are calls at the same time.
+
+    Attributes:
+        states: What the interface's user gets to know of the connections.
+    """
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -133,6 +163,7 @@ class BlockingTransport:
         self._pid = os.getpid()
         self._closed = False
         self._orders: dict[str, threading.Lock] = {}
+        self.states = States()
 
     def check(self) -> None:
         """Raise if this is closed."""
@@ -152,10 +183,10 @@ class BlockingTransport:
             try:
                 line = self._idle.pop()
             except IndexError:
-                return _Line(self._options)
+                return _Line(self._options, self.states)
             if line.fresh():
                 return line
-            line.close()
+            line.lost("the server closed an idle connection")
 
     def _give(self, line: _Line) -> None:
         if line.broken:
@@ -164,7 +195,6 @@ class BlockingTransport:
         if self._closed:
             line.close()
             return
-        line.used = time.monotonic()
         self._idle.append(line)
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
@@ -198,6 +228,7 @@ class BlockingTransport:
     async def close(self) -> None:
         """Close all connections that are not in use; the others are closed when given back."""
         self._closed = True
+        self.states.closed()
         while self._idle:
             self._idle.pop().close()
 

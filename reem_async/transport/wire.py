@@ -21,29 +21,41 @@ from ..plan import Command, Reply
 from .options import Options
 from .packing import LARGE, Piece, pack
 from .parsing import MORE, LargeReader, Reader, SmallReader
+from .patience import patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
-_NOTHING_SENT = float("inf")
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe")
 
 
 class _Due:
-    """The replies one caller waits for."""
+    """The replies one caller waits for.
 
-    __slots__ = ("count", "done", "replies")
+    Attributes:
+        count: How many they are.
+        done: Takes them, or an error.
+        limit: Seconds without a byte moving after which the caller is told, and
+        since: the time from which this counts at the earliest.
+        replies: Those that have come.
+        over: The caller was told; what still comes is dropped.
+    """
 
-    def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None]) -> None:
+    __slots__ = ("count", "done", "limit", "over", "replies", "since")
+
+    def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None], limit: float, since: float) -> None:
         self.count = count
         self.done = done
+        self.limit = limit
+        self.since = since
         self.replies: list[Reply] = []
+        self.over = False
 
 
 class Wire(asyncio.BufferedProtocol):
     """The protocol over a connection that has shaken hands.
 
     Args:
-        timeout: Seconds without a byte received, while a reply is due, after which it is given up.
+        timeout: Seconds without a byte moving, while a reply is due, after which a call is given up.
         reader: Parses what is received.
         on_push: Called with each message the server sends unasked.
         on_lost: Called once when the connection is gone, with the reason.
@@ -65,9 +77,10 @@ class Wire(asyncio.BufferedProtocol):
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._keep: Any = None
+        self._socket: Any = None
         self._watch: asyncio.TimerHandle | None = None
         self._last_byte = 0.0
-        self._unsent: float = _NOTHING_SENT
+        self._unsent = 0  # bytes of large values that were on their way up when last looked at
         self._reason: Exception | None = None
         self._gone = self._loop.create_future()
         # What the socket does not take at once is copied by asyncio of Python 3.11; later versions and
@@ -80,7 +93,7 @@ class Wire(asyncio.BufferedProtocol):
         self._keep = writer  # its finalizer would close the socket under us
         connection._reader = connection._writer = None
         transport: asyncio.Transport = writer.transport
-        self._transport = transport
+        self._transport, self._socket = transport, transport.get_extra_info("socket")
         transport.set_protocol(self)
 
     @property
@@ -96,14 +109,14 @@ class Wire(asyncio.BufferedProtocol):
         if self._transport is None or self._reason is not None:
             done(self._reason or ConnectionLost("the connection is closed"))
             return
-        pieces = pack(commands)
+        pieces, limit, now = pack(commands), patience(self._timeout), self._loop.time()
         idle = not self._due
-        self._due.append(_Due(len(commands), done))
+        self._due.append(_Due(len(commands), done, limit, now))
+        self._watch_until(now + limit)
         if idle and not self._outbox:
-            self._last_byte = self._loop.time()
-            if self._watch is None:
-                self._watch = self._loop.call_later(self._timeout, self._check_time)
             self._write(pieces)
+            if len(pieces) > 1:
+                self._unsent = self._bytes_unsent()
             return
         # Others wait already: what is sent in the same turn of the loop goes out in one system call.
         if not self._outbox:
@@ -203,25 +216,42 @@ class Wire(asyncio.BufferedProtocol):
         due.replies.append(reply)
         if len(due.replies) == due.count:
             self._due.popleft()
-            due.done(due.replies)
+            if not due.over:
+                due.done(due.replies)
+
+    def _watch_until(self, moment: float) -> None:
+        """Look at the time at `moment`, unless it will be looked at before."""
+        if self._watch is not None:
+            if self._watch.when() <= moment:
+                return
+            self._watch.cancel()
+        self._watch = self._loop.call_at(moment, self._check_time)
 
     def _check_time(self) -> None:
+        """Tell the callers whose limit has passed; break the connection if nobody is left to wait for it."""
         self._watch = None
-        if not self._due:
-            return
-        unsent = self._transport.get_write_buffer_size() if self._transport is not None else 0
-        if unsent < self._unsent:  # a large value on its way up is progress too
-            self._last_byte = self._loop.time()
-        self._unsent = unsent or _NOTHING_SENT
-        left = self._last_byte + self._timeout - self._loop.time()
-        if left <= 0:
-            self.abort(
-                ConnectionLost(
-                    f"the server moved no byte for {self._timeout} s; the call was applied once or not at all"
+        now, left = self._loop.time(), self._bytes_unsent()
+        if left < self._unsent:  # a large value on its way up is progress too
+            self._last_byte = now
+        self._unsent = left
+        waiting = [due for due in self._due if not due.over]
+        for due in waiting:
+            if max(self._last_byte, due.since) + due.limit <= now:
+                due.over = True
+                due.done(
+                    ConnectionLost(
+                        f"the server moved no byte for {due.limit:g} s; the call was applied once or not at all"
+                    )
                 )
-            )
-        else:
-            self._watch = self._loop.call_later(max(left, 0.01), self._check_time)
+        moments = [max(self._last_byte, due.since) + due.limit for due in self._due if not due.over]
+        if moments:
+            self._watch_until(max(min(moments), now + 0.01))
+        elif waiting:
+            self.abort(ConnectionLost(f"the server moved no byte for {waiting[-1].limit:g} s"))
+
+    def _bytes_unsent(self) -> int:
+        buffered = self._transport.get_write_buffer_size() if self._transport is not None else 0
+        return buffered + unsent(self._socket)
 
     def _fail(self, reason: Exception) -> None:
         if self._reason is not None:
@@ -232,7 +262,8 @@ class Wire(asyncio.BufferedProtocol):
             self._watch = None
         waiting, self._due = self._due, collections.deque()
         for due in waiting:
-            due.done(reason)
+            if not due.over:
+                due.done(reason)
         if self._on_lost is not None:
             self._on_lost(self, reason)
 

@@ -1,0 +1,71 @@
+"""How long a call may stand still: the interface's limit, or another one for the calls in a `with` block."""
+
+from __future__ import annotations
+
+import array
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from ..errors import BadValue
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows: what the kernel still holds cannot be asked there
+    fcntl = termios = None  # type: ignore[assignment]
+
+__all__ = ["check_timeout", "forget", "patience", "timeout", "unsent"]
+
+_given: ContextVar[float | None] = ContextVar("reem timeout", default=None)
+
+
+@contextmanager
+def timeout(seconds: float) -> Iterator[None]:
+    """Give every call of REEM inside the block another time limit than its interface's.
+
+    A call is given up once no byte has moved for that long, in either direction, while its reply is
+    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread.
+
+    Args:
+        seconds: The limit, above 0.
+
+    Raises:
+        BadValue: Not a number above 0.
+    """
+    token = _given.set(check_timeout(seconds))
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
+def forget() -> None:
+    """Go back to the interfaces' own limits in this context."""
+    _given.set(None)
+
+
+def check_timeout(seconds: float) -> float:
+    """Return `seconds` if it can be a time limit, else raise BadValue."""
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= 1e6:
+        raise BadValue(f"timeout={seconds!r} is not a number of seconds above 0 (at most a million)")
+    return float(seconds)
+
+
+def patience(default: float) -> float:
+    """Return the time limit of a call made now."""
+    given = _given.get()
+    return default if given is None else given
+
+
+def unsent(connected: socket.socket | None) -> int:
+    """Return how many bytes the other side has not confirmed yet, 0 where the kernel does not say."""
+    if connected is None or fcntl is None:
+        return 0
+    count = array.array("i", [0])
+    try:
+        fcntl.ioctl(connected.fileno(), termios.TIOCOUTQ, count)
+    except (OSError, ValueError):
+        return 0
+    return count[0]

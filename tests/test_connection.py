@@ -1,0 +1,285 @@
+"""The connection: its state, calls that stand still, what a stopped or restarted server does."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import threading
+import time
+
+import numpy as np
+import pytest
+from conftest import PATIENCE, aeventually, eventually
+
+import reem
+import reem_async
+from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.server import EmbeddedServer
+
+
+@pytest.fixture
+def server():
+    """A server of the test's own, to be stopped and killed."""
+    with EmbeddedServer() as own:
+        yield own
+
+
+@contextlib.contextmanager
+def stopped(server):
+    """The server stands still inside the block."""
+    os.kill(server.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+
+
+async def test_an_asyncio_call_to_a_stopped_server_ends_in_time(server):
+    async with reem_async.RedisInterface(server, timeout=0.3) as interface:
+        store = reem_async.KeyValueStore(interface)
+        await store["foo"].write(1)
+        with stopped(server):
+            begin = time.monotonic()
+            with pytest.raises(ConnectionLost, match=r"0\.3 s"):
+                await store["foo"].read()
+            assert 0.25 < time.monotonic() - begin < 0.9
+            assert interface.state == "lost"
+        assert await store["foo"].read() == 1
+        assert interface.state == "connected"
+
+
+def test_a_blocking_call_to_a_stopped_server_ends_in_time(server):
+    with reem.RedisInterface(server, timeout=0.3) as interface:
+        store = reem.KeyValueStore(interface)
+        store["foo"] = 1
+        with stopped(server):
+            begin = time.monotonic()
+            with pytest.raises(ConnectionLost, match=r"0\.3 s"):
+                store["foo"].read()
+            assert 0.25 < time.monotonic() - begin < 0.9
+            assert interface.state == "lost"
+        assert store["foo"].read() == 1
+        assert interface.state == "connected"
+
+
+async def test_the_limit_of_one_call_is_its_own(server):
+    """A short one does not cut off others on the same connection, a long one is not cut off by them."""
+    async with reem_async.RedisInterface(server, timeout=30) as interface:
+        store = reem_async.KeyValueStore(interface)
+        await store["foo"].write(1)
+        with stopped(server):
+            patient = asyncio.create_task(store["foo"].read())
+            await asyncio.sleep(0)
+            with reem_async.timeout(0.2), pytest.raises(ConnectionLost, match=r"0\.2 s"):
+                await store["foo"].read()
+            assert not patient.done()
+            assert interface.state == "connected"
+        assert await patient == 1
+        assert await store["foo"].read() == 1
+
+
+def test_the_limit_of_one_blocking_call_is_its_own(server):
+    with reem.RedisInterface(server, timeout=30) as interface:
+        store = reem.KeyValueStore(interface)
+        store["foo"] = 1
+        with stopped(server), reem.timeout(0.2), pytest.raises(ConnectionLost, match=r"0\.2 s"):
+            store["foo"].read()
+        with reem.timeout(20):
+            assert store["foo"].read() == 1
+
+
+@pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf"), True, "1", None])
+def test_what_is_no_time_limit_is_refused(seconds):
+    with pytest.raises(BadValue, match="timeout"), reem.timeout(seconds):
+        pass
+
+
+async def test_a_slow_upload_is_not_cut_off(server):
+    """Ten times the limit, but bytes move."""
+    total, rate = 24 << 20, 16 << 20
+    relays = []
+
+    async def relay(reader, writer):
+        relays.append(asyncio.current_task())
+        up_reader, up_writer = await asyncio.open_unix_connection(str(server.socket_path))
+
+        async def pump(source, sink, slow):
+            with contextlib.suppress(OSError):
+                while data := await source.read(1 << 16):
+                    sink.write(data)
+                    await sink.drain()
+                    if slow:
+                        await asyncio.sleep(len(data) / rate)
+            sink.close()
+            with contextlib.suppress(OSError):
+                await sink.wait_closed()
+
+        await asyncio.gather(pump(reader, up_writer, True), pump(up_reader, writer, False))
+
+    listening = socket.create_server(("127.0.0.1", 0))
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)  # what waits here looks delivered to the sender
+    slow = await asyncio.start_server(relay, sock=listening, limit=1 << 16)
+    port = slow.sockets[0].getsockname()[1]
+    value = np.zeros(total, np.uint8)
+    url = f"redis://127.0.0.1:{port}"
+
+    def blocking():
+        with reem.RedisInterface(url, timeout=0.3) as interface:
+            begin = time.monotonic()
+            reem.KeyValueStore(interface)["big"] = value
+            return time.monotonic() - begin
+
+    async with slow:
+        async with reem_async.RedisInterface(url, timeout=0.3) as interface:
+            begin = time.monotonic()
+            await reem_async.KeyValueStore(interface)["big"].write(value)
+            assert time.monotonic() - begin > 0.6
+        assert await asyncio.to_thread(blocking) > 0.6
+        await asyncio.gather(*relays)
+
+
+async def test_states_are_told_in_order_and_to_callbacks(server):
+    interface = reem_async.RedisInterface(server)
+    heard = []
+    interface.on_state(heard.append)
+    interface.on_state(lambda change: 1 / 0)  # logged, and nothing else
+    assert interface.state == "idle"
+    changes = interface.states()
+    await interface.initialize()
+    await aeventually(lambda: interface.state == "connected")
+    await interface.close()
+    assert [change.state async for change in changes] == ["idle", "connected", "closed"]
+    assert [change.state for change in heard] == ["connected", "closed"]
+    assert interface.state == "closed"
+    assert [change.state async for change in interface.states()] == ["closed"]
+
+
+def test_states_of_a_blocking_interface(server):
+    interface = reem.RedisInterface(server)
+    changes = interface.states()
+    seen = []
+    thread = threading.Thread(target=lambda: seen.extend(changes))
+    thread.start()
+    interface.initialize()
+    interface.close()
+    thread.join(PATIENCE)
+    assert [change.state for change in seen] == ["idle", "connected", "closed"]
+
+
+def killed(server):
+    os.kill(server.pid, signal.SIGKILL)
+    eventually(lambda: not server.running)
+
+
+async def test_a_restarted_server_is_told_apart(tmp_path):
+    first = EmbeddedServer(directory=tmp_path).__enter__()
+    port = first.port
+    async with reem_async.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
+        store = reem_async.KeyValueStore(interface)
+        changes = interface.states()
+        await store["foo"].write(1)
+        async with store["foo"].watch() as updates:
+            assert (await anext(updates)).initial
+            killed(first)
+            await aeventually(lambda: interface.state == "reconnecting")
+            with pytest.raises(NotConnected):
+                await store["foo"].read()
+            with contextlib.suppress(Exception):
+                first.__exit__(None, None, None)
+            with EmbeddedServer(port=port, directory=tmp_path):
+                update = await asyncio.wait_for(anext(updates), PATIENCE)
+                assert (update.gap, update.missed) == (True, None)
+                await aeventually(lambda: interface.state == "connected")
+    told = [change async for change in changes]
+    assert [change.state for change in told] == ["connected", "lost", "reconnecting", "connected", "closed"]
+    assert [change.restarted for change in told] == [False, False, False, True, False]
+    assert "restarted" in told[3].reason
+
+
+async def test_a_connection_cut_by_the_server_is_no_restart(server, raw):
+    import redis
+
+    async with reem_async.RedisInterface(server.url) as interface:
+        await reem_async.KeyValueStore(interface)["foo"].write(1)
+        changes = interface.states()
+        with redis.Redis.from_url(server.url) as other:
+            other.client_kill_filter(_type="normal", skipme=True)
+        await aeventually(lambda: interface.state == "lost")
+        assert await reem_async.KeyValueStore(interface)["foo"].read() == 1
+    told = [(change.state, change.restarted) async for change in changes]
+    assert told == [("connected", False), ("lost", False), ("connected", False), ("closed", False)]
+
+
+async def test_a_stopped_server_is_noticed_by_who_only_follows(server):
+    """Nobody calls anything: the heartbeat finds out."""
+    async with reem_async.RedisInterface(server, timeout=0.5) as interface:
+        store, space = reem_async.KeyValueStore(interface), reem_async.PublishSpace(interface)
+        await space["foo"].write(1)
+        async with store["foo"].watch() as updates:
+            assert (await anext(updates)).initial
+            with stopped(server):
+                begin = time.monotonic()
+                await aeventually(lambda: interface.state in ("lost", "reconnecting"))
+                assert time.monotonic() - begin < 3.5
+            update = await asyncio.wait_for(anext(updates), PATIENCE)
+            assert (update.gap, update.data) == (True, 1)
+
+
+async def test_a_lost_last_update_is_noticed(server):
+    """The server says that there was one more: as if its notice had been dropped on the way."""
+    async with reem_async.RedisInterface(server) as interface, reem_async.RedisInterface(server) as other:
+        store, space = reem_async.KeyValueStore(interface), reem_async.PublishSpace(other)
+        await space["foo"].write(1)
+        async with store["foo"].watch() as updates:
+            assert (await anext(updates)).data == 1
+            await space["foo"].write(2)
+            update = await asyncio.wait_for(anext(updates), PATIENCE)
+            assert (update.data, update.gap, update.missed) == (2, False, 0)
+            # Written, noted as published, and never announced.
+            keys = space["foo"]._reader.keys
+            publisher, number = other.session.stamp(keys)
+            await reem_async.KeyValueStore(other)["foo"].write(3)
+            await other.session.transport.roundtrip([("SET", keys.last, f"{publisher} {number}", "EX", 60)])
+            update = await asyncio.wait_for(anext(updates), PATIENCE)
+            assert (update.data, update.gap, update.missed) == (3, True, 1)
+            await space["foo"].write(4)
+            update = await asyncio.wait_for(anext(updates), PATIENCE)
+            assert (update.data, update.gap, update.missed) == (4, False, 0)
+
+
+async def test_updates_missed_in_between_are_counted(server):
+    async with reem_async.RedisInterface(server) as interface:
+        store, space = reem_async.KeyValueStore(interface), reem_async.PublishSpace(interface)
+        await space["foo"].write({"big": 0})
+        async with store["foo"].watch() as updates:
+            await anext(updates)
+            await space["foo"].write({"big": 1})  # from here on the publisher is known
+            await anext(updates)
+            for value in (1, np.zeros(100_000)):
+                interface.session.stamp(space["foo"]._reader.keys)
+                interface.session.stamp(space["foo"]._reader.keys)
+                await space["foo"]["big"].write(value)
+                update = await asyncio.wait_for(anext(updates), PATIENCE)
+                assert (update.gap, update.missed) == (True, 2)
+                await space["foo"]["big"].write(value)
+                update = await asyncio.wait_for(anext(updates), PATIENCE)
+                assert (update.gap, update.missed) == (False, 0)
+
+
+def test_an_idle_blocking_connection_survives_a_restart(tmp_path):
+    """No call fails for a connection that the server had closed before."""
+    first = EmbeddedServer(directory=tmp_path).__enter__()
+    port = first.port
+    with reem.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
+        store = reem.KeyValueStore(interface)
+        store["foo"] = 1
+        killed(first)
+        with contextlib.suppress(Exception):
+            first.__exit__(None, None, None)
+        with EmbeddedServer(port=port, directory=tmp_path):
+            store["bar"] = 2
+            assert store["bar"].read() == 2
+            assert interface.states().__next__().restarted
