@@ -28,6 +28,8 @@ LONGEST_TOP_KEY = 512
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
 _TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"~]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)
 
+_TYPED = re.compile(_TOKEN.pattern.replace("~", ""), re.DOTALL)  # `~` is only special in names on the server
+
 
 def check_element(key: object, parent: Path) -> str | int:
     """Return `key` if it can be an element of a path, else raise.
@@ -118,9 +120,13 @@ def parse_suffix(text: str) -> Path:
     Raises:
         BadKey: Not the text form of a path.
     """
+    return _split(text, _TOKEN)
+
+
+def _split(text: str, tokens: re.Pattern[str]) -> Path:
     position, path = 0, []
-    while position < len(text) and text[position] != "~":
-        token = _TOKEN.match(text, position)
+    while position < len(text) and not (tokens is _TOKEN and text[position] == "~"):
+        token = tokens.match(text, position)
         if token is None:
             raise BadKey(f"{shorten(text)} is not a path, at character {position}; write it like foo.bar[0]")
         path.append(_element(token))
@@ -151,17 +157,7 @@ def parse(text: str) -> Path:
     if text in ("", "."):
         return ()
     tail = text if text[0] in ".[" else "." + text
-    if "~" in tail or tail.endswith(".") or ".." in tail:
-        # `~` is only special in names on the server; a user's plain key may have it.
-        return tuple(check_element(key, ()) for key in _split_plain(tail))
-    return tuple(check_element(key, ()) for key in parse_suffix(tail))
-
-
-def _split_plain(text: str) -> list[str]:
-    keys = text[1:].split(".")
-    if not all(keys) or any("[" in key for key in keys):
-        raise BadKey(f"{shorten(text)} has an empty or unclear element; use store['a']['b'] for such keys")
-    return keys
+    return tuple(check_element(key, ()) for key in _split(tail, _TYPED))
 
 
 def show(path: Path) -> str:

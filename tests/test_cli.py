@@ -1,0 +1,444 @@
+"""The command line on a real server: what a command does, and the installed `reem` where a process matters.
+
+Starting Python and importing everything takes half a second, so most calls are made in this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from conftest import assert_same, nothing_sent
+from typer.testing import CliRunner
+
+import reem as blocking
+from reem_async.cli import COMMANDS, build, lazy
+
+REEM = str(pathlib.Path(sys.executable).parent / "reem")
+TERMINAL = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
+
+
+class CommandLine:
+    """Runs `reem` against one server, in a namespace of its own."""
+
+    def __init__(self, url, namespace):
+        self.url, self.namespace = url, namespace
+
+    def environment(self, **changes):
+        left_out = ("REEM_PASSWORD", "FORCE_COLOR", "NO_COLOR", "COLUMNS", "LINES")
+        clean = {name: value for name, value in os.environ.items() if name not in left_out}
+        return {**clean, "REEM_URL": self.url, "PYTHONWARNINGS": "error", "TERM": "xterm-256color", **changes}
+
+    def words(self, command, *arguments):
+        return [REEM, command, "--namespace", self.namespace, *map(str, arguments)]
+
+    def __call__(self, command, *arguments, input=None, **changes):  # noqa: A002
+        """Run a command in this process."""
+        words, environment = self.words(command, *arguments)[1:], self.environment(**changes)
+        run = CliRunner().invoke(build(), words, input, environment, prog_name="reem")
+        assert run.exception is None or isinstance(run.exception, SystemExit), repr(run.exception)
+        return run
+
+    def process(self, command, *arguments, **changes):
+        """Run a command as a user does."""
+        words, environment = self.words(command, *arguments), self.environment(**changes)
+        run = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=30, check=False)
+        assert "Traceback" not in run.stderr
+        return run
+
+    def result(self, *arguments, **options):
+        """The output of a command that must succeed."""
+        run = self(*arguments, **options)
+        assert run.exit_code == 0, run.stderr
+        return run.stdout
+
+    def error(self, code, *arguments, **options):
+        """The one line of a command that must fail with this exit code."""
+        run = self(*arguments, **options)
+        assert run.exit_code == code, (run.stdout, run.stderr)
+        assert run.stdout == ""
+        if code != 2:
+            assert run.stderr.count("\n") == 1, run.stderr
+        return run.stderr
+
+    @contextlib.contextmanager
+    def running(self, command, *arguments, **options):
+        """A command that goes on by itself; killed at the end."""
+        with subprocess.Popen(
+            self.words(command, *arguments),
+            env=self.environment(),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            **options,
+        ) as process:
+            try:
+                yield process
+            finally:
+                process.kill()
+
+    def in_terminal(self, command, *arguments, keys=(), columns=100):
+        """What a terminal shows of a command, and its exit code; `keys` are (text seen, what is typed then)."""
+        with subprocess.Popen(
+            [sys.executable, "-c", TERMINAL, *self.words(command, *arguments)],
+            env=self.environment(COLUMNS=str(columns)),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+        ) as process:
+            said, todo = b"", list(keys)
+            while data := process.stdout.read(4096):
+                said += data
+                while todo and todo[0][0] in said:
+                    process.stdin.write(todo.pop(0)[1])
+            code = process.wait(10)
+        assert not todo, said
+        assert b"Traceback" not in said
+        return said.decode(), code
+
+
+@pytest.fixture
+def cli(server_url, key):
+    return CommandLine(server_url, f"{key.prefix}:")
+
+
+@pytest.fixture
+def kvs(cli):
+    """A store in the same namespace, with something in it."""
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        store = blocking.KeyValueStore(interface)
+        store["foo"] = {
+            "number": 1,
+            "image": np.arange(24, dtype=np.uint8).reshape(2, 4, 3),
+            "names": ["left", "right"],
+            "deep": {"tiles": [{"a": np.arange(3.0)}, None]},
+        }
+        store["cam_left"] = np.linspace(0.0, 1.0, 2000).reshape(40, 50)
+        store["cam_right"] = b"\x00\xff"
+        store["a.b"] = {"x y": True}
+        store["evil"] = "\x1b[31mred\x9b32m\nline"
+        yield store
+
+
+# --- the whole -------------------------------------------------
+
+
+def test_help_has_every_command_under_its_heading_with_examples():
+    """The lines of the table are those of the docstrings, so `reem --help` and `reem NAME --help` agree."""
+    run = subprocess.run([REEM, "--help"], capture_output=True, text=True, timeout=30, check=True)
+    for entry in COMMANDS:
+        assert entry.panel in run.stdout
+        assert f" {entry.name} " in run.stdout
+        thing = getattr(importlib.import_module(f"reem_async.cli.{entry.module}"), entry.attribute)
+        if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
+            said = lazy.help_text(thing.__doc__)
+            assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])
+            assert "[bold]Examples:[/bold]\n" in said
+            assert f"    reem {entry.name}" in said
+    assert "--install-completion" in run.stdout
+    assert "\x1b" not in run.stdout
+
+
+def test_help_needs_none_of_the_commands():
+    """A heavy import in one of them slows down only that one."""
+    code = "import sys; sys.argv = ['reem', '--help']\nfrom reem_async.cli import main\n"
+    code += "try: main()\nexcept SystemExit: print([name for name in sys.modules if name.startswith('reem_async.cli')])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    loaded = run.stdout.splitlines()[-1]
+    assert loaded == "['reem_async.cli', 'reem_async.cli.lazy', 'reem_async.cli.version']"
+
+
+@pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
+def test_each_command_can_be_parsed(entry):
+    """Its options and arguments make sense to the library that parses them."""
+    command = lazy.command_of(entry)
+    assert command.name == entry.name
+    assert command.help
+
+
+def test_paragraphs_are_joined_and_indented_lines_are_kept():
+    said = lazy.help_text(
+        "One\n    two.\n\n    Three\n    four.\n\n    Examples:\n        reem ls\n        reem tree\n    "
+    )
+    assert said == "One two.\n\nThree four.\n\n[bold]Examples:[/bold]\n    reem ls\n    reem tree"
+
+
+def test_wrong_usage(cli):
+    assert "No such option" in cli.error(2, "get", "foo", "--ouput", "x")
+    assert "Missing argument" in cli.error(2, "get")
+    assert "write it like foo.bar[0]" in cli.error(2, "get", "foo..x")
+    assert "redis://" in cli.error(2, "ls", "--url", "http://nowhere")
+
+
+def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
+    run = cli.process("ls", REEM_URL="redis://:hidden-4711@127.0.0.1:1")
+    said = run.stderr
+    assert (run.returncode, run.stdout, said.count("\n")) == (1, "", 1)
+    assert said.startswith("reem ls: no server answers at 127.0.0.1:1")
+    assert "reem up" in said
+    assert "--url redis://host:port or REEM_URL" in said
+    assert "hidden" not in said
+    said = cli.error(1, "ls", "--url", cli.url.replace("redis://", "redis://nobody:hidden-4711@"))
+    assert "refused the user or password" in said
+    assert "hidden" not in said
+
+
+def test_completion_of_top_level_keys(cli, kvs):
+    def completed(*words, **changes):
+        typed = ["reem", "get", "--namespace", cli.namespace, *words]
+        changes = {"_REEM_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(typed), "COMP_CWORD": "4", **changes}
+        run = subprocess.run(
+            [REEM], env=cli.environment(**changes), capture_output=True, text=True, timeout=30, check=True
+        )
+        assert run.stderr == ""
+        return run.stdout.split()
+
+    assert completed("cam") == ["cam_left", "cam_right"]
+    assert completed("cam", REEM_URL="redis://127.0.0.1:1") == []
+
+
+# --- ls, tree -------------------------------------------------
+
+
+def test_ls(cli, kvs):
+    rows = [line.split("\t") for line in cli.result("ls").splitlines()]
+    assert rows == [
+        ['["a.b"]', "dict", "1 key", "8 B"],
+        ["cam_left", "numpy", "float64[40,50]", "16.0 kB"],
+        ["cam_right", "bytes", "bytes", "2 B"],
+        ["evil", "str", r'"\u001b[31mred\u009b32m\nline"', "18 B"],
+        ["foo", "dict", "4 keys", "73 B"],
+    ]
+    assert [line.split("\t")[0] for line in cli.result("ls", "cam_*").splitlines()] == ["cam_left", "cam_right"]
+    below = [json.loads(line) for line in cli.result("ls", "foo.*", "--json").splitlines()]
+    assert [entry["path"] for entry in below] == ["foo.number", "foo.image", "foo.names", "foo.deep"]
+    assert below[0] == {"path": "foo.number", "type": "int", "size": 8, "value": 1}
+    assert below[1] == {"path": "foo.image", "type": "numpy", "size": 24, "summary": "uint8[2,4,3]"}
+    assert "no key nix_*" in cli.error(3, "ls", "nix_*")
+    assert "nothing is stored at nix" in cli.error(3, "ls", "nix")
+
+
+def test_ls_of_what_others_wrote(cli, kvs, raw):
+    """A broken document does not hide the rest; a list of Redis is no key of REEM."""
+    raw.execute_command("JSON.SET", f"{cli.namespace}broken", "$", '"$ship nonsense"')
+    raw.lpush(f"{cli.namespace}foreign", "x")
+    names = {line.split("\t")[0]: line.split("\t")[1] for line in cli.result("ls").splitlines()}
+    assert names["broken"] == "?"
+    assert names["foo"] == "dict"
+    assert "foreign" not in names
+
+
+def test_tree(cli, kvs):
+    assert cli.result("tree", "foo").splitlines() == [
+        "foo  4 keys  73 B",
+        "├── number  1",
+        "├── image  uint8[2,4,3]  24 B",
+        '├── names  ["left", "right"]  2 items  9 B',
+        "└── deep  1 key  32 B",
+        "    └── tiles  2 items  32 B",
+        "        ├── [0]  1 key  24 B",
+        "        │   └── a  float64[3]  24 B",
+        "        └── [1]  null",
+    ]
+    assert cli.result("tree", "foo.deep.tiles[-2]", "--depth", "0") == "foo.deep.tiles[0]  1 key  24 B\n"
+    (line,) = cli.result("tree", "foo.deep", "--depth", "1", "--json").splitlines()
+    assert json.loads(line) == {
+        "path": "foo.deep",
+        "type": "dict",
+        "size": 32,
+        "length": 1,
+        "children": [{"path": "foo.deep.tiles", "type": "list", "size": 32, "length": 2}],
+    }
+
+
+def test_tree_is_cut_and_fetches_no_array(cli, kvs, raw):
+    kvs["many"] = {f"k{number}": {} for number in range(60)}
+    raw.set("{" + cli.namespace + "cam_left}", "not an array any more")
+    lines = cli.result("tree", "*").splitlines()
+    assert "cam_left  float64[40,50]  16.0 kB" in lines
+    assert lines[-1] == "└── … 10 more (--all)"
+    assert cli.result("tree", "many", "--all").count("\n") == 61
+
+
+# --- get -------------------------------------------------
+
+
+def test_get_for_people(cli, kvs):
+    assert cli.result("get", "foo.number") == "1\n"
+    assert json.loads(cli.result("get", "foo"))["image"] == "<uint8[2,4,3], 24 B>"
+    lines = cli.result("get", "cam_left").splitlines()
+    assert lines[0] == "float64[40,50], 16.0 kB, min 0.0, max 1.0, mean 0.5"
+    assert "..." in lines[4]
+    assert cli.result("get", "cam_right") == "2 bytes\nb'\\x00\\xff'\n"
+    assert cli.result("get", "evil") == '"\\u001b[31mred\\u009b32m\\nline"\n'
+    assert cli.result("get", "evil", "--raw") == "\x1b[31mred\x9b32m\nline\n"
+    shown, code = cli.in_terminal("get", "evil", "--raw")
+    assert (shown, code) == ("\\u001b[31mred\\u009b32m\r\nline\r\n", 0)
+
+
+def test_get_for_programs(cli, kvs):
+    assert json.loads(cli.result("get", "foo", "--json")) == {
+        "number": 1,
+        "image": np.arange(24).reshape(2, 4, 3).tolist(),
+        "names": ["left", "right"],
+        "deep": {"tiles": [{"a": [0.0, 1.0, 2.0]}, None]},
+    }
+    assert cli.result("get", "cam_right", "--json") == '"AP8="\n'
+    kvs["large"] = {"map": np.zeros(300_000, np.uint8)}
+    said = cli.error(1, "get", "large", "--json")
+    assert "300.0 kB of arrays" in said
+    assert "-o FILE.npz" in said
+    assert "nothing is stored at nix" in cli.error(3, "get", "nix")
+
+
+def test_get_into_files(cli, kvs, tmp_path):
+    from PIL import Image
+
+    def got(path, name):
+        run = cli("get", path, "-o", tmp_path / name)
+        assert (run.exit_code, run.stdout) == (0, ""), run.stderr
+        assert str(tmp_path / name) in run.stderr
+        return tmp_path / name
+
+    assert_same(np.load(got("foo.deep.tiles[0].a", "a.npy")), np.arange(3.0))
+    with np.load(got("foo", "foo.npz")) as arrays:
+        assert sorted(arrays) == ["deep.tiles[0].a", "image"]
+        assert_same(arrays["image"], np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+    assert json.loads(got("foo", "foo.json").read_text())["deep"] == {"tiles": [{"a": [0.0, 1.0, 2.0]}, None]}
+    with Image.open(got("foo.image", "foo.png")) as picture:
+        assert_same(np.asarray(picture), np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
+    assert got("cam_right", "x.bin").read_bytes() == b"\x00\xff"
+
+
+def test_files_that_cannot_be_written_leave_nothing_behind(cli, kvs, tmp_path):
+    (tmp_path / "old.npy").write_text("old")
+    assert "give its path, or use .npz" in cli.error(1, "get", "foo", "-o", tmp_path / "old.npy")
+    assert "png takes uint8" in cli.error(1, "get", "cam_left", "-o", tmp_path / "x.png")
+    assert "No such file or directory" in cli.error(1, "get", "foo", "-o", tmp_path / "no" / "x.json")
+    assert ".npy, .npz, .json" in cli.error(2, "get", "foo", "-o", tmp_path / "x.doc")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("old.npy", "old")]
+
+
+# --- set, del, pub -------------------------------------------------
+
+
+def test_set(cli, kvs, tmp_path):
+    np.save(tmp_path / "map.npy", np.eye(3))
+    (tmp_path / "config.json").write_text('{"gain": 0.1}')
+    for value, expected, options in (
+        ("-1.5", -1.5, {}),
+        ('{"a": [1, null, "x"]}', {"a": [1, None, "x"]}, {}),
+        ("18446744073709551615", 2**64 - 1, {}),
+        (f"@{tmp_path / 'map.npy'}", np.eye(3), {}),
+        (f"@{tmp_path / 'config.json'}", {"gain": 0.1}, {}),
+        ("-", [1, 2], {"input": "[1, 2]\n"}),
+    ):
+        assert cli.result("set", "foo.new", value, **options) == ""
+        assert_same(kvs["foo"]["new"].read(), expected)
+    cli.result("set", "--str", "foo.names[-1]", "@home")
+    assert kvs["foo"]["names"].read() == ["left", "@home"]
+
+
+def test_what_cannot_be_set_is_refused_before_anything_is_sent(cli, kvs, raw, tmp_path):
+    (tmp_path / "x.npy").write_bytes(b"\x93NUMPY nonsense")
+    with nothing_sent(raw):
+        assert "for text add --str" in cli.error(2, "set", "foo.new", "hello")
+        assert "NaN" in cli.error(2, "set", "foo.new", "[NaN]")
+        assert "no option --pubslish" in cli.error(2, "set", "foo.new", "--pubslish")
+        assert ".json or .npy" in cli.error(2, "set", "foo.new", "@picture.png")
+        assert "No such file" in cli.error(1, "set", "foo.new", f"@{tmp_path / 'none.npy'}")
+        assert "not an .npy file" in cli.error(1, "set", "foo.new", f"@{tmp_path / 'x.npy'}")
+    assert "there is no foo.nix to write into" in cli.error(1, "set", "foo.nix.x", "1")
+    assert "18446744073709551616" in cli.error(2, "set", "foo.new", "18446744073709551616")
+
+
+def test_delete(cli, kvs):
+    cli.result("del", "foo.names[0]")
+    assert kvs["foo"]["names"].read() == ["right"]
+    cli.result("del", "foo")
+    assert kvs.get("foo", "gone") == "gone"
+    assert "nothing is stored at foo" in cli.error(3, "del", "foo")
+
+
+@pytest.mark.parametrize(("answer", "code"), [(b"n\n", 1), (b"y\n", 0)])
+def test_a_terminal_is_asked_before_a_whole_key_goes(cli, kvs, answer, code):
+    shown, got = cli.in_terminal("del", "cam_left", keys=[(b"[y/N]", answer)])
+    assert got == code
+    assert "Delete cam_left (float64[40,50]) at " in shown
+    assert kvs.get("cam_left", None) is None if code == 0 else kvs["cam_left"].read().shape == (40, 50)
+    if code == 0:
+        assert cli.in_terminal("del", "cam_right", "--yes") == ("", 0)
+
+
+def test_subscribers_are_told_if_wanted(cli, kvs):
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        updates = blocking.KeyValueStore(interface)["foo"]["number"].watch(blocking.Every(100))
+        assert next(updates).initial
+        cli.result("set", "foo.number", "2")
+        cli.result("set", "foo.number", "3", "--publish")
+        assert next(updates).data == 3
+        run = cli("pub", "foo.number", "4", "--count", "3", "--rate", "200")
+        assert (run.exit_code, run.stdout) == (0, "")
+        assert run.stderr.startswith("published 3 times")
+        assert [next(updates).data for _ in range(3)] == [4, 4, 4]
+        assert cli("pub", "foo.number", "5").stderr == ""
+        assert next(updates).data == 5
+        cli.result("del", "foo.number", "--publish")
+        assert next(updates).data is None
+
+
+def test_publishing_until_ctrl_c(cli, kvs):
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        updates = blocking.KeyValueStore(interface)["foo"]["number"].watch(blocking.Every(10_000))
+        assert next(updates).initial
+        with cli.running("pub", "foo.number", "-7", "--rate", "100") as process:
+            assert [next(updates).data for _ in range(10)] == [-7] * 10
+            process.send_signal(signal.SIGINT)
+            said, errors = process.communicate(timeout=10)
+    assert (process.returncode, said) == (0, "")
+    assert errors.startswith("published ")
+
+
+# --- the terminal and the pipe -------------------------------------------------
+
+
+def test_colours_and_widths_are_those_of_the_terminal(cli, kvs):
+    wide, code = cli.in_terminal("ls")
+    assert code == 0
+    assert "\x1b[" in wide
+    narrow, _ = cli.in_terminal("ls", columns=44)
+    lines = narrow.replace("\x1b[1m", "").replace("\x1b[0m", "").replace("\x1b[36m", "").replace("\x1b[32m", "")
+    assert all(len(line) <= 44 for line in lines.split("\r\n")), lines
+    assert "…" in lines
+    assert "\x1b" not in cli.process("ls").stdout
+
+
+def test_a_closed_pipe_is_no_error(cli, kvs):
+    kvs["many"] = {f"key{number}": "x" * 100 for number in range(3000)}  # more than a pipe holds
+    with cli.running("tree", "many", "--all") as process:
+        assert process.stdout.readline().startswith("many")
+        process.stdout.close()
+        assert process.stderr.read() == ""
+        assert process.wait(10) == 0
+
+
+def test_ctrl_c_ends_what_is_not_live_with_130(cli):
+    """A server that never answers: the command waits, and can be interrupted."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        cli.url = f"redis://127.0.0.1:{silent.getsockname()[1]}"
+        with cli.running("ls") as process:
+            connection, _ = silent.accept()
+            with connection:
+                connection.recv(1)
+                process.send_signal(signal.SIGINT)
+                said, errors = process.communicate(timeout=10)
+    assert (process.returncode, said, errors) == (130, "", "")

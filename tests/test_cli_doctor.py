@@ -1,0 +1,237 @@
+"""`reem doctor`: what it finds on servers that are as they should be, and on those that are not."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import socket
+import subprocess
+import urllib.parse
+
+import pytest
+import redis
+from conftest import eventually
+from test_cli import CommandLine
+
+from reem_async._server_programs import find_program
+from reem_async.cli import checks
+from reem_async.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts
+from reem_async.errors import ServerMissing
+from reem_async.server import EmbeddedServer
+
+
+@pytest.fixture(scope="module")
+def own():
+    """A private server and its administrator's client."""
+    with contextlib.ExitStack() as stack:
+        try:
+            url = stack.enter_context(EmbeddedServer()).url
+        except ServerMissing as missing:
+            pytest.skip(f"needs a server of its own: {missing}")
+        yield url, stack.enter_context(redis.Redis.from_url(url, decode_responses=True))
+
+
+def findings(run):
+    """The report by check, as dicts of status, message, remedy."""
+    rows = [json.loads(line) for line in run.stdout.splitlines()]
+    assert all(set(row) == {"check", "status", "message", "remedy"} for row in rows)
+    return {row["check"]: row for row in rows}
+
+
+def test_a_server_as_it_should_be(own):
+    url, admin = own
+    run = CommandLine(url, "robot:")("doctor", "--json")
+    assert run.exit_code == 0, run.stderr
+    report = findings(run)
+    statuses = {name: row["status"] for name, row in report.items()}
+    assert statuses.pop("small read") in (OK, WARN)  # a matter of the machine
+    assert statuses.pop("1 MB array") in (OK, WARN)
+    assert statuses.pop("clock") == OK
+    assert statuses.pop("persistence") == WARN  # this server keeps nothing
+    assert set(statuses.values()) == {OK}
+    assert admin.info("server")["redis_version"] in run.stdout or "valkey" in report["server"]["message"]
+    assert report["json"]["message"].startswith("RedisJSON 2.")
+    assert re.search(r"median \S+ ms, p99 \S+ ms, of \d+$", report["small read"]["message"])
+    assert "33.6 MB" in report["subscribers"]["message"]
+    assert {"server", "libraries", "[server]", "[fast]"} <= set(report)
+    assert admin.dbsize() == 0
+
+
+def test_the_installed_command_in_a_pipe_and_in_a_terminal(own):
+    cli = CommandLine(own[0], "robot:")
+    run = cli.process("doctor", "--no-write")
+    assert (run.returncode, run.stderr) == (0, "")
+    lines = {line.split("\t")[1]: line.split("\t") for line in run.stdout.splitlines()}
+    assert lines["1 MB array"][:3] == ["unknown", "1 MB array", "left out by --no-write"]
+    assert lines["persistence"][0] == "warn"
+    assert "reem up --directory" in lines["persistence"][3]
+    shown, code = cli.in_terminal("doctor", "--no-write", columns=50)
+    assert code == 0
+    assert "\x1b[32m✓" in shown
+    assert "→ if it must outlive" in shown
+
+
+def test_nobody_there():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    run = CommandLine(f"redis://:hidden-4711@127.0.0.1:{port}", "")("doctor", "--json")
+    assert run.exit_code == 1
+    report = findings(run)
+    assert report["server"]["status"] == FAIL
+    assert "reem up" in report["server"]["message"]
+    assert report["libraries"]["status"] == OK
+    assert "hidden" not in run.output
+
+
+def test_a_user_who_may_do_little(own):
+    """It says what it could not look at, and what would be needed."""
+    url, admin = own
+    rules = ["reset", "on", ">hidden-4711", "~robot:*", "&*", "-@all", "+json.get", "+json.type", "+hello", "+auth"]
+    admin.execute_command("ACL", "SETUSER", "guest", *rules)
+    parts = urllib.parse.urlsplit(url)
+    cli = CommandLine(f"redis://guest:hidden-4711@127.0.0.1:{parts.port}", "robot:")
+    run = cli("doctor", "--json")
+    assert run.exit_code == 0, run.output
+    report = findings(run)
+    for name in ("1 MB array", "clock", "memory", "eviction", "subscribers", "persistence"):
+        assert report[name]["status"] == UNKNOWN, name
+    assert report["memory"]["remedy"] == "ask as an administrator, or allow +info"
+    assert report["subscribers"]["remedy"] == "ask as an administrator, or allow +config|get"
+    assert report["small read"]["status"] in (OK, WARN)
+    assert "with password, without TLS" in report["access"]["message"]
+    assert "hidden" not in run.output
+    said = cli.error(1, "ls")
+    assert "does not let this user do that" in said
+    assert "scan" in said
+
+
+def test_a_server_that_throws_keys_away(own):
+    url, admin = own
+    admin.config_set("maxmemory", "200mb")
+    admin.config_set("maxmemory-policy", "allkeys-lru")
+    admin.config_set("client-output-buffer-limit", "pubsub 1000000 0 0")
+    try:
+        report = findings(CommandLine(url, "")("doctor", "--json", "--no-write"))
+    finally:
+        admin.config_set("maxmemory", "0")
+        admin.config_set("maxmemory-policy", "noeviction")
+        admin.config_set("client-output-buffer-limit", "pubsub 33554432 8388608 60")
+    assert report["eviction"]["status"] == WARN
+    assert "allkeys-lru" in report["eviction"]["message"]
+    assert "noeviction" in report["eviction"]["remedy"]
+    assert report["subscribers"]["status"] == WARN
+    assert "1.0 MB" in report["subscribers"]["message"]
+    assert "of 209.7 MB (maxmemory)" in report["memory"]["message"]
+
+
+def answers(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def test_a_server_without_json(tmp_path):
+    try:
+        program = find_program()
+    except ServerMissing as missing:
+        pytest.skip(f"needs a server of its own: {missing}")
+    if not program.modules:
+        pytest.skip("this server has JSON built in")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [program.path, "--port", str(port), "--bind", "127.0.0.1", "--save", ""]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=tmp_path) as process:
+        try:
+            eventually(lambda: answers(port))
+            cli = CommandLine(f"redis://127.0.0.1:{port}", "")
+            run = cli("doctor", "--json")
+            said = cli.error(1, "ls")
+        finally:
+            process.kill()
+    assert run.exit_code == 1
+    report = findings(run)
+    assert report["json"]["status"] == FAIL
+    assert "Redis 8" in report["json"]["remedy"]
+    assert report["server"]["status"] == OK
+    assert report["1 MB array"]["status"] in (OK, WARN)
+    assert "small read" not in report
+    assert "no RedisJSON" in said
+
+
+# --- what the facts mean -------------------------------------------------
+
+
+def status(check, info=None, config=None):
+    return check(Facts(info, config)).status
+
+
+def test_persistence():
+    saved = {"rdb_last_bgsave_status": "ok", "aof_enabled": "0"}
+    assert status(checks.persistence, {**saved, "aof_enabled": "1"}) == OK
+    assert status(checks.persistence, saved, {"save": "3600 1"}) == OK
+    assert status(checks.persistence, saved, {"save": ""}) == WARN
+    assert status(checks.persistence, saved, None) == UNKNOWN
+    assert status(checks.persistence, {**saved, "rdb_last_bgsave_status": "err"}, {"save": "3600 1"}) == FAIL
+    assert status(checks.persistence, {"aof_last_write_status": "err", "aof_enabled": "1"}) == FAIL
+
+
+def test_memory_and_eviction():
+    assert status(checks.memory, {"used_memory": "95", "maxmemory": "100"}) == WARN
+    assert status(checks.memory, {"used_memory": "5", "maxmemory": "0", "total_system_memory": "100"}) == OK
+    assert status(checks.memory, {"used_memory": "95", "maxmemory": "0", "total_system_memory": "100"}) == WARN
+    assert status(checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "0"}) == OK
+    assert status(checks.eviction, {"maxmemory_policy": "allkeys-lru", "maxmemory": "9"}) == WARN
+    assert status(checks.eviction, {"evicted_keys": "3"}) == FAIL
+
+
+def test_subscribers():
+    def limits(text, **info):
+        return status(checks.subscribers, info, {"client-output-buffer-limit": text})
+
+    assert limits("normal 0 0 0 slave 1 1 1 pubsub 33554432 8388608 60") == OK
+    assert limits("pubsub 0 0 0") == OK
+    assert limits("pubsub 1000 0 0") == WARN
+    assert limits("pubsub 33554432 8388608 60", client_output_buffer_limit_disconnections="2") == WARN
+    assert limits("normal 0 0 0") == UNKNOWN
+    assert status(checks.subscribers, {}, None) == UNKNOWN
+
+
+def test_clock_and_latency():
+    assert checks.clock(0.005, 0.001).status == OK
+    assert checks.clock(0.05, 0.045).status == OK  # it may be the way there
+    assert checks.clock(-3.0, 0.001) == (
+        "clock",
+        WARN,
+        "the server's clock is 3000.0 ms behind, give or take 1.0 ms",
+        "set both by NTP or chrony; until then `reem delay` and time stamps are off by as much",
+    )
+    slow = checks.latency("small read", "a value", [0.01] * 197 + [0.5] * 3, large=False)
+    assert (slow.status, slow.message) == (WARN, "a value: median 10.00 ms, p99 500.00 ms, of 200")
+    assert checks.latency("1 MB array", "an array", [0.01], large=True).status == OK
+
+
+def test_access():
+    def statuses(**how):
+        known = {"address": "robot:6379", "loopback": False, "tls": True, "password": True}
+        return [finding.status for finding in checks.who("default", **{**known, **how})]
+
+    assert statuses() == [OK]
+    assert statuses(tls=False) == [WARN]
+    assert statuses(password=False) == [WARN]
+    assert statuses(password=False, tls=False) == [WARN, WARN]
+    assert statuses(password=False, tls=False, loopback=True) == [OK]
+    assert checks.is_loopback("127.0.0.1")
+    assert checks.is_loopback("localhost")
+    assert not checks.is_loopback("192.0.2.1")
+    assert not checks.is_loopback("no-such-host.invalid")
+
+
+def test_versions_of_redis_8_and_of_a_cluster():
+    info = {"redis_version": "8.2.1", "redis_mode": "standalone", "uptime_in_seconds": "7200"}
+    assert checks.version(Facts(info, None), "robot:6379").message == (
+        "redis 8.2.1 at robot:6379, standalone, up for 2.0 hours"
+    )
+    assert checks.version(Facts({**info, "redis_mode": "cluster"}, None), "robot:6379").status == WARN
+    modules = "name=bf,ver=80200,api=1\nname=ReJSON,ver=80201,api=1"
+    assert checks.json_support(Facts({"module": modules}, None), "").message == "RedisJSON 8.2.1"
+    assert checks.json_support(Facts({}, None), "use Redis 8").status == FAIL

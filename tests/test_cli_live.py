@@ -1,0 +1,318 @@
+"""echo, hz, bw and delay: what is heard, what is counted, and how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+import redis
+from conftest import eventually
+from test_cli import CommandLine
+
+import reem as blocking
+from reem_async.cli import following
+from reem_async.cli.following import Ending, follow
+from reem_async.cli.windows import BANDWIDTH, DELAY, RATE, Window, spread
+from reem_async.connection import RedisInterface
+from reem_async.monitor import Event
+from reem_async.plan.keys import keys_of
+from reem_async.plan.notices import announce
+
+
+@pytest.fixture
+def cli(server_url, key):
+    return CommandLine(server_url, f"{key.prefix}:")
+
+
+@pytest.fixture
+def space(cli):
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        yield blocking.PublishSpace(interface)
+
+
+@pytest.fixture
+def listening(cli, raw):
+    """Starts a live command and waits until it is subscribed."""
+
+    @contextlib.contextmanager
+    def start(*arguments):
+        before = raw.execute_command("PUBSUB", "NUMPAT")
+        with cli.running(*arguments) as process:
+            eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") > before)
+            yield process
+
+    return start
+
+
+@pytest.fixture
+def announced(cli):
+    """Publishes notices with numbers, times and sizes of the test's choice."""
+    with redis.Redis.from_url(cli.url) as client:
+
+        def publish(name, sequence, *, age=0.0, size=0, path=()):
+            channel = keys_of(name, cli.namespace, client.connection_pool.connection_kwargs.get("db", 0)).channel
+            client.publish(channel, announce("a-test", sequence, time.time() - age, path, size=size))
+
+        yield publish
+
+
+def ended(process, number=signal.SIGINT):
+    """Send a signal; the exit code, what was said and what was said on standard error."""
+    process.send_signal(number)
+    said, errors = process.communicate(timeout=10)
+    assert "Traceback" not in errors
+    return process.returncode, said, errors
+
+
+# --- echo -------------------------------------------------
+
+
+def test_echo_for_people(space, listening, announced):
+    with listening("echo", "foo", "bar.*.x") as process:
+
+        def line():
+            moment, path, what = process.stdout.readline().rstrip("\n").split("  ")
+            assert len(moment) == len("12:34:56.123456")
+            return path, what
+
+        space["foo"] = {"number": 1, "small": np.arange(3), "raw": b"ab", "evil": "\x1b[31m\x9b"}
+        assert line() == (
+            "foo",
+            '{"number":1,"small":"int64[3] [0 1 2]","raw":"<bytes, 2 B>","evil":"\\u001b[31m\\u009b"}',
+        )
+        space["foo"]["image"] = np.zeros(50_000)
+        assert line() == ("foo.image", "<400.2 kB, not fetched>")
+        space["foo"]["number"] += 1
+        assert line() == ("foo.number", "<changed, not fetched>")
+        space["bar"] = {"left": {"x": 1, "y": 2}}
+        assert line() == ("bar", '{"left":{"x":1,"y":2}}')
+        space["bar"]["left"]["y"] = 3  # nothing that was asked for
+        space["bar"]["left"]["x"] = 4
+        assert line() == ("bar.left.x", "4")
+        del space["foo"]["raw"]
+        assert line() == ("foo.raw", "deleted")
+        announced("foo", 1)
+        announced("foo", 5)
+        assert line()[0] == "foo"
+        assert process.stdout.readline() == "# 3 updates were lost before the next line\n"
+        assert line()[0] == "foo"
+        code, rest, errors = ended(process)
+    assert (code, rest) == (0, "")
+    assert errors.startswith("8 updates of 6 paths in ")
+    assert errors.endswith(" s, 3 lost\n")
+
+
+def test_echo_for_programs(space, listening):
+    with listening("echo", "foo", "--json", "--count", "3") as process:
+        before = time.time()
+        space["foo"] = {"image": np.arange(2.0)}
+        space["foo"]["big"] = "x" * 20_000
+        del space["foo"]["image"]
+        said, errors = process.communicate(timeout=10)
+    assert process.returncode == 0
+    assert errors.startswith("3 updates of 3 paths")
+    first, second, third = map(json.loads, said.splitlines())
+    assert first["value"] == {"image": [0.0, 1.0]}
+    assert before <= first["time"] <= first["received"] + 0.001 <= time.time() + 0.001
+    assert (first["sequence"], second["sequence"], third["sequence"]) == (1, 2, 3)
+    assert "value" not in second
+    assert second["size"] == 20_002
+    assert third["deleted"] is True
+    assert [each[name] for each in (first, second, third) for name in ("missed", "gap", "skipped")] == [0, False, 0] * 3
+
+
+def test_echo_fetches_if_asked(space, listening):
+    with listening("echo", "foo", "--fetch", "--count", "1") as process:
+        space["foo"] = np.full(5000, 7)
+        said, _ = process.communicate(timeout=10)
+    assert said.rstrip().endswith("foo  int64[5000] [7 7 7 ... 7 7 7]")
+
+
+def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
+    with listening("echo", "foo") as process:
+        space["foo"] = 1
+        assert process.stdout.readline().endswith("foo  1\n")
+        patterns = raw.execute_command("PUBSUB", "NUMPAT")
+        for row in raw.client_list():
+            if int(row.get("psub", 0)):
+                raw.client_kill_filter(_id=row["id"])
+        assert "made again" in process.stderr.readline()
+        eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") == patterns)
+        space["foo"] = 2
+        assert process.stdout.readline() == "# a gap: the connection broke, or an update was unreadable\n"
+        assert process.stdout.readline().endswith("foo  2\n")
+        code, _, errors = ended(process, signal.SIGTERM)
+    assert code == 0
+    assert "0 lost, 1 gaps of unknown length" in errors
+
+
+def test_waiting_in_vain(cli):
+    run = cli("echo", "foo", "--timeout", "0.2")
+    assert (run.exit_code, run.stdout) == (4, "")
+    assert "only what a PublishSpace writes is heard" in run.stderr
+
+
+async def test_how_waiting_ends(cli, space):
+    async with RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        for count, code in ((None, 0), (1, 0), (2, 4)):
+            tick = once(lambda: space["foo"].write(1))
+            ending = await follow(interface, ("foo",), lambda *_: None, count=count, seconds=0.5, every=0.05, tick=tick)
+            assert (ending.taken, ending.tell()) == (1, code)
+
+
+def test_a_pipe_that_has_seen_enough(space, listening):
+    with listening("echo", "foo") as process:
+        space["foo"] = 1
+        assert process.stdout.readline().endswith("foo  1\n")
+        process.stdout.close()
+        space["foo"] = 2
+        assert process.wait(10) == 0
+        assert process.stderr.read() == ""
+
+
+async def test_what_comes_too_fast_is_counted(cli, space, monkeypatch):
+    monkeypatch.setattr(following, "_WAITING", 3)
+    seen = []
+
+    async def slow(event, ending):
+        if not seen:
+            for number in range(20):  # blocks the event loop: all of these arrive at once
+                space["foo"] = number
+        seen.append((event.value, ending.skipped))
+
+    async with RedisInterface(cli.url, namespace=cli.namespace) as interface:
+        tick = once(lambda: space["foo"].write(-1))
+        ending = await follow(interface, ("foo",), slow, seconds=0.5, every=0.05, tick=tick)
+    assert seen[0] == (-1, 0)
+    assert ending.skipped == 21 - ending.taken > 0
+    assert seen[-1] == (19, ending.skipped)
+    assert not ending.timed_out
+
+
+def once(function):
+    """What calls a function when it is called first."""
+    left = [function]
+
+    def call(_):
+        if left:
+            left.pop()()
+
+    return call
+
+
+# --- hz, bw, delay -------------------------------------------------
+
+
+def test_bw_counts_the_bytes_that_notices_announce(listening, announced):
+    with listening("bw", "cam", "--json", "--count", "4", "--every", "60") as process:
+        for sequence, size in enumerate((1000, 3000, 2000, 2000), start=1):
+            announced("cam", sequence, size=size)
+        said, _ = process.communicate(timeout=10)
+    (line,) = said.splitlines()
+    got = json.loads(line)
+    assert process.returncode == 0
+    assert got["bytes"] == {"mean": 2000.0, "min": 1000, "max": 3000, "std": pytest.approx(707.1, abs=0.1)}
+    assert got["bytes_per_s"] > 0
+    assert (got["path"], got["updates"], got["window"], got["lost"], got["final"]) == ("cam", 4, 4, 0, True)
+
+
+def test_delay_is_by_both_clocks(listening, announced):
+    with listening("delay", "cam", "--count", "2", "--every", "60") as process:
+        announced("cam", 1, age=5.0)
+        announced("cam", 2, age=-5.0)  # a publisher whose clock is ahead
+        said, errors = process.communicate(timeout=10)
+    found = re.fullmatch(r"cam: delay in ms: mean (\S+) min (\S+) max (\S+) std (\S+), window 2, lost 0\n", said)
+    assert list(map(float, found.groups()[1:])) == pytest.approx([-5000, 5000, 5000], abs=2500)
+    assert "difference of their clocks" in errors
+
+
+def test_hz_reports_as_it_goes_and_at_the_end(listening, announced):
+    with listening("hz", "cam_*", "--every", "0.1", "--window", "2") as process:
+        for sequence in (1, 2, 4):
+            announced("cam_left", sequence)
+        announced("cam_right", 1, path=("x", 0))
+        announced("foo", 1)
+        heard = ""
+        while "cam_right.x[0]: one update so far" not in heard or "window 2, lost 1" not in heard:
+            line = process.stdout.readline()
+            assert line
+            heard += line
+        code, rest, errors = ended(process)
+    assert code == 0
+    final = rest.splitlines()[-2:]
+    assert final[0].startswith("cam_left: ")
+    assert " Hz, interval in ms: mean " in final[0]
+    assert final[0].endswith(", window 2, lost 1")
+    assert final[1] == "cam_right.x[0]: one update so far, window 1, lost 0"
+    assert errors.startswith("4 updates of 2 paths in ")
+    assert "foo" not in heard + rest
+
+
+@pytest.mark.parametrize("columns", [100, 50])
+def test_the_live_table_in_a_terminal(cli, columns, announced, raw):
+    """A row for a path appears, Ctrl-C ends it, and the table stays on the screen."""
+    before, stop = raw.execute_command("PUBSUB", "NUMPAT"), threading.Event()
+
+    def publish():
+        eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") > before)
+        sequence = 0
+        while not stop.wait(0.02):
+            sequence += 1
+            announced("camera", sequence, size=1000)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        shown, code = cli.in_terminal("hz", "cam*", keys=[(b"camera", b"\x03")], columns=columns)
+    finally:
+        stop.set()
+        thread.join()
+    assert code == 0
+    assert "waiting for updates of cam*" in shown
+    last = shown.rsplit("lost", 2)[-2]
+    assert "camera" in last
+    assert ("std ms" in shown) == (columns == 100)
+    assert "of 1 path in" in shown
+
+
+def event(received, *, sent=0.0, size=0, missed=0):
+    return Event(("p",), None, False, size, sent, received, "publisher", 1, missed)
+
+
+def test_what_a_window_says():
+    window = Window(4)
+    assert (window.rate(), window.bandwidth(), spread(window.intervals())) == (None, None, None)
+    for number, received in enumerate((0.0, 10.0, 10.1, 10.3, 10.6)):
+        window.add(event(received, sent=received - 0.002 * number, size=100 * number, missed=number == 2))
+    assert (window.total, window.lost) == (5, 1)
+    assert window.rate() == pytest.approx(3 / 0.6)
+    assert window.bandwidth() == pytest.approx((200 + 300 + 400) / 0.6)
+    assert window.intervals() == pytest.approx([0.1, 0.2, 0.3])
+    assert spread(window.delays) == pytest.approx((0.005, 0.002, 0.008, 0.002236), abs=1e-5)
+    assert RATE.cells(window) == ("5.00", "200.00", "100.00", "300.00", "81.65")
+    assert BANDWIDTH.cells(window) == ("1.5 kB/s", "250 B", "100 B", "400 B", "112 B")
+    assert DELAY.cells(window)[:3] == ("5.00", "2.00", "8.00")
+    assert RATE.line(window) == "5.00 Hz, interval in ms: mean 200.00 min 100.00 max 300.00 std 81.65"
+
+
+def test_updates_that_came_at_once_have_no_rate():
+    window = Window(10)
+    window.add(event(5.0))
+    window.add(event(5.0))
+    assert (window.rate(), window.bandwidth()) == (None, None)
+    assert RATE.cells(window)[0] == "-"
+
+
+def test_the_last_line(capsys):
+    ending = Ending(taken=2, lost=1, skipped=3, gaps=1, seconds=1.25, paths={"a", "b"}, timed_out=True)
+    assert ending.tell() == 4
+    said = capsys.readouterr().err
+    assert said == (
+        "2 updates of 2 paths in 1.2 s, 1 lost, 1 gaps of unknown length, 3 skipped here, since they came too fast\n"
+    )
