@@ -48,13 +48,23 @@ class PortTaken(ServerFailed):
 class ServerProcess:
     """A server that is up: loopback port (0: none), unix socket, data in `directory` (None: in memory).
 
+    It begins with the data of the file `rdb`, if there is one; a `directory` must have no data of its own then.
+
     The process started here is the watchdog (see `_server_watchdog.py`), the server is its child.
 
     Raises:
         ServerFailed: it did not come up; nothing is left behind.
     """
 
-    def __init__(self, program: ServerProgram, *, port: int, directory: Path | None, password: str | None) -> None:
+    def __init__(
+        self,
+        program: ServerProgram,
+        *,
+        port: int,
+        directory: Path | None,
+        password: str | None,
+        rdb: Path | None = None,
+    ) -> None:
         self.port = port
         self.scratch = _private_directory()
         self.directory = directory or self.scratch
@@ -62,13 +72,19 @@ class ServerProcess:
         self.socket_path = str(self.scratch / "redis.sock")
         self.pid = 0
         self._watchdog: subprocess.Popen[bytes] | None = None
+        self._planted: Path | None = None
         self._ended = False
         self._owner = os.getpid()
         try:
+            self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if rdb is not None:
+                self._plant(rdb, keep=directory is not None)
             offset = self._spawn(program, self._config(program, directory is not None, password), directory)
             self._wait_until_ready(program, offset, password)
         except BaseException as error:
             self.stop()
+            if self._planted is not None:
+                shutil.rmtree(self._planted, ignore_errors=True)
             if isinstance(error, OSError):
                 raise ServerFailed(f"the server could not be started: {error}") from error
             raise
@@ -141,11 +157,22 @@ class ServerProcess:
             lines.append(f"requirepass {_quoted(password.encode())}")
         return "\n".join(lines) + "\n"
 
+    def _plant(self, rdb: Path, *, keep: bool) -> None:
+        """Put a copy of an RDB file where a server that starts in the directory loads it."""
+        if not keep:
+            shutil.copyfile(rdb, self.directory / "dump.rdb")
+            return
+        # A server that appends to a log loads nothing else: the file becomes the base of that log.
+        log = self.directory / "appendonlydir"
+        log.mkdir(mode=0o700)
+        self._planted = log
+        shutil.copyfile(rdb, log / "appendonly.aof.1.base.rdb")
+        (log / "appendonly.aof.manifest").write_text("file appendonly.aof.1.base.rdb seq 1 type b\n")
+
     def _spawn(self, program: ServerProgram, config: str, lock: Path | None) -> int:
         """Start watchdog and server; returns where in the log this run begins."""
         if not sys.executable:
             raise ServerFailed("sys.executable is empty: an embedded server needs a Python interpreter to run")
-        self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         fresh = not self.log.exists() or self.log.stat().st_size > LOG_BYTES
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | (os.O_TRUNC if fresh else 0)
         with os.fdopen(os.open(self.log, flags, 0o600), "ab") as log:
@@ -237,6 +264,11 @@ def _close_pipes(process: subprocess.Popen[bytes]) -> None:
         if pipe is not None:
             with suppress(OSError):
                 pipe.close()
+
+
+def has_data(directory: Path) -> bool:
+    """Whether a server has kept data in the directory."""
+    return any((directory / name).exists() for name in ("appendonlydir", "appendonly.aof", "dump.rdb"))
 
 
 def _private_directory() -> Path:

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 import socket
 import threading
 import weakref
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 from urllib.parse import quote
 
 import anyio
 import anyio.to_thread
 
-from reem_async._server_process import HOST, PortTaken, ServerProcess
+from reem_async._server_process import HOST, PortTaken, ServerProcess, has_data
 from reem_async._server_programs import find_program
 from reem_async.errors import BadValue, Misuse, ServerFailed
 
 __all__ = ["EmbeddedServer"]
 
 ATTEMPTS = 10  # to find a port that nobody takes in the moment before the server does
+FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored
 PASSWORD_BYTES = 512  # the server's own limit
 
 
@@ -47,6 +49,7 @@ class EmbeddedServer:
         port: int = 0,
         directory: str | os.PathLike[str] | None = None,
         password: str | None = None,
+        snapshot: str | os.PathLike[str] | None = None,
     ) -> None:
         """Prepare a server; `start` or a `with` block starts it.
 
@@ -55,6 +58,8 @@ class EmbeddedServer:
             directory: where the data is kept from one start to the next; made if missing. None keeps it in
                 memory, and it is gone with the server.
             password: what every client has to give, on the unix socket too.
+            snapshot: a file of either kind (see `reem_async.snapshots`) that the server begins with, under the
+                namespace it was taken of. The directory, if there is one, must hold no data yet.
 
         Raises:
             BadValue: a port or password that no server takes.
@@ -68,6 +73,7 @@ class EmbeddedServer:
         self._wanted_port = port
         self._wanted_directory = None if directory is None else Path(directory).absolute()
         self._password = password
+        self._snapshot = None if snapshot is None else Path(snapshot).absolute()
         self._lock = threading.Lock()
         self._owner: int | None = None
         self._process: ServerProcess | None = None
@@ -80,6 +86,9 @@ class EmbeddedServer:
             ServerMissing: no server program was found; says what to install.
             ServerFailed: the port is taken, the directory is in use or unusable, or the server ended; the
                 message holds the last lines of its log.
+            BadData: the snapshot is damaged, or no snapshot. No server is left running.
+            BadValue: there is a snapshot, and data in the directory.
+            FileNotFoundError: the snapshot is not there.
         """
         if self._is_in_fork():
             return
@@ -88,7 +97,7 @@ class EmbeddedServer:
                 return
             self._clear()
             self._owner = os.getpid()
-            self._process = self._run()
+            self._process = self._begun()
             # At the program's end, and when this object is forgotten.
             self._finalizer = weakref.finalize(self, self._process.stop)
 
@@ -170,14 +179,60 @@ class EmbeddedServer:
         with anyio.CancelScope(shield=True):
             await anyio.to_thread.run_sync(self.stop)
 
-    def _run(self) -> ServerProcess:
+    def _begun(self) -> ServerProcess:
+        """Start the server with what it begins with."""
+        if self._snapshot is None:
+            return self._run(None)
+        from reem_async.snapshots.files import sniff  # only programs that use snapshots load them
+
+        if self._wanted_directory is not None and has_data(self._wanted_directory):
+            raise BadValue(
+                f"{self._wanted_directory} holds a server's data, and {self._snapshot} would have to replace it: "
+                "give a new directory for the snapshot, or go on with that data without the snapshot"
+            )
+        if sniff(self._snapshot) == "rdb":
+            process = self._run(self._snapshot)
+        else:
+            process = self._run(None)
+            try:
+                self._fill(process, self._snapshot)
+            except BaseException:
+                process.stop()
+                if self._wanted_directory is not None:  # which was empty before
+                    shutil.rmtree(self._wanted_directory / "appendonlydir", ignore_errors=True)
+                raise
+        if self._wanted_directory is not None:
+            self._snapshot = None  # from now on the data is in the directory
+        return process
+
+    def _fill(self, process: ServerProcess, snapshot: Path) -> None:
+        """Restore a portable snapshot; on another thread, since this one may run an event loop already."""
+        import asyncio
+        from concurrent.futures import ThreadPoolExecutor
+
+        from reem_async.connection import RedisInterface
+        from reem_async.snapshots import described, restore
+
+        async def fill() -> None:
+            namespace = described(snapshot).namespace
+            login: dict[str, Any] = {} if self._password is None else {"password": self._password}
+            url = f"unix://{quote(process.socket_path)}"
+            async with RedisInterface(url, namespace=namespace, timeout=FILL_SECONDS, **login) as interface:
+                await restore(interface, snapshot)
+
+        with ThreadPoolExecutor(1, "reem-restore") as thread:
+            thread.submit(asyncio.run, fill()).result()
+
+    def _run(self, rdb: Path | None) -> ServerProcess:
         program = find_program()
         attempts = 1 if self._wanted_port else ATTEMPTS
         while True:
             attempts -= 1
             port = _bindable(self._wanted_port)
             try:
-                return ServerProcess(program, port=port, directory=self._wanted_directory, password=self._password)
+                return ServerProcess(
+                    program, port=port, directory=self._wanted_directory, password=self._password, rdb=rdb
+                )
             except PortTaken:  # by somebody who came between the look and the start
                 if not attempts:
                     raise

@@ -12,10 +12,15 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
+
+import reem
+import reem.snapshots
+from reem_async.server import EmbeddedServer
 
 ROOT = pathlib.Path(__file__).parents[1]
 REEM = [sys.executable, "-X", "dev", "-W", "error", "-c", "from reem_async.cli import main; main()"]
@@ -26,7 +31,7 @@ def environment(**changes: str) -> dict[str, str]:
     return {**clean, "PYTHONPATH": str(ROOT), **changes}
 
 
-def reem(*arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
+def reem_command(*arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [*REEM, *arguments],
         env=environment(**changes),
@@ -79,6 +84,34 @@ def test_up_until_told_to_stop(number):
             assert probe.connect_ex(("127.0.0.1", port)) != 0
 
 
+STORM = """
+import os, signal, threading
+from reem_async.cli.up import _Stop
+
+stop = _Stop()
+ended = threading.Event()
+
+def send():
+    while not ended.is_set():
+        os.kill(os.getpid(), signal.SIGINT)
+
+sender = threading.Thread(target=send)
+sender.start()
+assert all(stop.wait(1.0) for _ in range(20000))
+ended.set()
+sender.join()
+print("done")
+"""
+
+
+def test_a_signal_may_come_at_any_moment():
+    """Also while the main thread looks whether one has come, and while another is handled."""
+    run = subprocess.run(
+        [sys.executable, "-c", STORM], env=environment(), capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (run.stdout, run.returncode) == ("done\n", 0), run.stderr
+
+
 def test_says_what_to_type(tmp_path):
     with up("--port", "0", "--directory", str(tmp_path / "x" / ("long" * 20))) as (_, said):
         url = f"redis://127.0.0.1:{port_in(said)}"
@@ -105,7 +138,7 @@ def test_the_data_is_kept(tmp_path):
 def test_port_taken():
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        run = reem("up", "--port", str(port))
+        run = reem_command("up", "--port", str(port))
     assert run.returncode == 1
     assert run.stdout == ""
     assert f"port {port}" in run.stderr
@@ -139,7 +172,7 @@ def test_password(name):
     ],
 )
 def test_a_password_that_is_not_there_is_no_open_server(option, changes):
-    run = reem("up", "--port", "0", *option, **changes)
+    run = reem_command("up", "--port", "0", *option, **changes)
     assert run.returncode == 1
     assert "environment variable" in run.stderr
 
@@ -177,22 +210,84 @@ def test_ctrl_c_in_a_terminal_and_colours():
         stdout=subprocess.PIPE,
         bufsize=0,
     ) as process:
-        said = b""
+        said, told = b"", False
         while data := process.stdout.read(4096):
-            if b"Ctrl-C" in data:
-                process.stdin.write(b"\x03")
             said += data
+            if b"Ctrl-C" in said and not told:  # not in `data`: it may come in two parts
+                told = bool(process.stdin.write(b"\x03"))
         assert process.wait(10) == 0
     assert b"\x1b[" in said
     assert b"Stopped." in said
     assert b"Traceback" not in said
 
 
+@pytest.fixture
+def snapshots(tmp_path):
+    """A portable snapshot and an RDB file of the same server."""
+    with EmbeddedServer() as server, reem.RedisInterface(server, namespace="r1:") as interface:
+        reem.KeyValueStore(interface)["foo"] = {"x": np.arange(3), "n": 1.5}
+        reem.snapshots.save(interface, tmp_path / "a.zip")
+        reem.snapshots.save_rdb(interface, tmp_path / "b.rdb")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("name", "what"), [("a.zip", "1 key"), ("b.rdb", "3 Redis keys")])
+def test_from_a_snapshot(snapshots, name, what):
+    """A past state beside the live one: on a free port, under the namespace it was taken of."""
+    file = snapshots / name
+    before = file.read_bytes()
+    with up("--from", str(file)) as (process, said):
+        assert re.search(rf"snapshot  {re.escape(str(file))}, taken \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d, {what}", said)
+        assert ("under the namespace r1:" in said) == (name == "a.zip")
+        assert port_in(said) != 6379
+        with reem.RedisInterface(f"redis://127.0.0.1:{port_in(said)}", namespace="r1:") as interface:
+            kvs = reem.KeyValueStore(interface)
+            assert kvs["foo"]["x"].read().tolist() == [0, 1, 2]
+            kvs["foo"] = "changed"
+        process.terminate()
+        assert process.wait(10) == 0
+    assert file.read_bytes() == before
+
+
+def test_from_a_snapshot_into_a_directory(snapshots):
+    """Once; from then on the directory has the data."""
+    data = str(snapshots / "data")
+    with up("--from", str(snapshots / "a.zip"), "--directory", data, "--port", "0") as (process, _):
+        process.terminate()
+        process.wait(10)
+    run = reem_command("up", "--from", str(snapshots / "a.zip"), "--directory", data)
+    assert run.returncode == 1
+    assert "holds a server's data" in run.stderr
+    with (
+        up("--directory", data, "--port", "0") as (_, said),
+        reem.RedisInterface(f"redis://127.0.0.1:{port_in(said)}", namespace="r1:") as interface,
+    ):
+        assert reem.KeyValueStore(interface)["foo"]["n"].read() == 1.5
+
+
+def test_from_what_is_no_snapshot(snapshots):
+    """Said, with an exit code, and no server is left."""
+    whole = (snapshots / "a.zip").read_bytes()
+    (snapshots / "cut.zip").write_bytes(whole[:-10])
+    (snapshots / "cut.rdb").write_bytes((snapshots / "b.rdb").read_bytes()[:-60])
+    (snapshots / "text.zip").write_text("text")
+    for name, code, message in (
+        ("cut.zip", 1, "damaged"),
+        ("cut.rdb", 1, "did not start"),
+        ("text.zip", 1, "neither a snapshot"),
+        ("none.zip", 2, "none.zip"),
+    ):
+        run = reem_command("up", "--from", str(snapshots / name), COLUMNS="200")
+        assert run.returncode == code
+        assert message in run.stderr
+        assert "Traceback" not in run.stderr
+
+
 def test_version_and_help():
-    run = reem("--version")
+    run = reem_command("--version")
     assert (run.returncode, run.stderr) == (0, "")
     assert run.stdout.startswith("reem")
-    run = reem("--help")
+    run = reem_command("--help")
     assert (run.returncode, run.stderr) == (0, "")
     assert "up" in run.stdout
 

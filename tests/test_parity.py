@@ -75,7 +75,7 @@ def test_both_packages_export_the_same_names():
         assert not [name for name in package.__all__ if not hasattr(package, name)]
 
 
-@pytest.mark.parametrize("module", ["connection", "datatypes", "ships", "errors", "server"])
+@pytest.mark.parametrize("module", ["connection", "datatypes", "ships", "errors", "server", "snapshots"])
 def test_both_packages_have_the_same_documented_modules(module):
     """With the same public names."""
     names = [

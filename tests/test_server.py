@@ -19,15 +19,19 @@ import threading
 import time
 
 import anyio
+import anyio.to_thread
+import numpy as np
 import pytest
 import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
+import reem
 import reem.server
+import reem.snapshots
 from reem_async import _server_process, _server_programs
 from reem_async import server as server_module
-from reem_async.errors import BadValue, Misuse, ServerFailed, ServerMissing
+from reem_async.errors import BadData, BadValue, Misuse, ServerFailed, ServerMissing
 from reem_async.server import EmbeddedServer
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -687,3 +691,83 @@ class TestPrograms:
         monkeypatch.setattr(sys, "platform", "win32")
         with pytest.raises(ServerMissing, match="compose"):
             EmbeddedServer().start()
+
+
+# --- beginning with a snapshot -------------------------------------------------
+
+
+@pytest.fixture
+def snapshots(tmp_path):
+    """A portable snapshot and an RDB file of one server."""
+    with EmbeddedServer() as server, reem.RedisInterface(server) as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs["foo"] = {"x": np.arange(3), "n": 1.5}
+        kvs["image"] = np.zeros((1000, 1000))
+        reem.snapshots.save(interface, tmp_path / "a.zip")
+        reem.snapshots.save_rdb(interface, tmp_path / "b.rdb")
+    return tmp_path
+
+
+def holds_it(server: EmbeddedServer) -> bool:
+    with reem.RedisInterface(server) as interface:
+        kvs = reem.KeyValueStore(interface)
+        return kvs["foo"]["x"].read().tolist() == [0, 1, 2] and kvs["image"].read().shape == (1000, 1000)
+
+
+@pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
+def test_begins_with_a_snapshot(snapshots, name):
+    """In memory: each start begins with it anew. The file is not touched."""
+    before = (snapshots / name).read_bytes()
+    server = EmbeddedServer(password="p w", snapshot=snapshots / name)
+    for _ in range(2):
+        with server, client(server) as raw:
+            assert holds_it(server)
+            assert not raw.exists("mine")
+            raw.set("mine", 1)
+    assert (snapshots / name).read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
+def test_a_snapshot_into_a_directory(snapshots, name):
+    """The first start takes it over; what is written is kept, by this object and by others."""
+    data = snapshots / "data"
+    server = EmbeddedServer(directory=data, snapshot=str(snapshots / name))
+    for number in range(2):
+        with server, client(server) as raw:
+            assert holds_it(server)
+            assert raw.exists("mine") == number
+            raw.set("mine", 1)
+    (snapshots / name).unlink()
+    with EmbeddedServer(directory=data) as again, client(again) as raw:
+        assert holds_it(again)
+        assert raw.exists("mine")
+    with pytest.raises(BadValue, match="holds a server's data"):
+        EmbeddedServer(directory=data, snapshot=snapshots / name).start()
+
+
+async def test_a_snapshot_where_an_event_loop_runs(snapshots):
+    """Blocking, as in a notebook, and awaited."""
+    with EmbeddedServer(snapshot=snapshots / "a.zip") as server:
+        assert holds_it(server)
+    async with EmbeddedServer(snapshot=snapshots / "a.zip") as server:
+        assert await anyio.to_thread.run_sync(holds_it, server)
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_damaged_snapshot_leaves_no_server_and_no_data(snapshots, keep):
+    data = snapshots / "data" if keep else None
+    for name, kind, cut, error in (
+        ("cut.zip", "a.zip", 10, BadData),
+        ("cut.rdb", "b.rdb", 60, ServerFailed),
+        ("text.zip", "a.zip", None, BadData),
+        ("none.zip", "a.zip", 0, FileNotFoundError),
+    ):
+        if cut != 0:
+            (snapshots / name).write_bytes(b"text" if cut is None else (snapshots / kind).read_bytes()[:-cut])
+        server = EmbeddedServer(directory=data, snapshot=snapshots / name)
+        with pytest.raises(error):
+            server.start()
+        assert not server.running
+        assert data is None or not (data / "appendonlydir").exists()
+    with EmbeddedServer(directory=data, snapshot=snapshots / "b.rdb") as server:
+        assert holds_it(server)

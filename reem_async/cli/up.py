@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
-import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 from types import FrameType
@@ -14,15 +15,24 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from reem_async.errors import BadValue, ServerFailed, ServerMissing
+from reem_async.errors import BadData, BadValue, ServerFailed, ServerMissing
 from reem_async.server import EmbeddedServer
 
 PASSWORD_VARIABLE = "REEM_PASSWORD"  # noqa: S105 - the name of a variable
+DEFAULT_PORT = 6379
 LOOK_SECONDS = 0.5  # between looks whether the server is still there
 
 
 def up(
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port on 127.0.0.1; 0 takes a free one.")] = 6379,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            show_default="6379; a free one with --from",
+            help="TCP port on 127.0.0.1; 0 takes a free one.",
+        ),
+    ] = None,
     directory: Annotated[
         Path | None,
         typer.Option(file_okay=False, help="Keep the data here; without it, it is gone with the server."),
@@ -34,18 +44,38 @@ def up(
             help=f"Environment variable that holds the password; {PASSWORD_VARIABLE} is used if it is set.",
         ),
     ] = None,
+    snapshot: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            exists=True,
+            dir_okay=False,
+            help="Begin with what this snapshot holds, portable or RDB. A --directory must have no data yet.",
+        ),
+    ] = None,
 ) -> None:
-    """Start a private server and keep it up until Ctrl-C."""
+    """Start a private server and keep it up until Ctrl-C.
+
+    With --from, a past state can be looked at beside the live one, which is not touched.
+
+    Examples:
+      reem up
+      reem up --directory /var/lib/robot --port 6400
+      reem up --from reem-20260801T120000Z.zip
+    """
     variable = _password_variable(password_from_env)
-    stop = _stop_event()
+    if port is None:
+        port = 0 if snapshot else DEFAULT_PORT
+    stop = _Stop()
     try:
-        server = EmbeddedServer(port, directory, os.environ[variable] if variable else None)
+        server = EmbeddedServer(port, directory, os.environ[variable] if variable else None, snapshot)
         with server:
-            _describe(server, directory, variable)
+            _describe(server, directory, variable, snapshot)
             while not stop.wait(LOOK_SECONDS):
                 if not server.running:
                     _fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
-    except (BadValue, ServerFailed, ServerMissing) as error:
+    except (BadData, BadValue, OSError, ServerFailed, ServerMissing) as error:
         _fail(str(error))
     with suppress(OSError):  # the terminal may have closed
         Console().print(f"Stopped. The data is {'kept' if directory else 'gone'}.")
@@ -61,19 +91,29 @@ def _password_variable(name: str | None) -> str | None:
     return name
 
 
-def _stop_event() -> threading.Event:
-    """Set by Ctrl-C, by SIGTERM, and when the terminal closes."""
-    stop = threading.Event()
+class _Stop:
+    """Set by Ctrl-C, by SIGTERM, and when the terminal closes.
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
+    A pipe, not a `threading.Event`: a handler that runs while the main thread is inside of `Event.wait` would
+    wait for a lock that this very thread holds.
+    """
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, handle)
-    return stop
+    def __init__(self) -> None:
+        self._reader, self._writer = os.pipe()
+        os.set_blocking(self._writer, False)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._handle)
+
+    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+        with suppress(BlockingIOError):  # full: told often enough
+            os.write(self._writer, b"x")
+
+    def wait(self, seconds: float) -> bool:
+        """Return whether it was set, after so long at most."""
+        return bool(select.select([self._reader], [], [], seconds)[0])
 
 
-def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None) -> None:
+def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None, snapshot: Path | None) -> None:
     password = f', password=os.environ["{variable}"]' if variable else ""
     url = f"redis://127.0.0.1:{server.port}"
     connect = f'KeyValueStore(RedisInterface("{url}"{password}))'
@@ -81,6 +121,7 @@ def _describe(server: EmbeddedServer, directory: Path | None, variable: str | No
     console = Console()
     console.print(Text("REEM's server is up.", style="bold green"), f"(process {server.pid})")
     for label, value in (
+        *((("snapshot", _summary(snapshot)),) if snapshot else ()),
         ("address", url),
         ("socket", f"unix://{server.socket_path}"),
         (
@@ -94,6 +135,17 @@ def _describe(server: EmbeddedServer, directory: Path | None, variable: str | No
     ):
         # soft_wrap: a line to be copied stays one line, however narrow the terminal
         console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value), soft_wrap=True)
+
+
+def _summary(path: Path) -> str:
+    """What the server has begun with, and when that was."""
+    from reem_async.snapshots import described
+
+    it = described(path)
+    taken = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
+    count = "" if it.count is None else f", {it.count} {'keys' if it.kind == 'portable' else 'Redis keys'}"
+    under = f", under the namespace {it.namespace}" if it.namespace else ""
+    return f"{path}, taken {taken}{count}{under}"
 
 
 def _log_end(server: EmbeddedServer) -> str:

@@ -1,0 +1,406 @@
+"""`reem snapshot`: save what a server holds to files, list them, restore them."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.cli.lazy import help_text
+from reem_async.cli.options import DEFAULT_URL, AsJson, Namespace, Url
+from reem_async.cli.output import clean, columns, emit, emit_json, is_terminal, note, size_text, styled
+from reem_async.cli.running import FAILED, NOTHING, Refused, prepared, run
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.snapshots import Progress, Snapshot
+
+__all__ = ["app"]
+
+app = typer.Typer(rich_markup_mode="rich", help="Save what a server holds to files, list them, restore them.")
+
+_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+_NAMED = 3
+"""How many names a line of text has."""
+
+Match = Annotated[
+    str,
+    typer.Option(
+        "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
+    ),
+]
+
+
+def period(text: str) -> float:
+    """Return seconds from `90`, `30s`, `10m`, `1.5h` or `1d`; at least one."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd]?)", text.strip())
+    seconds = float(found[1]) * _UNITS[found[2]] if found else 0.0
+    if not 1.0 <= seconds <= 366 * 86400.0:
+        raise typer.BadParameter(f"{text!r} is no period of a second to a year; write it like 30s, 10m, 1.5h or 1d")
+    return seconds
+
+
+def save(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", show_default=False, help="The file to make. Without it, one named by time."),
+    ] = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option("--directory", "-d", metavar="DIR", show_default="here", help="Where to make one named by time."),
+    ] = None,
+    match: Match = "*",
+    rdb: Annotated[
+        bool,
+        typer.Option(
+            "--rdb",
+            help="Have the server save all it holds, foreign keys too, and copy its RDB file; a portable snapshot "
+            "where that cannot be had.",
+        ),
+    ] = False,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            "--every", metavar="PERIOD", parser=period, help="Go on until Ctrl-C: one each 30s, 10m, 1.5h or 1d."
+        ),
+    ] = None,
+    keep: Annotated[
+        int | None,
+        typer.Option(
+            "--keep", min=1, metavar="N", help="Leave the newest N, delete older ones that were saved with --keep."
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="FILE may be replaced.")] = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Save the keys of REEM to a file, or all of the server with --rdb.
+
+    A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant, and any
+    user who may read the keys can take it. Redis keys that are not REEM's are counted and left alone.
+
+    Examples:
+      reem snapshot save before.zip
+      reem snapshot save --match 'arm*' arm.zip
+      reem snapshot save -d /var/backups --every 10m --keep 24
+      reem snapshot save --rdb -d /var/backups
+    """
+    _check_options(file, directory, match, rdb=rdb, periodic=every is not None or keep is not None)
+    saver = _Saver(file, directory or Path(), match, rdb=rdb, keep=keep, overwrite=overwrite, as_json=as_json)
+
+    async def work(interface: RedisInterface) -> None:
+        if every is None:
+            await saver.once(interface)
+        else:
+            await saver.by_period(interface, every)
+
+    run("snapshot save", work, url, namespace, live=every is not None)
+
+
+def _check_options(file: Path | None, directory: Path | None, match: str, *, rdb: bool, periodic: bool) -> None:
+    if file is not None and (directory is not None or periodic):
+        raise typer.BadParameter(
+            "FILE cannot be combined with --directory, --every or --keep, which name files by time"
+        )
+    if rdb and match != "*":
+        raise typer.BadParameter("--rdb saves all of the server: leave out --match")
+
+
+class _Saver:
+    """Takes snapshots and says what it did."""
+
+    def __init__(
+        self,
+        file: Path | None,
+        directory: Path,
+        match: str,
+        *,
+        rdb: bool,
+        keep: int | None,
+        overwrite: bool,
+        as_json: bool,
+    ) -> None:
+        self._file = file
+        self._directory = directory
+        self._match = match
+        self._rdb = rdb
+        self._keep = keep
+        self._overwrite = overwrite
+        self._as_json = as_json
+        self._made: list[Path] = []
+        self._noted: set[str] = set()
+
+    async def once(self, interface: RedisInterface, *, bar: bool = True) -> None:
+        """Take one, delete what is too old, print a line."""
+        started = time.monotonic()
+        it = await self._saved(interface, bar)
+        gone = await asyncio.to_thread(self._pruned, it.path)
+        if self._as_json:
+            emit_json({**_facts(it), "seconds": time.monotonic() - started, "deleted": [str(path) for path in gone]})
+            return
+        deleted = f", deleted {', '.join(path.name for path in gone)}" if gone else ""
+        taken = f"{time.monotonic() - started:.2f} s"
+        emit(f"{styled(clean(str(it.path)), 'cyan')}: {_content(it)}, {taken}{clean(deleted)}")
+        sys.stdout.flush()
+        self._note_foreign(it)
+
+    async def by_period(self, interface: RedisInterface, every: float) -> None:
+        """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""
+        from reem_async.errors import RedisError, ReemError
+
+        start, turn = time.monotonic(), 0
+        try:
+            while True:
+                try:
+                    await self.once(interface, bar=False)
+                except (ReemError, RedisError, OSError) as error:
+                    if not self._made:
+                        raise
+                    note(f"reem snapshot save: not saved, next try in due time: {error}")
+                turn = max(turn + 1, int((time.monotonic() - start) / every))
+                await asyncio.sleep(start + turn * every - time.monotonic())
+        except asyncio.CancelledError:
+            note("Stopped; what is listed above is complete.")
+            raise
+
+    async def _saved(self, interface: RedisInterface, bar: bool) -> Snapshot:
+        from reem_async.snapshots import RdbUnavailable, save, save_rdb
+
+        if self._rdb:
+            try:
+                return await save_rdb(interface, self._path("rdb"), overwrite=self._overwrite)
+            except RdbUnavailable as error:
+                self._note_once(f"No RDB file: {error}. A portable snapshot, of the keys of REEM, is taken instead.")
+        with _progress(shown=bar and not self._as_json) as progress:
+            return await save(
+                interface, self._path("portable"), self._match, overwrite=self._overwrite, progress=progress
+            )
+
+    def _path(self, kind: str) -> Path:
+        from reem_async.snapshots.files import new_name
+
+        return self._file or new_name(self._directory, kind, time.time(), auto=self._keep is not None)
+
+    def _pruned(self, newest: Path) -> list[Path]:
+        from reem_async.snapshots.files import prune
+
+        self._made.append(newest)
+        if self._keep is None:
+            del self._made[:-1]
+            return []
+        gone = prune(self._made, self._keep)
+        del self._made[: -self._keep]
+        return gone
+
+    def _note_foreign(self, it: Snapshot) -> None:
+        if it.foreign:
+            more = f" and {it.foreign - _NAMED} more" if it.foreign > _NAMED else ""
+            names = ", ".join(it.foreign_names[:_NAMED])
+            self._note_once(f"Left out, not REEM's: {names}{more}")
+
+    def _note_once(self, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            note(text)
+
+
+def list_(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", show_default="here", help="A directory, or one snapshot to look into.")
+    ] = Path(),
+    check: Annotated[
+        bool, typer.Option("--check", help="Read portable snapshots to their end to find damage; exit code 1 if any.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the snapshots in a directory, oldest first, or the keys in one.
+
+    Examples:
+      reem snapshot list
+      reem snapshot list --check /var/backups
+      reem snapshot list before.zip
+    """
+    code = prepared("snapshot list", lambda: _listed(path, check, as_json))
+    if code:
+        raise typer.Exit(code)
+
+
+def _listed(path: Path, check: bool, as_json: bool) -> int:
+    from reem_async.errors import BadData
+    from reem_async.snapshots import described
+
+    _check_there(path)
+    if path.is_file():
+        _show_keys(described(path, check=check), as_json)
+        return 0
+    found: list[Snapshot] = []
+    damaged: dict[str, str] = {}
+    for file in _candidates(path):
+        try:
+            found.append(described(file, check=check))
+        except (BadData, OSError) as error:
+            damaged[str(file)] = str(error)
+    found.sort(key=lambda it: (it.time, it.path.name))
+    _show_files(found, damaged, as_json)
+    return FAILED if damaged else 0
+
+
+def _candidates(directory: Path) -> Iterator[Path]:
+    """Yield the files that are snapshots by name and first bytes, or by a name that only snapshots have."""
+    from reem_async.errors import BadData
+    from reem_async.snapshots.files import SUFFIXES, dated, sniff
+
+    for file in sorted(directory.iterdir()):
+        if file.suffix not in SUFFIXES.values() or not file.is_file():
+            continue
+        try:
+            sniff(file)
+        except (BadData, OSError):
+            if dated(file) is None:  # somebody else's zip file
+                continue
+        yield file
+
+
+def _show_files(found: list[Snapshot], damaged: dict[str, str], as_json: bool) -> None:
+    if as_json:
+        for it in found:
+            emit_json(_facts(it))
+        for name, error in damaged.items():
+            emit_json({"path": name, "damaged": error})
+        return
+    rows = [[clean(it.path.name), it.kind, _when(it), size_text(it.size), _count(it)] for it in found]
+    if rows and is_terminal():
+        rows.insert(0, ["name", "kind", "taken", "size", "keys"])
+    columns(rows, ["cyan", "", "", "", ""], frozenset({3, 4}))
+    if not rows and not damaged:
+        note("No snapshots here; `reem snapshot save` makes one.")
+    for error in damaged.values():
+        note(f"damaged: {error}")
+
+
+def _show_keys(it: Snapshot, as_json: bool) -> None:
+    if as_json:
+        values = [
+            {
+                "key": key.name,
+                "size": key.size,
+                "values": [{"place": place, "type": kind, "size": size} for place, kind, size in key.values],
+            }
+            for key in it.keys
+        ]
+        emit_json({**_facts(it), "keys": values})
+        return
+    emit(f"{styled(clean(str(it.path)), 'cyan')}: {_content(it)}, taken {_when(it)} at {clean(it.server) or 'unknown'}")
+    rows = [[clean(key.name), size_text(key.size), _arrays(len(key.values))] for key in it.keys]
+    columns(rows, ["cyan", "", "dim"], frozenset({1}))
+
+
+def _arrays(count: int) -> str:
+    return f"{count} array{'s' * (count > 1)} or other values of ships" if count else ""
+
+
+def restore(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A portable snapshot.")],
+    match: Match = "*",
+    replace: Annotated[bool, typer.Option("--replace", help="Keys that are there may be replaced.")] = False,
+    into: Annotated[str, typer.Option("--into", metavar="PREFIX", help="Goes before the name of each key.")] = "",
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write the keys of a snapshot to a server, and tell their subscribers.
+
+    The file is checked first, and whether keys are in the way: then nothing is changed. Keys that the
+    snapshot does not hold are left alone. An RDB file cannot be restored into a running server; use
+    `reem up --from FILE`, which also shows a portable snapshot beside the live server.
+
+    Examples:
+      reem snapshot restore before.zip
+      reem snapshot restore --replace --match 'arm*' before.zip
+      reem snapshot restore --into old_ before.zip
+    """
+    prepared("snapshot restore", lambda: _check_there(file))
+
+    async def work(interface: RedisInterface) -> None:
+        from reem_async.snapshots import describe
+        from reem_async.snapshots import restore as restored
+
+        with _progress(shown=not as_json) as progress:
+            done = await restored(interface, file, match, replace=replace, into=into, progress=progress)
+        if as_json:
+            emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
+            return
+        emit(f"{_number(len(done.names), 'key')} restored, {size_text(done.size)}")
+        saved = (await describe(file)).namespace
+        if saved != namespace:
+            note(f"They were saved under the namespace {saved!r} and are now under {namespace!r} (--namespace).")
+
+    run("snapshot restore", work, url, namespace)
+
+
+def _check_there(path: Path) -> None:
+    if not path.exists():
+        raise Refused(f"{path}: there is no such file", NOTHING)
+
+
+def _facts(it: Snapshot) -> dict[str, Any]:
+    return {
+        "path": str(it.path),
+        "kind": it.kind,
+        "time": it.time,
+        "size": it.size,
+        "count": it.count,
+        "server": it.server,
+        "namespace": it.namespace,
+        "foreign": it.foreign,
+        "foreign_names": it.foreign_names,
+    }
+
+
+def _when(it: Snapshot) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
+
+
+def _count(it: Snapshot) -> str:
+    return "" if it.count is None else f"{it.count} of Redis" if it.kind == "rdb" else str(it.count)
+
+
+def _content(it: Snapshot) -> str:
+    keys = "" if it.count is None else f"{_number(it.count, 'key' if it.kind == 'portable' else 'Redis key')}, "
+    return f"{keys}{size_text(it.size)}"
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+@contextmanager
+def _progress(*, shown: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """Give what draws a bar on standard error, if that is a terminal; it is gone afterwards."""
+    if not shown or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    parts = (TextColumn("{task.description:8}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Bar(*parts, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("")
+
+        def tell(progress: Progress) -> None:
+            bar.update(task, description=progress.doing, completed=progress.done, total=max(progress.total, 1))
+
+        yield tell
+
+
+for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
+    app.command(_name, help=help_text(_command.__doc__ or ""))(_command)

@@ -1,0 +1,60 @@
+"""Snapshots: what a server holds, in a file, and back.
+
+    saved = await save(interface, "before.zip")
+    await restore(interface, "before.zip", replace=True)
+
+A portable snapshot holds the keys of REEM and is written to any server, old or new, by any user who may
+write there; see `archive` for what is in the file. An RDB file is the server's own and holds all of it.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import anyio.to_thread
+
+from .archive import Archive, verify
+from .files import SavedKey, Snapshot, sniff
+from .portable import Progress, Restored, restore, save
+from .rdb import RdbUnavailable, describe_rdb, save_rdb
+
+__all__ = [
+    "Progress",
+    "RdbUnavailable",
+    "Restored",
+    "SavedKey",
+    "Snapshot",
+    "describe",
+    "described",
+    "restore",
+    "save",
+    "save_rdb",
+]
+
+
+async def describe(path: str | os.PathLike[str], *, check: bool = False) -> Snapshot:
+    """Return what a snapshot of either kind holds, without a server.
+
+    Reads the index of a portable snapshot, or the first bytes of an RDB file.
+
+    Args:
+        path: The file.
+        check: Read all of a portable snapshot and compare its digest.
+
+    Raises:
+        BadData: Neither kind, or damaged where it was looked at.
+        OSError: It cannot be read.
+    """
+    return await anyio.to_thread.run_sync(lambda: described(path, check=check))
+
+
+def described(path: str | os.PathLike[str], *, check: bool = False) -> Snapshot:
+    """Return what `describe` returns, on this thread."""
+    file = Path(path)
+    if sniff(file) == "rdb":
+        return describe_rdb(file)
+    if check:
+        verify(file)
+    with Archive(file) as archive:
+        return archive.summary

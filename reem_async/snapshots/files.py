@@ -1,0 +1,204 @@
+"""Files of snapshots: what one says of itself, names by time, and writing that is all or nothing."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+import secrets
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from ..errors import BadData
+
+__all__ = ["SUFFIXES", "NewFile", "SavedKey", "Snapshot", "check_target", "dated", "new_name", "prune", "sniff"]
+
+SUFFIXES = {"portable": ".zip", "rdb": ".rdb"}
+"""How the names of both kinds of files end. What a file is, its content says."""
+
+FIRST_MEMBER = b"reem-snapshot.json"
+"""The name of the first member of a portable snapshot."""
+
+_NAME = re.compile(r"reem-(?P<auto>auto-)?(?P<time>\d{8}T\d{6}Z)(?:-\d+)?\.(?:zip|rdb)")
+_TIME = "%Y%m%dT%H%M%SZ"
+_ABANDONED_SECONDS = 3600.0
+_PART = ".part"
+
+
+class SavedKey(NamedTuple):
+    """One top-level key in a portable snapshot.
+
+    Attributes:
+        name: The key, without namespace.
+        document: Bytes of the document's JSON.
+        values: Of each value that a ship holds: the key's name after the tag, the Redis type, and bytes.
+    """
+
+    name: str
+    document: int
+    values: tuple[tuple[str, str, int], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Bytes of document and values."""
+        return self.document + sum([size for _, _, size in self.values])
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What a file holds.
+
+    Attributes:
+        path: The file.
+        kind: "portable" or "rdb".
+        time: When it was taken, in seconds since 1970.
+        size: Bytes of the file.
+        count: Top-level keys in a portable one; Redis keys of the first database in an RDB file, and None
+            where it does not say.
+        keys: The top-level keys of a portable one, in order of their names.
+        server: Where it was taken, or which program wrote the RDB file.
+        namespace: The namespace it was taken of.
+        foreign: How many Redis keys were left out since they are not REEM's.
+        foreign_names: The first of them, with their types.
+    """
+
+    path: Path
+    kind: str
+    time: float
+    size: int
+    count: int | None
+    keys: tuple[SavedKey, ...] = field(default=(), repr=False)
+    server: str = ""
+    namespace: str = ""
+    foreign: int = 0
+    foreign_names: tuple[str, ...] = ()
+
+
+def sniff(path: Path) -> str:
+    """Return "portable" or "rdb", by what the file begins with.
+
+    Raises:
+        BadData: It is neither.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(64)
+    if head.startswith(b"PK\3\4") and head[30:].startswith(FIRST_MEMBER):
+        return "portable"
+    if re.match(rb"REDIS\d{4}|VALKEY\d{3}", head):
+        return "rdb"
+    raise BadData(f"{path}: neither a snapshot of REEM nor an RDB file; it begins with {head[:16]!r}")
+
+
+def new_name(directory: Path, kind: str, moment: float, *, auto: bool) -> Path:
+    """Return a name that says when, in UTC, and that no file of the directory has."""
+    stem = f"reem-{'auto-' if auto else ''}{time.strftime(_TIME, time.gmtime(moment))}"
+    path, number = directory / f"{stem}{SUFFIXES[kind]}", 1
+    while path.exists():
+        number += 1
+        path = directory / f"{stem}-{number}{SUFFIXES[kind]}"
+    return path
+
+
+def dated(path: Path) -> float | None:
+    """Return the time in a name that `new_name` made, None for any other name."""
+    found = _NAME.fullmatch(path.name)
+    if found is None:
+        return None
+    with suppress(ValueError):
+        return datetime.datetime.strptime(found["time"], _TIME).replace(tzinfo=datetime.UTC).timestamp()
+    return None
+
+
+def prune(made: Sequence[Path], keep: int) -> list[Path]:
+    """Delete the oldest snapshots that were saved by period until `keep` are left; return what was deleted.
+
+    Only files beside the last one made that have such a name and such content, and are of its kind, are
+    deleted, and never that one itself. Those of earlier runs go first, whatever the clock said then and
+    says now: a robot without a clock of its own begins each day in 1970.
+
+    Args:
+        made: What this run has saved, in this order.
+        keep: How many to leave, at least 1.
+    """
+    newest, order = made[-1], {path: number for number, path in enumerate(made)}
+    own = [
+        path
+        for path in newest.parent.iterdir()
+        if path.suffix == newest.suffix and path != newest and _is_automatic(path)
+    ]
+    own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
+    gone = own[: max(0, len(own) + 1 - keep)]
+    for path in gone:
+        path.unlink(missing_ok=True)
+    return gone
+
+
+def _is_automatic(path: Path) -> bool:
+    found = _NAME.fullmatch(path.name)
+    if found is None or found["auto"] is None or path.is_symlink() or not path.is_file():
+        return False
+    try:
+        return SUFFIXES[sniff(path)] == path.suffix
+    except (BadData, OSError):
+        return False
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Raise what would only show after the work: FileExistsError, NotADirectoryError, IsADirectoryError."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a directory; name a file in it")
+    if not path.parent.is_dir():
+        raise NotADirectoryError(f"{path}: there is no directory {path.parent}; make it first")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} is there already; choose another name; overwrite=True (--overwrite) replaces it")
+
+
+class NewFile:
+    """A file that gets the name `path` when all of it is on the disk, or never; until then it is hidden beside it.
+
+    Attributes:
+        file: What to write to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        _remove_abandoned(path.parent)
+        self._path = path
+        self._part = path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}{_PART}")
+        self.file: BinaryIO = self._part.open("x+b")
+
+    def commit(self) -> None:
+        """Give the file its name."""
+        self.file.flush()
+        os.fsync(self.file.fileno())
+        self.file.close()
+        self._part.replace(self._path)
+        _sync_directory(self._path.parent)
+
+    def discard(self) -> None:
+        """Remove the file. A thread that still writes to it or commits it gets an error, and the name stays free."""
+        with suppress(OSError):
+            self.file.close()
+        self._part.unlink(missing_ok=True)
+
+
+def _remove_abandoned(directory: Path) -> None:
+    """Remove what a run that was killed has left: it would have been written to within the hour."""
+    for part in directory.glob(f".reem-*{_PART}"):
+        with suppress(OSError):
+            if time.time() - part.stat().st_mtime > _ABANDONED_SECONDS:
+                part.unlink()
+
+
+def _sync_directory(directory: Path) -> None:
+    """Make the new name survive a power failure, where directories can be opened."""
+    with suppress(OSError):
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

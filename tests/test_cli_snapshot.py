@@ -1,0 +1,337 @@
+"""`reem snapshot`, run as a user runs it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from unittest import mock
+
+import numpy as np
+import pytest
+import redis
+import typer
+from conftest import ROOT, assert_same, eventually
+from typer.testing import CliRunner
+
+import reem
+from reem_async.cli.snapshot import app, period
+from reem_async.errors import ServerMissing
+from reem_async.server import EmbeddedServer
+
+MAIN = """
+from reem_async.cli import Entry
+from reem_async.cli.lazy import command_of
+command_of(Entry("snapshot", "snapshot", "app", "", ""))(prog_name="reem snapshot")
+"""
+REEM = [sys.executable, "-W", "error", "-c", MAIN]  # not -X dev: asyncio would tell of each slow step
+
+
+def environment(**changes):
+    clean = {name: value for name, value in os.environ.items() if name not in ("REEM_URL", "FORCE_COLOR", "COLUMNS")}
+    return {**clean, "PYTHONPATH": str(ROOT), **changes}
+
+
+def snapshot(*arguments, code=0, **changes):
+    """Run it in this process; returns what it wrote to both outputs."""
+    with mock.patch.dict(os.environ, environment(**changes), clear=True):
+        run = CliRunner().invoke(app, [str(word) for word in arguments], prog_name="reem snapshot")
+    assert isinstance(run.exception, (SystemExit, type(None))), run.exception
+    assert run.exit_code == code, run.stdout + run.stderr
+    assert "\x1b" not in run.stdout + run.stderr
+    return run.stdout, run.stderr
+
+
+@pytest.fixture(scope="module")
+def server():
+    with contextlib.ExitStack() as stack:
+        try:
+            yield stack.enter_context(EmbeddedServer())
+        except ServerMissing as missing:
+            pytest.skip(f"needs a server of its own: {missing}")
+
+
+@pytest.fixture
+def kvs(server):
+    with redis.Redis.from_url(server.url) as raw:
+        raw.flushall()
+    with reem.RedisInterface(server) as interface:
+        yield reem.KeyValueStore(interface)
+
+
+@pytest.fixture
+def env(server):
+    return {"REEM_URL": server.url}
+
+
+def names(directory):
+    return sorted(path.name for path in directory.iterdir())
+
+
+def test_in_a_process_of_its_own(kvs, env, tmp_path):
+    """As the shell sees it: both outputs apart, no colours, an exit code."""
+    kvs["foo"] = 1
+    for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 1), (["list"], 0)):
+        run = subprocess.run(
+            [*REEM, *words],
+            cwd=tmp_path,
+            env=environment(**env),
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        assert (run.returncode, bool(run.stdout), bool(run.stderr)) == (code, not code, bool(code))
+        assert "a.zip" in run.stdout + run.stderr
+        assert "\x1b" not in run.stdout + run.stderr
+
+
+def test_there_and_back(kvs, env, server, tmp_path):
+    """By FILE and by time; by --url and by REEM_URL."""
+    kvs["foo"] = {"x": np.arange(3), "n": 1}
+    kvs["bar"] = 2
+    file = tmp_path / "a.zip"
+    said, errors = snapshot("save", file, "--url", server.url)
+    assert re.fullmatch(rf"{re.escape(str(file))}: 2 keys, [\d.]+ kB, [\d.]+ s\n", said)
+    assert errors == ""
+    kvs["foo"]["n"] = 5
+    _, errors = snapshot("restore", file, code=1, **env)
+    assert "--replace" in errors
+    assert kvs["foo"]["n"].read() == 5
+    assert snapshot("restore", file, "--replace", "--match", "f*", **env)[0].startswith("1 key restored")
+    assert_same(kvs["foo"].read(), {"x": np.arange(3), "n": 1})
+    assert snapshot("restore", file, "--into", "old_", **env)[0].startswith("2 keys restored")
+    assert kvs["old_foo"]["n"].read() == 1
+    _, errors = snapshot("restore", file, "--namespace", "r1:", **env)
+    assert "namespace ''" in errors
+    assert "'r1:'" in errors
+    snapshot("save", "-d", tmp_path / "by", code=1, **env)
+    (tmp_path / "by").mkdir()
+    for number in range(2):
+        said, _ = snapshot("save", "-d", tmp_path / "by", "--match", "foo", **env)
+        assert re.search(r"by/reem-\d{8}T\d{6}Z(-2)?\.zip: 1 key, ", said)
+        assert len(names(tmp_path / "by")) == number + 1
+
+
+def test_json_for_scripts(kvs, env, tmp_path):
+    """One object a line."""
+    kvs["foo"] = {"x": np.arange(3)}
+    with redis.Redis.from_url(env["REEM_URL"]) as raw:
+        raw.set("foreign", 1)
+    said, errors = snapshot("save", tmp_path / "a.zip", "--json", **env)
+    saved = json.loads(said)
+    assert (saved["kind"], saved["count"], saved["foreign_names"]) == ("portable", 1, ["foreign (string)"])
+    assert errors == ""
+    (listed,) = map(json.loads, snapshot("list", tmp_path, "--json")[0].splitlines())
+    assert listed == {name: saved[name] for name in listed}
+    inside = json.loads(snapshot("list", tmp_path / "a.zip", "--json")[0])
+    assert inside["keys"][0]["key"] == "foo"
+    assert inside["keys"][0]["values"] == [{"place": ".x", "type": "string", "size": 152}]
+    done = json.loads(snapshot("restore", tmp_path / "a.zip", "--replace", "--json", **env)[0])
+    assert done["restored"] == ["foo"]
+
+
+def test_foreign_keys_are_named(kvs, env, tmp_path):
+    with redis.Redis.from_url(env["REEM_URL"]) as raw:
+        for number in range(5):
+            raw.lpush(f"odd\x1b[31m{number}", 1)
+    _, errors = snapshot("save", tmp_path / "a.zip", **env)
+    assert re.search(r"not REEM's: .*\(list\).* and 2 more", errors)
+
+
+def test_list_shows_both_kinds_and_what_is_damaged(kvs, env, tmp_path):
+    kvs["foo"] = {"x": np.arange(3000)}
+    snapshot("save", tmp_path / "reem-20260101T000000Z.zip", **env)
+    snapshot("save", "--rdb", tmp_path / "b.rdb", **env)
+    (tmp_path / "notes.zip").write_text("somebody else's")
+    (tmp_path / "readme.txt").write_text("x")
+    said, errors = snapshot("list", "--check", tmp_path)
+    rows = [line.split("\t") for line in said.splitlines()]
+    assert {(row[0], row[1], row[4]) for row in rows} == {
+        ("reem-20260101T000000Z.zip", "portable", "1"),
+        ("b.rdb", "rdb", "3 of Redis"),
+    }
+    assert all(re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d", row[2]) for row in rows)
+    assert all(re.fullmatch(r"[\d.]+ k?B", row[3]) for row in rows)
+    assert errors == ""
+    said, _ = snapshot("list", tmp_path / "reem-20260101T000000Z.zip")
+    assert "foo\t24.2 kB\t1 array" in said
+    whole = bytearray((tmp_path / "reem-20260101T000000Z.zip").read_bytes())
+    whole[len(whole) // 2] ^= 1
+    (tmp_path / "reem-20260101T000000Z.zip").write_bytes(whole)
+    snapshot("list", tmp_path)  # a look at its index does not show it
+    said, errors = snapshot("list", "--check", tmp_path, code=1)
+    assert said.startswith("b.rdb")
+    assert "damaged" in errors
+    (tmp_path / "reem-20260101T000000Z.zip").write_bytes(whole[:1000])
+    _, errors = snapshot("list", tmp_path, code=1)
+    assert "damaged or not complete" in errors
+    _, errors = snapshot("restore", tmp_path / "reem-20260101T000000Z.zip", code=1, **env)
+    assert "damaged or not complete" in errors
+    (tmp_path / "empty").mkdir()
+    said, errors = snapshot("list", tmp_path / "empty")
+    assert said == ""
+    assert "reem snapshot save" in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["save", "x.zip", "-d", "."], 2, "FILE"),
+        (["save", "x.zip", "--every", "10m"], 2, "FILE"),
+        (["save", "x.zip", "--keep", "3"], 2, "FILE"),
+        (["save", "--rdb", "--match", "a*", "x.rdb"], 2, "--match"),
+        (["save", "--every", "soon"], 2, "10m"),
+        (["save", "--keep", "0"], 2, "--keep"),
+        (["save", "--match", "", "x.zip"], 2, "empty"),
+        (["save", "--match", "nothing*", "x.zip"], 3, "nothing*"),
+        (["save", "no/x.zip"], 1, "make it first"),
+        (["restore", "no.zip"], 3, "no.zip"),
+        (["list", "no"], 3, "no"),
+        (["restore"], 2, "FILE"),
+    ],
+)
+def test_what_is_wrong_is_said_with_an_exit_code(kvs, env, tmp_path, monkeypatch, words, code, message):
+    monkeypatch.chdir(tmp_path)
+    _, errors = snapshot(*words, code=code, **env)
+    assert message in " ".join(errors.split())
+    assert names(tmp_path) == []
+
+
+def test_nobody_listens(tmp_path):
+    _, errors = snapshot("save", tmp_path / "a.zip", "--url", "redis://user:s3cret@127.0.0.1:1", code=1)
+    assert "reem up" in errors
+    assert "s3cret" not in errors
+    assert names(tmp_path) == []
+
+
+def test_without_the_right_to_an_rdb_file_a_portable_one_is_taken(kvs, server, tmp_path):
+    kvs["foo"] = 1
+    with redis.Redis.from_url(server.url) as admin:
+        admin.execute_command("ACL", "SETUSER", "robot", "reset", "on", ">pw", "~*", "&*", "+@all", "-config")
+        url = server.url.replace("redis://", "redis://robot:pw@")
+        said, errors = snapshot("save", "--rdb", "-d", tmp_path, "--url", url)
+        admin.execute_command("ACL", "DELUSER", "robot")
+    assert "CONFIG GET" in errors
+    assert "portable" in errors
+    assert re.search(r"reem-\w+\.zip: 1 key", said)
+    assert len(names(tmp_path)) == 1
+
+
+@contextlib.contextmanager
+def periodic(*arguments, **changes):
+    with subprocess.Popen(
+        [*REEM, "save", *map(str, arguments)],
+        env=environment(**changes),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
+    """A line for each; the oldest that it saved itself go, and nothing else."""
+    kvs["foo"] = {"x": np.arange(3)}
+    snapshot("save", "-d", tmp_path, **env)
+    (mine,) = names(tmp_path)
+    (tmp_path / "reem-auto-20000101T000000Z.zip").write_text("not a snapshot")
+    with periodic("-d", tmp_path, "--every", "1s", "--keep", "2", "--json", **env) as process:
+        lines = [json.loads(process.stdout.readline()) for _ in range(3)]
+        process.send_signal(number)
+        rest, errors = process.communicate(timeout=20)
+    assert process.returncode == 0, errors
+    assert "Stopped" in errors
+    assert "Traceback" not in errors
+    assert [len(line["deleted"]) for line in lines] == [0, 0, 1]
+    assert lines[2]["deleted"] == [lines[0]["path"]]
+    assert lines[1]["time"] - lines[0]["time"] > 0.5
+    lines += map(json.loads, rest.splitlines())
+    kept = {os.path.basename(line["path"]) for line in lines[-2:]}
+    assert set(names(tmp_path)) == kept | {mine, "reem-auto-20000101T000000Z.zip"}
+    assert all(re.fullmatch(r"reem-auto-\d{8}T\d{6}Z(-\d+)?\.zip", name) for name in kept)
+
+
+def test_by_period_it_outlives_the_server(tmp_path):
+    """What went wrong is said, and the next one is tried."""
+    server = EmbeddedServer()
+    with server:
+        port = server.port
+        with periodic("-d", tmp_path, "--every", "1s", REEM_URL=server.url) as process:
+            assert "0 keys" in process.stdout.readline()
+            server.stop()
+            assert "not saved" in process.stderr.readline()
+            with EmbeddedServer(port):
+                assert "0 keys" in process.stdout.readline()
+                process.send_signal(signal.SIGINT)
+                assert "Traceback" not in process.communicate(timeout=20)[1]
+            assert process.returncode == 0
+    with periodic("-d", tmp_path, "--every", "1s", REEM_URL="redis://127.0.0.1:1") as process:
+        assert process.wait(20) == 1, "what has never worked is an error"
+
+
+def test_ctrl_c_leaves_no_half_file(kvs, env, tmp_path):
+    for number in range(60):
+        kvs[f"k{number}"] = np.zeros(500_000)
+    with periodic(tmp_path / "a.zip", **env) as process:
+        eventually(lambda: any(name.endswith(".part") for name in names(tmp_path)))
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert names(tmp_path) == []
+
+
+def test_in_a_terminal(kvs, env, tmp_path):
+    """Colours, a header, a bar on long work; all of it gone when redirected, as the other tests see."""
+    for number in range(20):
+        kvs[f"k{number}"] = np.zeros(100_000)
+    said = b""
+    for words in (["save", tmp_path / "a.zip"], ["list", tmp_path], ["restore", "--replace", tmp_path / "a.zip"]):
+        here, there = pty.openpty()
+        variables = environment(**env, TERM="xterm-256color", COLUMNS="80")
+        with subprocess.Popen([*REEM, *map(str, words)], env=variables, stdout=there, stderr=there) as process:
+            os.close(there)
+            with contextlib.suppress(OSError):  # the end of a terminal
+                while data := os.read(here, 4096):
+                    said += data
+            os.close(here)
+        assert process.returncode == 0, said
+    assert b"\x1b[" in said
+    assert b"taken" in said
+    assert b"save" in said
+    assert b"restore" in said
+    assert b"%" in said
+    assert b"20 keys restored" in said
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("90", 90), ("30s", 30), ("10m", 600), ("1.5h", 5400), ("1d", 86400), (" 2 m", 120)]
+)
+def test_periods(text, seconds):
+    assert period(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "m", "0", "0.5s", "-1m", "1w", "ten", "1e3", "1000d", "1m30s"])
+def test_bad_periods(text):
+    with pytest.raises(typer.BadParameter, match="10m"):
+        period(text)
+
+
+def test_help_has_examples():
+    for command in ("save", "list", "restore"):
+        said, _ = snapshot(command, "--help", COLUMNS="100")
+        assert "Examples:" in said
+        assert f"reem snapshot {command}" in said
+        assert "Traceback" not in said
+    said, _ = snapshot("--help")
+    assert all(command in said for command in ("save", "list", "restore"))

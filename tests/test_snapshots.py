@@ -1,0 +1,302 @@
+"""Portable snapshots: what is saved is of one instant, and restored bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import threading
+import time
+import tracemalloc
+
+import numpy as np
+import orjson
+import pytest
+import redis
+import snapshotkit
+from conftest import aeventually, assert_no_orphans, assert_same, commands_run
+from snapshotkit import STRANGE, TREE, everything, fill, hard_floats, left_in
+from test_ships import Pose, PoseShip
+
+import reem
+import reem.snapshots
+import reem_async
+import reem_async.snapshots
+from reem_async.errors import BadData, BadKey, Conflict, MissingKey
+from reem_async.plan.keys import keys_of
+from reem_async.plan.memory import Memory
+from reem_async.snapshots import describe, restore, save
+from reem_async.snapshots.plans import put
+from reem_async.snapshots.values import KINDS, Entry, Value, settable
+
+servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
+
+
+# --- there and back -------------------------------------------------
+
+
+async def test_an_empty_server_gets_everything_bit_for_bit(here, there, raws, tmp_path):
+    """Documents, arrays, registries; and what is read is what was written."""
+    kvs = await fill(here)
+    raws[0].execute_command("JSON.NUMMULTBY", "number", "$", "1.1")  # a float that no program has written
+    before = everything(raws[0])
+    saved = await save(here, tmp_path / "a.zip")
+    assert everything(raws[0]) == before, "saving changes nothing"
+    assert (saved.count, saved.foreign, saved.kind) == (len(STRANGE) + 8, 0, "portable")
+    assert saved.size == (tmp_path / "a.zip").stat().st_size > 8_000_000
+    assert abs(saved.time - time.time()) < 60
+    done = await restore(there, tmp_path / "a.zip")
+    assert everything(raws[1]) == before
+    assert set(done.names) == {key.name for key in saved.keys} == {"tree", "number", *STRANGE} | set(done.names)
+    copy = reem_async.KeyValueStore(there)
+    assert_same(await copy["tree"].read(), TREE)
+    for name in STRANGE:
+        assert_same(await copy[name].read(), await kvs[name].read())
+    assert await describe(tmp_path / "a.zip", check=True) == saved
+
+
+async def test_the_servers_own_text_would_not_do(raws):
+    """Given back as it is, it changes floats; `settable` gives the same document, or REEM's form of the float."""
+    raw = raws[0]
+    raw.execute_command("JSON.SET", "f", "$", orjson.dumps(hard_floats(20000)))
+    short = [float(f"{digits}e{power}") for digits in ("2.647", "9.4425", "31597") for power in range(16, 300)]
+    raw.execute_command("JSON.SET", "g", "$", orjson.dumps(short))
+    inline = 0
+    for name in "fg":
+        text = raw.execute_command("JSON.GET", name)
+        raw.execute_command("JSON.SET", "naive", "$", text)
+        assert raw.execute_command("JSON.GET", "naive") != text, "this server reads floats well: settable is not needed"
+        raw.execute_command("JSON.SET", "exact", "$", settable(text))
+        for value, again in zip(
+            orjson.loads(text), orjson.loads(raw.execute_command("JSON.GET", "exact")), strict=True
+        ):
+            if isinstance(again, str):
+                inline += 1
+                again = float.fromhex(again.removeprefix("$ship float "))
+            assert struct.pack("<d", again) == struct.pack("<d", value)
+    assert inline < 400, "those that no text carries are few"
+
+
+async def test_an_empty_server_gives_an_empty_snapshot(here, there, raws, tmp_path):
+    assert (await save(here, tmp_path / "a.zip")).count == 0
+    assert (await restore(there, tmp_path / "a.zip")).names == ()
+    assert everything(raws[1]) == {}
+
+
+class Stored:
+    """A value of a ship that keeps it in one Redis type."""
+
+    def __init__(self, kind):
+        self.kind = kind
+
+
+class KindShip(reem_async.SpecialDatatypeShip):
+    """Fills its key with one of the types a ship may use."""
+
+    def check_fit(self, value):
+        return isinstance(value, Stored)
+
+    def write(self, key, value, client):
+        big, many = b"\x00\xff:" * 40_000, [b"%d" % number for number in range(2500)]
+        if value.kind == "hash":
+            client.hset(key, mapping={b"a:1": b"1:", b"\x00": big, b"": b""})
+        elif value.kind == "list":
+            client.rpush(key, *many, big, b"")
+        elif value.kind == "set":
+            client.sadd(key, *many)
+        elif value.kind == "zset":
+            client.zadd(key, {b"a": 0.1, b"b": -1e300, b"": 5e-324, b"c": float("inf")})
+        elif value.kind == "stream":
+            client.xadd(key, {"a": 1})
+        elif value.kind == "ReJSON-RL":
+            client.execute_command("JSON.SET", key, "$", '{"a":[1,2.25,"é"]}')
+
+    def read(self, key, client):
+        client.get(key)
+
+    def interpret_read(self, responses):
+        raise AssertionError("a snapshot does not ask ships")
+
+    def get_label(self):
+        return "kind"
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "string"])
+async def test_ships_may_use_other_redis_types(servers, there, raws, tmp_path, kind):
+    """The snapshot needs no ship to save and restore them."""
+    async with reem_async.RedisInterface(servers[0], ships=[KindShip()]) as writer:
+        await reem_async.KeyValueStore(writer)["k"].write({"x": [Stored(kind)]})
+    async with reem_async.RedisInterface(servers[0]) as here:
+        before = everything(raws[0])
+        assert kind.encode() in {each for each, _ in before.values()}
+        saved = await save(here, tmp_path / "a.zip")
+        assert [each for _, each, _ in saved.keys[0].values] == [kind]
+        await restore(there, tmp_path / "a.zip")
+        assert everything(raws[1]) == before
+
+
+async def test_a_type_that_cannot_be_saved_is_refused_by_name(servers, raws, tmp_path):
+    """And no file is left."""
+    async with reem_async.RedisInterface(servers[0], ships=[KindShip()]) as here:
+        await reem_async.KeyValueStore(here)["odd"].write({"x": Stored("stream")})
+        with pytest.raises(BadData, match=r"odd\.x.*stream"):
+            await save(here, tmp_path / "a.zip")
+    assert left_in(tmp_path) == []
+
+
+async def test_a_custom_ship_reads_what_was_restored(servers, raws, tmp_path):
+    ships = [reem.NumpyShip(), PoseShip()]
+    async with reem_async.RedisInterface(servers[0], ships=ships) as here:
+        await reem_async.KeyValueStore(here)["robot"].write({"at": Pose(1.5, 2.5), "path": [Pose(0, 0), np.arange(2)]})
+        await save(here, tmp_path / "a.zip")
+    async with reem_async.RedisInterface(servers[1], ships=ships) as there:
+        await restore(there, tmp_path / "a.zip")
+        got = await reem_async.KeyValueStore(there)["robot"].read()
+    assert (got["at"], got["path"][0]) == (Pose(1.5, 2.5), Pose(0.0, 0.0))
+
+
+# --- which keys -------------------------------------------------
+
+
+async def test_a_namespace_is_saved_alone_and_restored_into_any(servers, raws, tmp_path):
+    """Also where its name is special in patterns; what is outside is neither saved nor counted."""
+    async with contextlib.AsyncExitStack() as stack:
+        spaces = {
+            name: await stack.enter_async_context(reem_async.RedisInterface(servers[0], namespace=name))
+            for name in ("r*[1]:", "rx1:", "")
+        }
+        for name, interface in spaces.items():
+            await reem_async.KeyValueStore(interface)["foo"].write({"space": name, "x": np.arange(3)})
+        raws[0].set("outside", 1)
+        raws[0].set("r*[1]:foreign", 1)
+        saved = await save(spaces["r*[1]:"], tmp_path / "a.zip")
+        assert ([key.name for key in saved.keys], saved.namespace) == (["foo"], "r*[1]:")
+        assert saved.foreign_names == ("r*[1]:foreign (string)",)
+        other = await stack.enter_async_context(reem_async.RedisInterface(servers[1], namespace="other:"))
+        await restore(other, tmp_path / "a.zip")
+        assert (await reem_async.KeyValueStore(other)["foo"].read())["space"] == "r*[1]:"
+        assert set(everything(raws[1])) == {b"other:foo", b"{other:foo}.x", b"{other:foo}:ships"}
+        everywhere = await save(spaces[""], tmp_path / "b.zip")
+        assert {key.name for key in everywhere.keys} == {"foo", "rx1:foo", "r*[1]:foo"}
+
+
+async def test_foreign_keys_are_left_alone_counted_and_named(here, there, raws, tmp_path):
+    """Other types, keys with a tag that no registry knows, what is left of a deleted document."""
+    raw = raws[0]
+    space = reem_async.PublishSpace(here)
+    await space["foo"].write({"x": np.arange(3)})
+    await space["gone"].write({"x": np.arange(3)})
+    raw.delete("gone")
+    for name in ("plain", "{foo}.stranger", "{nobody}.x", "{}", b"\xff\xfe"):
+        raw.set(name, 1)
+    raw.lpush("a list", 1)
+    saved = await save(here, tmp_path / "a.zip")
+    assert [key.name for key in saved.keys] == ["foo"]
+    names = {r"\xff\xfe (string)", "plain (string)", "{foo}.stranger (string)", "{nobody}.x (string)", "{} (string)"}
+    names |= {"a list (list)", "{gone}.x (string)", "{gone}:ships (set)"}
+    assert (set(saved.foreign_names), saved.foreign) == (names, len(names))
+    await restore(there, tmp_path / "a.zip")
+    assert set(everything(raws[1])) == {b"foo", b"{foo}.x", b"{foo}:ships"}
+    for number in range(50):
+        raw.set(f"more{number}", 1)
+    many = await save(here, tmp_path / "b.zip")
+    assert (len(many.foreign_names), many.foreign) == (20, len(names) + 50)
+
+
+async def test_only_what_matches(here, there, raws, tmp_path):
+    """Of the server, and of the file; a plain name is not searched for."""
+    kvs = reem_async.KeyValueStore(here)
+    for name in ("arm1", "arm2", "base", "arm.1[x]"):
+        await kvs[name].write({"x": np.arange(2)})
+    assert [key.name for key in (await save(here, tmp_path / "a.zip", "arm?")).keys] == ["arm1", "arm2"]
+    before = commands_run(raws[0])
+    assert [key.name for key in (await save(here, tmp_path / "b.zip", "arm.1[x]")).keys] == ["arm.1[x]"]
+    assert "scan" not in commands_run(raws[0]).keys() - before.keys()
+    assert commands_run(raws[0]).get("scan") == before.get("scan")
+    await save(here, tmp_path / "c.zip")
+    assert (await restore(there, tmp_path / "c.zip", "*1*")).names == ("arm.1[x]", "arm1")
+    for name in ("nothing", "nothing*"):
+        with pytest.raises(MissingKey, match="nothing"):
+            await save(here, tmp_path / "d.zip", name)
+        with pytest.raises(MissingKey, match="nothing"):
+            await restore(there, tmp_path / "c.zip", name)
+    for call in (lambda: save(here, tmp_path / "d.zip", ""), lambda: restore(there, tmp_path / "c.zip", "")):
+        with pytest.raises(BadKey):
+            await call()
+    assert left_in(tmp_path) == ["a.zip", "b.zip", "c.zip"]
+
+
+# --- while others write -------------------------------------------------
+
+
+async def test_no_pair_is_torn_while_others_write(servers, here, there, raws, tmp_path):
+    """A number and arrays written together, the shape changing, are saved together."""
+    stop, count = threading.Event(), 0
+
+    def write():
+        nonlocal count
+        with reem.RedisInterface(servers[0]) as interface:
+            kvs = reem.KeyValueStore(interface)
+            while not stop.is_set():
+                count += 1
+                array = np.full(20_000, count)
+                value = {"n": count, "a": array, "l": [array, {"x": array}]}
+                kvs["pair"] = value if count % 3 else {"n": count, "other": array, "l": [count]}
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        await aeventually(lambda: count > 3)
+        kvs = reem_async.KeyValueStore(there)
+        seen = set()
+        for number in range(15):
+            saved = await save(here, tmp_path / f"{number}.zip", "p*")
+            assert saved.foreign == 0
+            await restore(there, tmp_path / f"{number}.zip", replace=True)
+            got = await kvs["pair"].read()
+            seen.add(got["n"])
+            arrays = [got["a"], got["l"][0], got["l"][1]["x"]] if "a" in got else [got["other"]]
+            assert {each.min() for each in arrays} | {each.max() for each in arrays} == {got["n"]}
+            assert_no_orphans(redis.Redis.from_url(servers[1].url, decode_responses=True), "pair")
+    finally:
+        stop.set()
+        writer.join()
+    assert len(seen) > 5
+
+
+def test_putting_a_key_starts_over_when_somebody_writes_in_between():
+    """The server gives the transaction up; the notice keeps its number."""
+    told = []
+
+    def notices():
+        told.append(1)
+        return [("PUBLISH", "c", b"x")]
+
+    entry = Entry("foo", b"{}", (".x",), (Value(".x", "string", (b"1",)),))
+    first = put(keys_of("foo"), entry, Memory(), replace=True, notices=notices)
+    assert first.held
+    assert first.commands[0][0] == "WATCH"
+    change = first.decode([b"OK", b"ReJSON-RL", [b".old"]])
+    assert change.atomic
+    assert change.commands[0] == ("UNLINK", "{foo}:ships", b"{foo}.old", b"{foo}.x")
+    again = change.decode(None)
+    assert again.commands == first.commands
+    assert again.decode([b"OK", b"none", []]).commands[-1] == ("PUBLISH", "c", b"x")
+    assert len(told) == 1
+    refusal = put(keys_of("foo"), entry, Memory(), replace=False, notices=notices).decode([b"OK", b"ReJSON-RL", []])
+    assert refusal.commands == [("UNWATCH",)]
+    with pytest.raises(Conflict):
+        refusal.decode([b"OK"])
+
+
+async def test_one_key_at_a_time_is_in_memory(here, there, raws, tmp_path):
+    kvs = reem_async.KeyValueStore(here)
+    for number in range(40):
+        await kvs[f"k{number}"].write(np.full(250_000, number, float))
+    tracemalloc.start()
+    try:
+        await save(here, tmp_path / "a.zip")
+        await restore(there, tmp_path / "a.zip")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 30_000_000, "the snapshot has 80 MB, a key 2 MB"

@@ -1,0 +1,256 @@
+"""Restoring beside what is there, with few rights; RDB files."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import shutil
+import time
+import urllib.parse
+from pathlib import Path
+
+import numpy as np
+import pytest
+import redis
+import snapshotkit
+from conftest import ROOT, aeventually, assert_same
+from snapshotkit import everything, fill, left_in
+from test_acl import COMMANDS
+
+import reem
+import reem.snapshots
+import reem_async
+import reem_async.snapshots
+from reem_async.errors import BadData, BadKey, Conflict, WrongKind
+from reem_async.server import EmbeddedServer
+from reem_async.snapshots import RdbUnavailable, describe, rdb, restore, save, save_rdb
+
+servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
+
+
+# --- restoring -------------------------------------------------
+
+
+async def test_keys_that_are_there_are_not_replaced_unasked(here, there, raws, tmp_path):
+    """Nothing at all is written then; asked to, it leaves no array of the old value, and other keys alone."""
+    kvs, copy = reem_async.KeyValueStore(here), reem_async.KeyValueStore(there)
+    for name in ("a", "b", "c"):
+        await kvs[name].write({"x": np.arange(3), "l": [np.arange(4)]})
+    await save(here, tmp_path / "a.zip")
+    await copy["b"].write({"old": np.arange(9), "l": [np.zeros(3), np.zeros(3)], "x": 1})
+    await copy["mine"].write({"x": np.arange(3)})
+    before = everything(raws[1])
+    with pytest.raises(Conflict, match=r"'b'.*--replace"):
+        await restore(there, tmp_path / "a.zip")
+    assert everything(raws[1]) == before
+    assert (await restore(there, tmp_path / "a.zip", "a")).names == ("a",)
+    await restore(there, tmp_path / "a.zip", replace=True)
+    mine = everything(raws[1], "*mine*")
+    assert everything(raws[1]) == everything(raws[0]) | mine
+    assert mine == {key: value for key, value in before.items() if b"mine" in key}
+    assert_same(await copy["b"].read(), {"x": np.arange(3), "l": [np.arange(4)]})
+    await copy["b"].write(1)
+    assert everything(raws[1], "{b}*") == {}, "the interface knows what the registry holds"
+
+
+async def test_under_other_names(here, there, raws, tmp_path):
+    await reem_async.KeyValueStore(here)["a"].write({"x": np.arange(3)})
+    await save(here, tmp_path / "a.zip")
+    assert (await restore(here, tmp_path / "a.zip", into="old ")).names == ("old a",)
+    assert_same(await reem_async.KeyValueStore(here)["old a"].read(), {"x": np.arange(3)})
+    with pytest.raises(BadKey, match="brace"):
+        await restore(here, tmp_path / "a.zip", into="{")
+    with pytest.raises(BadKey):
+        await restore(here, tmp_path / "a.zip", into="x" * 600)
+    assert set(everything(raws[0], "*old*")) == {b"old a", b"{old a}.x", b"{old a}:ships"}
+
+
+async def test_a_foreign_key_in_the_way_is_never_replaced(here, there, raws, tmp_path):
+    for name in ("a", "b"):
+        await reem_async.KeyValueStore(here)[name].write(np.arange(3))
+    await save(here, tmp_path / "a.zip")
+    raws[1].lpush("b", "precious")
+    with pytest.raises(WrongKind, match="list"):
+        await restore(there, tmp_path / "a.zip", replace=True)
+    assert set(everything(raws[1])) == {b"b"}
+    raws[1].delete("b")
+    raws[1].lpush("{a}:ships", "precious")
+    with pytest.raises(BadData, match=r"\{a\}:ships"):
+        await restore(there, tmp_path / "a.zip", replace=True)
+    assert set(everything(raws[1])) == {b"{a}:ships"}
+
+
+async def test_subscribers_are_told(here, servers, raws, tmp_path):
+    """A mirror has the restored value, arrays included, and no update of this interface is missed afterwards."""
+    space = reem_async.PublishSpace(here)
+    await space["arm"].write({"joint": 1.5, "image": np.arange(3)})
+    await save(here, tmp_path / "a.zip")
+    async with (
+        reem_async.RedisInterface(servers[0]) as other,
+        reem_async.SilentSubscriber("arm", other) as mirror,
+    ):
+        await space["arm"].write({"joint": 2.5, "new": np.zeros(3)})
+        await aeventually(lambda: mirror["joint"].read() == 2.5)
+        updates = []
+
+        def heard(data, updated_path):
+            updates.append((updated_path, data["joint"]))
+
+        async with reem_async.CallbackSubscriber("arm", other, heard):
+            await restore(here, tmp_path / "a.zip", replace=True)
+            await aeventually(lambda: mirror["joint"].read() == 1.5)
+            assert_same(mirror.value(), {"joint": 1.5, "image": np.arange(3)})
+            await space["arm"]["joint"].write(3.5)
+            await aeventually(lambda: updates == [("arm", 1.5), ("arm.joint", 3.5)])
+
+
+async def test_progress_and_the_twins(servers, raws, tmp_path):
+    """The blocking front does the same."""
+    with reem.RedisInterface(servers[0]) as here, reem.RedisInterface(servers[1]) as there:
+        reem.KeyValueStore(here)["foo"] = {"x": np.arange(3)}
+        told = []
+        saved = reem.snapshots.save(here, tmp_path / "a.zip", progress=told.append)
+        done = reem.snapshots.restore(there, str(tmp_path / "a.zip"), progress=told.append)
+        assert reem.snapshots.describe(tmp_path / "a.zip", check=True) == saved
+        assert_same(reem.KeyValueStore(there)["foo"].read(), {"x": np.arange(3)})
+        assert (saved.count, done.names) == (1, ("foo",))
+        assert [(each.doing, each.done, each.total) for each in told if each.doing != "verify"] == [
+            *(("save", 0, 1), ("save", 1, 1)),
+            *(("restore", 0, 1), ("restore", 1, 1)),
+        ]
+        assert ("verify", saved.size) in {(each.doing, each.total) for each in told}
+        assert reem.snapshots.save_rdb(here, tmp_path / "a.rdb").kind == "rdb"
+    for name in ("save", "restore", "save_rdb"):
+        ours, theirs = getattr(reem.snapshots, name), getattr(reem_async.snapshots, name)
+        shapes = [
+            [(each.name, each.kind, each.default) for each in inspect.signature(function).parameters.values()]
+            for function in (ours, theirs)
+        ]
+        assert shapes[0] == shapes[1]
+        assert ours.__doc__ == theirs.__doc__
+    assert set(reem.snapshots.__all__) == set(reem_async.snapshots.__all__)
+
+
+# --- rights -------------------------------------------------
+
+
+async def test_a_program_with_few_rights_can_save_and_restore(servers, raws, tmp_path):
+    """Those it has anyway, and SCAN; an RDB file it cannot have, and is told so."""
+    admin = raws[0]
+    rules = ["reset", "on", ">secret", "~reem:*", "~{reem:*", "&reem:*", "&{reem:*", "-@all", "+scan"]
+    admin.execute_command("ACL", "SETUSER", "robot", *rules, *(f"+{name}" for name in COMMANDS))
+    admin.set("elsewhere", 1)
+    parts = urllib.parse.urlsplit(servers[0].url)
+    url = f"redis://robot:secret@{parts.hostname}:{parts.port}"
+    async with reem_async.RedisInterface(url, namespace="reem:") as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        await kvs["foo"].write({"x": np.arange(3), "l": [b"x"]})
+        before = everything(admin)
+        admin.execute_command("ACL", "LOG", "RESET")
+        await save(interface, tmp_path / "a.zip")
+        await kvs["foo"].write({"x": 1})
+        await restore(interface, tmp_path / "a.zip", replace=True)
+        assert everything(admin) == before
+        denied = {row["object"] for row in admin.acl_log()}
+        assert denied <= {"info"}, "new connections ask who the server is, and do without the answer"
+        with pytest.raises(RdbUnavailable, match="CONFIG GET"):
+            await save_rdb(interface, tmp_path / "a.rdb")
+    async with reem_async.RedisInterface(url) as interface:  # it sees the names of keys that it may not look at
+        saved = await save(interface, tmp_path / "b.zip")
+        assert [key.name for key in saved.keys] == ["reem:foo"]
+        assert saved.foreign_names == ("elsewhere (not allowed)",)
+    admin.execute_command("ACL", "SETUSER", "robot", "-scan")
+    async with reem_async.RedisInterface(url, namespace="reem:") as interface:
+        with pytest.raises(redis.exceptions.NoPermissionError, match="scan"):
+            await save(interface, tmp_path / "c.zip")
+        assert (await save(interface, tmp_path / "c.zip", "foo")).count == 1
+    admin.execute_command("ACL", "DELUSER", "robot")
+    assert left_in(tmp_path) == ["a.zip", "b.zip", "c.zip"]
+
+
+# --- RDB files -------------------------------------------------
+
+
+async def test_an_rdb_file_is_of_now(here, raws, tmp_path):
+    """Not one that the server saved before; and a server started on it has all of it."""
+    await fill(here)
+    raws[0].set("foreign", "x")
+    first = await save_rdb(here, tmp_path / "a.rdb")
+    assert (first.kind, first.count) == ("rdb", raws[0].dbsize())
+    assert abs(first.time - time.time()) < 60
+    assert "valkey" in first.server or "7" in first.server or "8" in first.server
+    await reem_async.KeyValueStore(here)["later"].write(np.arange(3))
+    with pytest.raises(FileExistsError):
+        await save_rdb(here, tmp_path / "a.rdb")
+    again = await save_rdb(here, tmp_path / "a.rdb", overwrite=True)
+    assert again.count == raws[0].dbsize() == first.count + 3
+    with pytest.raises(BadData, match="reem up --from"):
+        await restore(here, tmp_path / "a.rdb")
+    # RedisJSON keeps documents as text there, and reads it as it reads any text: the tree's floats have changed.
+    with EmbeddedServer(snapshot=tmp_path / "a.rdb") as server, redis.Redis.from_url(server.url) as past:
+        now, then = everything(raws[0]), everything(past)
+        assert {key for key in now | then if now.get(key) != then.get(key)} <= {b"tree"}
+        kept, read = (json.loads(each[b"tree"][1])["floats"] for each in (now, then))
+        numbers = [pair for pair in zip(kept, read, strict=True) if isinstance(pair[0], float)]
+        assert len(numbers) > 1900
+        assert all(math.isclose(*pair, rel_tol=1e-15, abs_tol=1e-322) for pair in numbers)
+    assert left_in(tmp_path) == ["a.rdb"]
+
+
+async def test_the_rdb_file_of_a_server_elsewhere(tmp_path):
+    """Of another machine or container: there is none here, or one that is another server's."""
+    with pytest.raises(RdbUnavailable, match=r"/no/such/dump\.rdb"):
+        rdb._check_readable(Path("/no/such/dump.rdb"))
+    source = tmp_path / "dump.rdb"
+    rdb._check_readable(source)  # the server will make it
+    with pytest.raises(RdbUnavailable, match="another server's"):
+        await rdb._copy(source, None, tmp_path / "b.rdb")
+    source.write_bytes(b"REDIS0011 of another server")
+    with pytest.raises(RdbUnavailable, match="another server's"):
+        await rdb._copy(source, rdb._identity(source), tmp_path / "b.rdb")
+    assert left_in(tmp_path) == ["dump.rdb"]
+
+
+async def test_a_server_that_cannot_save_says_so(tmp_path):
+    """Its directory is gone: no file, and no waiting for ever."""
+    with EmbeddedServer(directory=tmp_path / "data") as server:
+        async with reem_async.RedisInterface(server) as interface:
+            shutil.rmtree(tmp_path / "data")
+            with pytest.raises(RdbUnavailable):
+                await save_rdb(interface, tmp_path / "a.rdb")
+    assert "a.rdb" not in left_in(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("head", "count"),
+    [
+        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfa\x05ctime\xc2\x00\x00\x00\x60\xfe\x00\xfb\x07\x00", 7),
+        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfe\x00\xfb\x41\x00\x00", 256),
+        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfe\x00\xfb\x80\x00\x01\x00\x00\x00", 65536),
+        (
+            b"REDIS0011\xf7\x81\x01\x02\x03\x04\x05\x06\x07\x08\x02\x02\x05\x03abc\x01\x41\x02\x04"
+            + bytes(8)
+            + b"\x00\xff",
+            0,
+        ),
+        (b"REDIS0011\xff" + bytes(8), 0),
+        (b"REDIS0011\xf5\x03abc\xff" + bytes(8), None),
+        (b"REDIS0011\xfa\xc3\x01", None),
+        (b"VALKEY080\xfe", None),
+    ],
+)
+async def test_what_the_beginning_of_an_rdb_file_says(tmp_path, head, count):
+    path = tmp_path / "x.rdb"
+    path.write_bytes(head)
+    it = await describe(path)
+    assert it.count == count
+    assert it.server == ("redis 7.4.0" if b"redis-ver" in head else "")
+    assert it.time == (0x60000000 if b"ctime" in head else path.stat().st_mtime)
+
+
+def test_the_modules_that_know_the_format_know_no_server():
+    """The file format and the plans are values and functions."""
+    for name in ("archive", "files", "values", "plans"):
+        text = (ROOT / f"reem_async/snapshots/{name}.py").read_text(encoding="utf-8")
+        assert not any(word in text for word in ("asyncio", "anyio", "session", "transport", "import redis")), name
