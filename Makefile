@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench clean
+.PHONY: demo test check chaos bench clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -20,6 +20,9 @@ $(VENV)/ready: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	touch $@
+
+chaos: $(VENV)/ready  ## the reliability scoreboard, under 20 minutes; CHAOS="--rows 1,9 --seed 7"
+	$(BIN)/python -m tests.chaos $(CHAOS)
 
 bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick for about one
 	.venv-bench/bin/python -m benchmarks $(BENCH)

@@ -16,6 +16,7 @@ from reem_async.policy import Ended
 from reem_async.ships.base import SpecialDatatypeShip
 from reem_async.state import State, StateChange, StateChanges
 from reem_async.transport.blocking import BlockingTransport
+from reem_async.transport.endpoints import NewTransport
 
 from ._portal import Portal, finish
 from ._twin import documented_by
@@ -28,7 +29,7 @@ Result = TypeVar("Result")
 class _OnThread(reem_async.RedisInterface):
     """The core's interface over connections that the caller's own thread drives."""
 
-    _new_transport = BlockingTransport
+    _new_transport: NewTransport = BlockingTransport
 
 
 class _Background:
@@ -178,7 +179,11 @@ class RedisInterface:
         self._closing()
 
     def __enter__(self) -> Self:
-        self.initialize()
+        try:
+            self.initialize()
+        except BaseException:
+            self.close()
+            raise
         return self
 
     def __exit__(

@@ -15,6 +15,8 @@ from .plan.patterns import escaped, parse_pattern
 from .plan.placeholders import MARK_BYTES, Placeholder, find
 from .plan.reads import get_command, present
 from .plan.replies import loads
+from .session import Session
+from .transport import Transport
 
 __all__ = ["Outline", "names", "outline"]
 
@@ -55,21 +57,29 @@ async def names(interface: RedisInterface, pattern: str = "*") -> AsyncIterator[
         interface: The server.
         pattern: A glob: `*` and `?` stand for other characters.
 
-    One round trip for about 1000 keys of the server, whoever they belong to. A key that is written or
-    deleted meanwhile may or may not be among them.
+    One round trip for about 1000 keys of the server, whoever they belong to; in a cluster all primaries are
+    asked, one after the other. A key that is written, deleted or moved to another node meanwhile may or
+    may not be among them.
     """
     session = interface.session
     glob = escaped(session.namespace) + parse_pattern(pattern).glob
     seen: set[str] = set()
-    cursor: Any = b"0"
-    while True:
-        command = ("SCAN", cursor, "MATCH", glob, "COUNT", _PAGE, "TYPE", "ReJSON-RL")
-        cursor, page = await session.run(Plan([command], _first))
-        for key in page:
+    for node in await session.transport.nodes():
+        async for key in documents(session, node, glob):
             name = key.decode(errors="replace")[len(session.namespace) :]
             if name not in seen and _is_name(name):
                 seen.add(name)
                 yield name
+
+
+async def documents(session: Session, node: Transport, glob: str) -> AsyncIterator[bytes]:
+    """Yield the keys of the documents that `node` has and whose server-side names match `glob`."""
+    cursor: Any = b"0"
+    while True:
+        command = ("SCAN", cursor, "MATCH", glob, "COUNT", _PAGE, "TYPE", "ReJSON-RL")
+        cursor, page = await session.run(Plan([command], _first), node)
+        for key in page:
+            yield key
         if cursor in (b"0", 0):
             return
 

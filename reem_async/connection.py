@@ -56,6 +56,7 @@ class RedisInterface:
         self._given = (getattr(host, "url", host), ships, {"namespace": namespace, "timeout": timeout, **options})
         self.session = Session(host, ships, namespace, timeout, options, self._new_transport)
         self.session.interface = self
+        self.session.transport.at_end = self.session.release
 
     @property
     def hostname(self) -> str:
@@ -105,7 +106,11 @@ class RedisInterface:
         await self.session.close()
 
     async def __aenter__(self) -> Self:
-        await self.initialize()
+        try:
+            await self.initialize()
+        except BaseException:
+            await self.close()
+            raise
         return self
 
     async def __aexit__(

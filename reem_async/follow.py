@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .background import in_background
-from .errors import MissingKey
+from .errors import MissingKey, RedisError
 from .hub import Topic
 from .plan import Plan, Reply, unwrap, wire_commands
 from .plan.keys import Keys
@@ -103,6 +103,7 @@ class Follower:
         self._last_reading = 0
         self._settling = False  # the snapshot is here and ships are opening it
         self._behind = False  # an update could not be applied: only a snapshot helps
+        self._unread = False  # the server would not let itself be read: ask again before long
         self._covered: list[Notice] = []  # arrived while a snapshot was on its way: it has them
         self._doubtful: list[Notice] = []  # arrived while a large one was: it has the first of them
         self._later: list[tuple[Notice, str]] = []  # arrived after a snapshot that ships are still opening
@@ -137,7 +138,9 @@ class Follower:
 
     def on_note(self, note: bytes | None) -> None:
         """Compare with the server's note of the last update, asked for in order with notices."""
-        if self._wire is not None and not self._reading and not self._settling and self._heard.lacks(note):
+        if self._wire is None or self._reading or self._settling:
+            return
+        if self._heard.lacks(note) or self._unread:
             self._behind = True
             self._read()
 
@@ -270,14 +273,15 @@ class Follower:
                 self._settle(sealed.holder[0])
 
     def _failed(self, error: Exception) -> None:
-        """Report a snapshot that could not be taken; the next update tries again."""
+        """Report a snapshot that could not be taken; the next update or heartbeat tries again."""
         self._reading, self._settling, self._behind = 0, False, True
+        self._unread = isinstance(error, RedisError)
         self._covered.clear()
         self._doubtful.clear()
         later, self._later = self._later, []
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(error)
-        elif self._wire is not None:
+        elif self._wire is not None and self._wire.alive:
             where = show((self.keys.name, *self.path))
             logger.warning("%s: an update could not be read and is skipped: %s", where, error)
         if later:
@@ -289,7 +293,7 @@ class Follower:
         later, self._later = self._later, []
         kind, self._kind = ("gap" if self._behind and not self._kind else self._kind), ""
         self.tree = tree
-        self._reading, self._settling, self._behind = 0, False, False
+        self._reading, self._settling, self._behind, self._unread = 0, False, False, False
         if kind == "gap" or (kind == "initial" and self.at() is not MISSING):
             self._emit_snapshot(initial=kind == "initial")
         if not kind:

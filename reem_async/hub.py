@@ -24,6 +24,9 @@ __all__ = ["Hub", "Listener", "Topic"]
 
 logger = logging.getLogger("reem.subscribe")
 
+_LONGEST_PAUSE = 0.5
+"""Seconds between tries to connect: with one that hangs before it, still less than two in all."""
+
 _HEARTBEAT = 1.0
 """Seconds between looks at a subscribed connection; one that is dead shows a call's time limit later."""
 
@@ -246,7 +249,7 @@ class Hub:
         try:
             while self._is_wanted():
                 await asyncio.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - only spreads the load
-                pause = min(pause * 2, 1.0)
+                pause = min(pause * 2, _LONGEST_PAUSE)
                 if not self._is_wanted():
                     return
                 try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,7 +18,7 @@ from .plan.replies import no_json
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive
-from .transport.options import Options
+from .transport.endpoints import NewTransport, way_to
 from .transport.recorder import CommandRecorder
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ class Session:
     """One server as one interface sees it.
 
     Args:
-        host: A host name, a URL, or an `EmbeddedServer`.
+        host: A host name, a URL, an `EmbeddedServer` or an `EmbeddedCluster`.
         ships: What carries values that are not JSON; None for the default list.
         namespace: Goes before every key and channel.
         timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options.
-        new_transport: Makes the transport.
+        new_transport: Makes the transport to one server.
 
     Attributes:
         ships: Chooses ships.
@@ -53,15 +53,14 @@ class Session:
         namespace: str,
         timeout: float,
         options: dict[str, Any],
-        new_transport: Callable[[Options], Transport],
+        new_transport: NewTransport,
     ) -> None:
         if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
             raise BadType(f"the namespace {namespace!r} is not a str without braces")
         self.namespace = namespace
-        self.options = Options(host, timeout, options)
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.memory = Memory()
-        self.transport = new_transport(self.options)
+        self.options, self.transport = way_to(host, timeout, options, new_transport)
         self.interface: Any = None
         self._publisher = secrets.token_hex(6), os.getpid()
         self._sequences: dict[str, int] = {}
@@ -83,12 +82,15 @@ class Session:
 
     def keys(self, name: object) -> Keys:
         """Return the server-side names of the top-level key `name`; raises BadKey."""
-        return keys_of(check_top_key(name), self.namespace, self.options.database)
+        return keys_of(check_top_key(name), self.namespace, self.options.database, self.transport.sharded)
 
-    async def run(self, plan: Plan) -> Any:
-        """Send a plan's commands, and those that follow from the replies; return the result."""
+    async def run(self, plan: Plan, at: Transport | None = None) -> Any:
+        """Send a plan's commands, and those that follow from the replies; return the result.
+
+        They go `at` one server, or where their keys are.
+        """
         try:
-            return await drive(self.transport, plan)
+            return await drive(at or self.transport, plan)
         except WrongKind as error:
             (kind,) = await self.transport.roundtrip([("TYPE", error.key)])
             raise WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?") from None
@@ -110,6 +112,13 @@ class Session:
             raise NoJsonSupport(f"{self.options.address}: {no_json()}")
         if "run the" in str(reply):  # not allowed to use JSON; that the one key is out of bounds means nothing
             raise reply
+
+    async def release(self) -> None:
+        """End all subscriptions and close all connections of this event loop; another one may go on."""
+        hub, self._hub = self._hub, None
+        if hub is not None:
+            await hub.close()
+        await self.transport.release()
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""

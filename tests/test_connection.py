@@ -98,8 +98,8 @@ def test_what_is_no_time_limit_is_refused(seconds):
 
 
 async def test_a_slow_upload_is_not_cut_off(server):
-    """Ten times the limit, but bytes move."""
-    total, rate = 24 << 20, 16 << 20
+    """More than twice the limit, but bytes move."""
+    total, rate = 24 << 20, 10 << 20
     relays = []
 
     async def relay(reader, writer):
@@ -127,17 +127,17 @@ async def test_a_slow_upload_is_not_cut_off(server):
     url = f"redis://127.0.0.1:{port}"
 
     def blocking():
-        with reem.RedisInterface(url, timeout=0.3) as interface:
+        with reem.RedisInterface(url, timeout=0.9) as interface:
             begin = time.monotonic()
             reem.KeyValueStore(interface)["big"] = value
             return time.monotonic() - begin
 
     async with slow:
-        async with reem_async.RedisInterface(url, timeout=0.3) as interface:
+        async with reem_async.RedisInterface(url, timeout=0.9) as interface:
             begin = time.monotonic()
             await reem_async.KeyValueStore(interface)["big"].write(value)
-            assert time.monotonic() - begin > 0.6
-        assert await asyncio.to_thread(blocking) > 0.6
+            assert time.monotonic() - begin > 1.8
+        assert await asyncio.to_thread(blocking) > 1.8
         await asyncio.gather(*relays)
 
 

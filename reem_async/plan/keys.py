@@ -22,6 +22,7 @@ class Keys(NamedTuple):
         registry: The set of the suffixes of all ships' keys that exist.
         channel: Where notices of updates are published.
         last: Which notice was published last; kept for a minute.
+        publish: The command for notices: SPUBLISH in a cluster, where a channel belongs to the key's node.
     """
 
     name: str
@@ -30,12 +31,14 @@ class Keys(NamedTuple):
     registry: str
     channel: str
     last: str
+    publish: str = "PUBLISH"
 
 
 @lru_cache(maxsize=4096)
-def keys_of(name: str, namespace: str = "", database: int = 0) -> Keys:
+def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = False) -> Keys:
     """Return the server-side names of the top-level key `name`."""
     tag = "{" + namespace + name + "}"
     # Channels are shared by all databases of a server, keys are not.
     channel = f"{tag}:notices" + (f"@{database}" if database else "")
-    return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last")
+    publish = "SPUBLISH" if sharded else "PUBLISH"
+    return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last", publish)

@@ -58,7 +58,7 @@ def published(keys: Keys, publisher: str, sequence: int, payload: bytes) -> list
     Of a snapshot that holds this note one can tell which notices it has: those up to this one. It
     expires, since it only matters while a snapshot is on its way.
     """
-    return [("SET", keys.last, f"{publisher} {sequence}", "EX", 60), ("PUBLISH", keys.channel, payload)]
+    return [("SET", keys.last, f"{publisher} {sequence}", "EX", 60), (keys.publish, keys.channel, payload)]
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:

@@ -6,7 +6,7 @@ event loop, `BlockingTransport` a plain thread; both are handed the same plans b
 
 from __future__ import annotations
 
-from collections.abc import Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
@@ -29,12 +29,28 @@ class Transport(Held, Protocol):
 
     Attributes:
         states: What the interface's user gets to know of the connections.
+        sharded: It is a cluster: every key, and the notices about it, have a node.
+        at_end: What ends subscriptions and connections when the event loop in use ends; unused where there is none.
     """
 
     states: States
+    at_end: Callable[[], Awaitable[None]]
+    sharded: bool
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
+        ...
+
+    async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
+        """Return the way to the server that has `key`; `anew` if it was not where it was thought to be."""
+        ...
+
+    async def nodes(self) -> Sequence[Transport]:
+        """Return the ways to the servers that have all keys together."""
+        ...
+
+    async def pause(self, seconds: float) -> None:
+        """Wait."""
         ...
 
     async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
@@ -47,6 +63,10 @@ class Transport(Held, Protocol):
 
     def check(self) -> None:
         """Raise if this cannot be used here: closed, or bound to another event loop."""
+        ...
+
+    async def release(self) -> None:
+        """Close the connections that are not in use; new ones are made when needed."""
         ...
 
     async def close(self) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -21,15 +22,19 @@ from .wire import Wire, open_wire
 __all__ = ["AsyncTransport"]
 
 _BULK = 1 << 16
-_SPARE = 4
+_SPARE = 16
 
 
 class AsyncTransport:
     """Connections of one interface in one event loop, made when first needed.
 
     Attributes:
+        sharded: One server has all keys.
         states: What the interface's user gets to know of the connections.
+        at_end: What closes all connections of an event loop; called if it ends before that was done.
     """
+
+    sharded = False
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -41,6 +46,8 @@ class AsyncTransport:
         self._spare: list[Wire] = []
         self._orders: dict[str, anyio.Lock] = {}
         self.states = States()
+        self.at_end: Callable[[], Awaitable[None]] = self.release
+        self._farewell: AsyncGenerator[None, None] | None = None
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` on the shared wire, or on the one for large values, and return the replies."""
@@ -87,7 +94,7 @@ class AsyncTransport:
         if self._pid != os.getpid():
             # After a fork the sockets belong to the parent: forget them without closing.
             self._forget()
-            self._pid, self._loop = os.getpid(), loop
+            self._pid, self._loop = os.getpid(), None
         if self._loop is not loop:
             if self._loop is not None and not self._loop.is_closed():
                 raise WrongLoop(
@@ -96,6 +103,18 @@ class AsyncTransport:
                 )
             self._forget()
             self._loop = loop
+            self._farewell = self._end_with_loop()
+            with contextlib.suppress(StopIteration):
+                self._farewell.__anext__().__await__().send(None)
+
+    async def _end_with_loop(self) -> AsyncGenerator[None, None]:
+        """Close the connections that a program left open before its event loop ends: generators end last there."""
+        try:
+            yield
+        finally:
+            self._farewell = None
+            if not self._closed:
+                await self.at_end()
 
     def _forget(self) -> None:
         self._lanes.clear()
@@ -120,6 +139,18 @@ class AsyncTransport:
         else:
             await wire.close()
 
+    async def owner(self, key: bytes, *, anew: bool = False) -> AsyncTransport:
+        """Return this: there is one server."""
+        return self
+
+    async def nodes(self) -> Sequence[AsyncTransport]:
+        """Return this alone."""
+        return (self,)
+
+    async def pause(self, seconds: float) -> None:
+        """Wait."""
+        await asyncio.sleep(seconds)
+
     async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
         """Run `call` to its end even if the caller is cancelled: what comes after it must not overtake it."""
         task = asyncio.get_running_loop().create_task(call)
@@ -139,16 +170,24 @@ class AsyncTransport:
         return await self._opened(on_push, on_lost)
 
     async def close(self) -> None:
-        """Close all connections."""
+        """Close all connections, for good."""
         if self._closed:
             return
         self._closed = True
         self.states.closed()
+        farewell, self._farewell = self._farewell, None
+        if self._loop is asyncio.get_running_loop():
+            await self.release()
+            if farewell is not None:
+                await farewell.aclose()
+        self._forget()
+
+    async def release(self) -> None:
+        """Close the connections of this event loop; another one may go on with this transport."""
         wires = [*self._lanes.values(), *self._spare]
         self._forget()
-        if self._loop is asyncio.get_running_loop():
-            for wire in wires:
-                await wire.close()
+        for wire in wires:
+            await wire.close()
 
 
 def _is_bulk(commands: Sequence[Command]) -> bool:

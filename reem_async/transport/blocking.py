@@ -12,7 +12,8 @@ import select
 import socket
 import struct
 import threading
-from collections.abc import AsyncIterator, Coroutine, Sequence
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -23,11 +24,14 @@ from ..plan import Command, Reply
 from ..state import States
 from .identity import WHO, who
 from .options import Options
-from .packing import pack
+from .packing import Piece, pack
 from .parsing import MORE, LargeReader, Reader, SmallReader
 from .patience import patience, unsent
 
 __all__ = ["BlockingTransport"]
+
+_LOOKS = 20
+"""How many times per time limit to look whether a large value is moving."""
 
 
 class _Line:
@@ -42,7 +46,6 @@ class _Line:
             raise options.refused(error) from error
         self._socket: socket.socket = self._connection._sock
         self._timeout = options.timeout
-        self._unsent = 0  # bytes of a large value that were on their way up when last looked at
         self._limit = 0.0
         self._set_limit(self._timeout)
         self._poll = select.poll() if hasattr(select, "poll") else None
@@ -77,9 +80,10 @@ class _Line:
             self._set_limit(limit)
         try:
             pieces = pack(commands)
-            for piece in pieces:
-                self._socket.sendall(piece)
-            self._unsent = unsent(self._socket) if len(pieces) > 1 else 0
+            if len(pieces) == 1:
+                self._socket.sendall(pieces[0])
+            else:
+                self._send_large(pieces, limit)
             if bulk and self._large is None:
                 self._large = LargeReader()
             replies = self._replies((bulk and self._large) or self._small, len(commands))
@@ -106,7 +110,7 @@ class _Line:
         while True:
             reply = gets()
             if reply is MORE:
-                received = self._receive(reader.target())
+                received = self._socket.recv_into(reader.target())
                 if not received:
                     raise ConnectionResetError("closed by the server")
                 reader.received(received)
@@ -115,15 +119,33 @@ class _Line:
             if len(replies) == count:
                 return replies
 
-    def _receive(self, target: memoryview) -> int:
-        """Receive into `target`; a large value that is still on its way up is progress too."""
-        while True:
-            try:
-                return self._socket.recv_into(target)
-            except (BlockingIOError, TimeoutError):
-                before, self._unsent = self._unsent, unsent(self._socket)
-                if self._unsent >= before:
-                    raise
+    def _send_large(self, pieces: list[Piece], limit: float) -> None:
+        """Send large values and wait for the first byte of the reply; bytes that move begin the limit anew."""
+        self._set_limit(limit / _LOOKS)
+        moved = time.monotonic()
+        try:
+            for piece in pieces:
+                view, sent = memoryview(piece), 0
+                while sent < len(view):
+                    try:
+                        sent += self._socket.send(view[sent:])
+                        moved = time.monotonic()
+                    except (BlockingIOError, TimeoutError):
+                        _check_moved(moved, limit)
+            self._await_reply(moved, limit)
+        finally:
+            self._set_limit(limit)
+
+    def _await_reply(self, moved: float, limit: float) -> None:
+        """Wait until something can be received, as long as what was sent goes on arriving."""
+        if self._poll is None:
+            return
+        left = unsent(self._socket)
+        while not self._poll.poll(limit / _LOOKS * 1000):
+            before, left = left, unsent(self._socket)
+            if left < before:
+                moved = time.monotonic()
+            _check_moved(moved, limit)
 
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
@@ -150,12 +172,21 @@ class _Line:
         self._connection.disconnect()
 
 
+def _check_moved(moved: float, limit: float) -> None:
+    if time.monotonic() - moved >= limit:
+        raise TimeoutError
+
+
 class BlockingTransport:
     """Connections for the threads of one process: as many as there are calls at the same time.
 
     Attributes:
+        sharded: One server has all keys.
         states: What the interface's user gets to know of the connections.
+        at_end: Never called: no event loop is in use.
     """
+
+    sharded = False
 
     def __init__(self, options: Options) -> None:
         self._options = options
@@ -164,6 +195,7 @@ class BlockingTransport:
         self._closed = False
         self._orders: dict[str, threading.Lock] = {}
         self.states = States()
+        self.at_end: Callable[[], Awaitable[None]] = self.release
 
     def check(self) -> None:
         """Raise if this is closed."""
@@ -216,6 +248,18 @@ class BlockingTransport:
             raise
         self._give(line)
 
+    async def owner(self, key: bytes, *, anew: bool = False) -> BlockingTransport:
+        """Return this: there is one server."""
+        return self
+
+    async def nodes(self) -> Sequence[BlockingTransport]:
+        """Return this alone."""
+        return (self,)
+
+    async def pause(self, seconds: float) -> None:
+        """Wait, and the thread with it."""
+        time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
+
     async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
         """Run `call`; nothing can cancel it half way."""
         return await call
@@ -229,6 +273,10 @@ class BlockingTransport:
         """Close all connections that are not in use; the others are closed when given back."""
         self._closed = True
         self.states.closed()
+        await self.release()
+
+    async def release(self) -> None:
+        """Close all connections that are not in use; new ones are made when needed."""
         while self._idle:
             self._idle.pop().close()
 

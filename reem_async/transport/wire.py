@@ -25,7 +25,10 @@ from .patience import patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
-_CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe")
+_LOOKS = 20
+"""How many times per time limit to look whether a large value is moving."""
+
+_CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
 
 class _Due:
@@ -38,9 +41,10 @@ class _Due:
         since: the time from which this counts at the earliest.
         replies: Those that have come.
         over: The caller was told; what still comes is dropped.
+        lenient: Errors are no reply.
     """
 
-    __slots__ = ("count", "done", "limit", "over", "replies", "since")
+    __slots__ = ("count", "done", "lenient", "limit", "over", "replies", "since")
 
     def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None], limit: float, since: float) -> None:
         self.count = count
@@ -49,6 +53,7 @@ class _Due:
         self.since = since
         self.replies: list[Reply] = []
         self.over = False
+        self.lenient = False
 
 
 class Wire(asyncio.BufferedProtocol):
@@ -117,12 +122,23 @@ class Wire(asyncio.BufferedProtocol):
             self._write(pieces)
             if len(pieces) > 1:
                 self._unsent = self._bytes_unsent()
+                self._watch_until(now + limit / _LOOKS)
             return
         # Others wait already: what is sent in the same turn of the loop goes out in one system call.
         if not self._outbox:
             self._loop.call_soon(self._flush)
         # A view of an array is copied: its owner may change it before this turn is over.
         self._outbox.extend(bytes(piece) if type(piece) is memoryview else piece for piece in pieces)
+
+    def leave(self, channel: bytes) -> None:
+        """Unsubscribe from a sharded channel.
+
+        What confirms that looks like the word that the channel's slot has moved, and if it has, there is an
+        error instead. So neither is waited for; the PONG behind it is.
+        """
+        if not self.alive:
+            return
+        self.send([("PING",)], lambda _: None, before=[("SUNSUBSCRIBE", channel)])
 
     def _flush(self) -> None:
         pieces, self._outbox = self._outbox, []
@@ -213,6 +229,8 @@ class Wire(asyncio.BufferedProtocol):
             self.abort(ConnectionLost("the server sent a reply that nobody asked for"))
             return
         due = self._due[0]
+        if due.lenient and isinstance(reply, Exception):
+            return
         due.replies.append(reply)
         if len(due.replies) == due.count:
             self._due.popleft()
@@ -245,7 +263,9 @@ class Wire(asyncio.BufferedProtocol):
                 )
         moments = [max(self._last_byte, due.since) + due.limit for due in self._due if not due.over]
         if moments:
-            self._watch_until(max(min(moments), now + 0.01))
+            # While a large value is on its way up, look often: its last progress begins the limit.
+            soon = now + min(due.limit for due in self._due if not due.over) / _LOOKS if left else max(moments)
+            self._watch_until(max(min(*moments, soon), now + 0.01))
         elif waiting:
             self.abort(ConnectionLost(f"the server moved no byte for {waiting[-1].limit:g} s"))
 

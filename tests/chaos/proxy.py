@@ -1,0 +1,266 @@
+"""A TCP proxy that misbehaves when told to, in a thread of its own: blocking and asyncio clients can both be tested."""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import contextlib
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+
+CHUNK = 1 << 16
+
+
+class Scanner:
+    """Counts the commands in what one client sends, by the lengths they declare, just as a server would."""
+
+    def __init__(self, names: collections.Counter[str]) -> None:
+        self._names = names
+        self._rest = b""
+        self._skip = 0  # bytes of an argument, and its line end, that are still to come
+        self._left = 0  # arguments of the command that are still to come
+        self._first = False
+
+    def feed(self, data: bytes) -> None:
+        """Take note of the next bytes."""
+        data, at = self._rest + data, 0
+        while at < len(data):
+            if self._skip:
+                step = min(self._skip, len(data) - at)
+                self._skip -= step
+                at += step
+                continue
+            end = data.find(b"\r\n", at)
+            if end < 0:
+                break
+            if not self._left:
+                if data[at : at + 1] == b"*":
+                    self._left, self._first = int(data[at + 1 : end]), True
+                else:
+                    self._names["(inline)"] += 1
+                at = end + 2
+                continue
+            size = int(data[at + 1 : end])
+            if self._first:
+                if len(data) < end + 2 + size:
+                    break
+                self._names[data[end + 2 : end + 2 + size].decode(errors="replace").upper()] += 1
+                self._first = False
+            self._left -= 1
+            self._skip = size + 2
+            at = end + 2
+        self._rest = data[at:]
+
+
+class _Link:
+    """One client's connection and the one made to the server for it."""
+
+    def __init__(self, client: asyncio.StreamWriter, server: asyncio.StreamWriter) -> None:
+        self.client = client
+        self.server = server
+        self.swallowed = False  # for good: bytes are missing
+        self.gone = False  # the client has closed; the server may still be busy with what it sent
+        self.doomed = False  # the next reply is dropped and the connection reset
+
+    def reset(self) -> None:
+        """End it with a RST to the client; the server still gets, and answers, what was sent."""
+        _abort(self.client)
+        self.swallowed = self.gone = True
+        with contextlib.suppress(OSError, RuntimeError):
+            self.server.write_eof()
+
+
+class Proxy:
+    """Stands between clients and the server at `port`; faults are set from any thread.
+
+    Attributes:
+        port: Where it listens, on 127.0.0.1.
+        delay: Seconds by which each chunk, either way, is held back.
+        sliced: Send every byte, either way, by itself.
+        names: How many commands of each name clients have sent.
+        lost: How many replies were dropped.
+    """
+
+    def __init__(self, port: int) -> None:
+        self._target = port
+        self.port = 0
+        self.delay = 0.0
+        self.sliced = False
+        self.names: collections.Counter[str] = collections.Counter()
+        self.lost = 0
+        self._marker: bytes | None = None
+        self._hole = False
+        self._links: set[_Link] = set()
+        self._loop = asyncio.new_event_loop()
+        self._over = asyncio.Event()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=self._loop.run_until_complete, args=(self._serve(),), name="proxy")
+
+    # What tests call.
+
+    @property
+    def url(self) -> str:
+        """What to connect to."""
+        return f"redis://127.0.0.1:{self.port}"
+
+    @property
+    def commands(self) -> int:
+        """How many commands clients have sent."""
+        return sum(self.names.values())
+
+    @property
+    def connections(self) -> int:
+        """How many connections are open."""
+        return len(self._links)
+
+    def drop_reply(self, marker: bytes) -> None:
+        """Lose the reply to the next request that contains `marker`: it is applied, and the connection reset."""
+        self._marker = marker
+
+    def reset(self) -> None:
+        """End all connections with a RST."""
+        self._do(lambda: [link.reset() for link in list(self._links)])
+
+    def settled(self, seconds: float = 10.0) -> bool:
+        """Wait until the server is done with all connections that clients have lost or closed; whether it is."""
+        deadline = time.monotonic() + seconds
+        while any(link.gone for link in list(self._links)):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.0005)
+        return True
+
+    def half_close(self) -> None:
+        """End all connections in the direction of the clients only; what they send is swallowed."""
+
+        def close() -> None:
+            for link in list(self._links):
+                link.swallowed = True
+                with contextlib.suppress(OSError, RuntimeError):
+                    link.client.write_eof()
+
+        self._do(close)
+
+    def black_hole(self) -> None:
+        """From now on swallow every byte, either way, of old and new connections, and close none."""
+
+        def open_hole() -> None:
+            self._hole = True
+            for link in self._links:
+                link.swallowed = True
+
+        self._do(open_hole)
+
+    def heal(self) -> None:
+        """Serve new connections again, without delay or slices; those that lost bytes stay dead."""
+        self.delay, self.sliced, self._marker = 0.0, False, None
+
+        def close_hole() -> None:
+            self._hole = False
+
+        self._do(close_hole)
+
+    def __enter__(self) -> Proxy:
+        self._thread.start()
+        self._ready.wait(10)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._loop.call_soon_threadsafe(self._over.set)
+        self._thread.join(10)
+        self._loop.close()
+
+    # What runs in the proxy's thread.
+
+    def _do(self, action: Callable[[], object]) -> None:
+        done = threading.Event()
+        self._loop.call_soon_threadsafe(lambda: (action(), done.set()))
+        done.wait(10)
+
+    async def _serve(self) -> None:
+        tasks: set[asyncio.Task[None]] = set()
+
+        def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            task = asyncio.get_running_loop().create_task(self._link(reader, writer))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
+
+        server = await asyncio.start_server(connected, "127.0.0.1", 0, backlog=1000)
+        self.port = server.sockets[0].getsockname()[1]
+        self._ready.set()
+        await self._over.wait()
+        server.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await asyncio.sleep(0)
+
+    async def _link(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
+        try:
+            replies, server = await asyncio.open_connection("127.0.0.1", self._target)
+        except OSError:
+            _abort(client)
+            return
+        link = _Link(client, server)
+        link.swallowed = self._hole
+        self._links.add(link)
+        pumps = [asyncio.ensure_future(pump) for pump in (self._up(link, reader), self._down(link, replies))]
+        try:
+            await asyncio.gather(*pumps)
+        except (OSError, RuntimeError):  # RuntimeError: the other pump has ended this side meanwhile
+            pass
+        finally:
+            self._links.discard(link)
+            for pump in pumps:
+                pump.cancel()
+            await asyncio.gather(*pumps, return_exceptions=True)
+            client.transport.abort()
+            server.transport.abort()
+
+    async def _up(self, link: _Link, reader: asyncio.StreamReader) -> None:
+        scanner, tail = Scanner(self.names), b""
+        while data := await reader.read(CHUNK):
+            scanner.feed(data)
+            marker = self._marker
+            if marker is not None:
+                if marker in tail + data:
+                    self._marker, link.doomed = None, True
+                tail = data[-len(marker) :]
+            if not link.swallowed:
+                await self._forward(data, link.server)
+        link.gone = True
+        with contextlib.suppress(OSError, RuntimeError):
+            link.server.write_eof()
+
+    async def _down(self, link: _Link, replies: asyncio.StreamReader) -> None:
+        while data := await replies.read(CHUNK):
+            if link.doomed and not link.swallowed:
+                self.lost += 1
+                link.reset()
+            if not link.swallowed:
+                await self._forward(data, link.client)
+        if not link.swallowed:
+            raise ConnectionResetError("the server has closed")
+
+    async def _forward(self, data: bytes, writer: asyncio.StreamWriter) -> None:
+        if self.delay:
+            await asyncio.sleep(self.delay)
+        if not self.sliced:
+            writer.write(data)
+            await writer.drain()
+            return
+        for at in range(len(data)):
+            writer.write(data[at : at + 1])
+            await asyncio.sleep(0)
+        await writer.drain()
+
+
+def _abort(writer: asyncio.StreamWriter) -> None:
+    """Close with a RST, as a host does that knows nothing of the connection any more."""
+    with contextlib.suppress(OSError):
+        link = writer.get_extra_info("socket")
+        link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    writer.transport.abort()

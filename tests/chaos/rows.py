@@ -1,0 +1,15 @@
+"""Every row of the scoreboard: importing this enters them."""
+
+from . import (  # noqa: F401
+    atomic,
+    calls,
+    hostile,
+    model,
+    outages,
+    processes,
+    recorder,
+    refusals,
+    restarts,
+    soak,
+    values,
+)

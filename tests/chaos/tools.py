@@ -1,0 +1,158 @@
+"""Small things that several rows need."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import reem_async
+
+from .scoreboard import ROOT
+
+PAUSE = 0.005
+"""Seconds between two looks at a condition."""
+
+
+def rss() -> float:
+    """The memory of this process that is in RAM, in MB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def descriptors() -> int:
+    """How many files and sockets this process has open."""
+    return len(os.listdir("/proc/self/fd"))
+
+
+def quantile(values: list[float], part: float) -> float:
+    """The value that `part` of the values do not exceed."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(part * len(ordered)))]
+
+
+async def became(condition: Callable[[], Any], seconds: float) -> float | None:
+    """Wait until the condition holds; returns the seconds that took, None if it never did."""
+    begun = time.monotonic()
+    while not condition():
+        if time.monotonic() - begun > seconds:
+            return None
+        await asyncio.sleep(PAUSE)
+    return time.monotonic() - begun
+
+
+def state_of(interface: Any) -> str:
+    """The state of an interface."""
+    state = getattr(interface, "state", None)
+    if state is None:
+        raise AssertionError("RedisInterface has no `state`: what became of a connection cannot be observed")
+    return str(state)
+
+
+@contextlib.asynccontextmanager
+async def background(*coroutines: Any):
+    """Run coroutines beside the block and cancel them after it; the first failure of one is raised."""
+    tasks = [asyncio.ensure_future(coroutine) for coroutine in coroutines]
+    try:
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
+        outcomes = await asyncio.gather(*tasks, return_exceptions=True)
+    for outcome in outcomes:
+        if isinstance(outcome, Exception):
+            raise outcome
+
+
+@contextlib.contextmanager
+def measured(times: list[float]) -> Iterator[None]:
+    """Add to `times` the seconds that the block takes, however it ends."""
+    begun = time.perf_counter()
+    try:
+        yield
+    finally:
+        times.append(time.perf_counter() - begun)
+
+
+@contextlib.contextmanager
+def program(name: str, *arguments: Any, flags: tuple[str, ...] = ("-W", "error")):
+    """Start one of the programs; both ways of talking to it are pipes."""
+    command = [sys.executable, *flags, "-m", "tests.chaos.programs", name, *map(str, arguments)]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def said(process: subprocess.Popen[str]) -> dict[str, Any]:
+    """Return the next thing a program says."""
+    line = process.stdout.readline()
+    assert line, f"the program ended with {process.wait(5)}"
+    return json.loads(line)
+
+
+def order(process: subprocess.Popen[str], word: object) -> None:
+    """Tell a program to go on."""
+    process.stdin.write(f"{word}\n")
+    process.stdin.flush()
+
+
+class Log:
+    """What one subscriber was told, update by update: repetitions, steps back, and losses that nobody flagged.
+
+    Numbers of one publisher go up one by one. If one is skipped, then an update in between, or the one
+    after it, must say `gap`, or the loop's own counter of skipped updates must have moved.
+
+    Attributes:
+        told: How many updates came.
+        gaps: How many of them were flagged.
+        repeated: Updates that came again.
+        backward: Updates that came after newer ones of the same publisher.
+        silent: Losses that were not flagged.
+    """
+
+    def __init__(self, updates: reem_async.subscribe.Watch) -> None:
+        self.updates = updates
+        self.told = self.gaps = 0
+        self.repeated: list[Any] = []
+        self.backward: list[Any] = []
+        self.silent: list[Any] = []
+        self._last: dict[str, int] = {}
+        self._excused: dict[str, bool] = {}
+        self._dropped = 0
+
+    async def follow(self) -> None:
+        """Take updates until the loop ends."""
+        async for update in self.updates:
+            self.take(update)
+
+    def take(self, update: Any) -> None:
+        """Note one update."""
+        self.told += 1
+        self.gaps += update.gap
+        if update.gap or self.updates.dropped > self._dropped:
+            self._dropped = self.updates.dropped
+            self._excused = dict.fromkeys(self._last, True)
+        publisher, sequence = update.publisher, update.sequence
+        if publisher is None:
+            return
+        last = self._last.get(publisher)
+        if last is not None and sequence <= last:
+            (self.repeated if sequence == last else self.backward).append((publisher, last, sequence))
+            return
+        if last is not None and sequence > last + 1 and not self._excused.get(publisher):
+            self.silent.append((publisher, last, sequence))
+        self._last[publisher] = sequence
+        self._excused[publisher] = False
