@@ -1,0 +1,257 @@
+"""Filling the rolling buffer: every published update, and a look at the documents for what is not published."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+
+from ..catalog import names, outline
+from ..connection import RedisInterface
+from ..document import DocumentReader
+from ..errors import BadData, MissingKey, RedisError, ReemError
+from ..monitor import ANNOUNCED, Event, Monitor
+from ..plan.paths import Path
+from ..plan.trees import MISSING
+from ..policy import Last
+from .history import History
+from .peek import document_texts
+from .timeline import PENDING
+from .trees import Leaf, tree_of, tree_of_outline, walk, weight
+
+__all__ = ["Follower"]
+
+_WAITING = 50_000
+"""Updates that wait for this program before the oldest are skipped."""
+
+_LOOK_SECONDS = 0.5
+_LOOK_KEYS = 400
+"""Documents that are looked at each time, in turn if there are more."""
+
+_BATCH = 100
+_LOOK_BYTES = 1 << 20
+"""Bytes of documents a second that looking may cost the server."""
+
+_LARGE = 1 << 18
+"""Bytes of a document from which it is looked at seldom."""
+
+_SELDOM = 60.0
+_MOST_HEARD = 100_000
+_QUIET_SECONDS = 1.0
+"""A key that was just published need not be looked at: what is read may be older than what was heard."""
+
+
+class Allowance:
+    """So many bytes a second, saved up to a limit.
+
+    Args:
+        rate: Bytes a second.
+        most: Bytes that can be saved up.
+    """
+
+    def __init__(self, rate: float, most: float) -> None:
+        self._rate, self._most, self._saved, self._then = rate, most, most, time.monotonic()
+
+    def take(self, size: int) -> bool:
+        """Take so many bytes if they are there; else nothing, and return False."""
+        now = time.monotonic()
+        self._saved = min(self._saved + (now - self._then) * self._rate, self._most)
+        self._then = now
+        if size > self._saved:
+            return False
+        self._saved -= size
+        return True
+
+
+class Follower:
+    """Keeps a `History` up to date.
+
+    Args:
+        interface: The server.
+        history: Where changes go.
+
+    Attributes:
+        names: The top-level keys, sorted.
+        lost: Why the server cannot be read at the moment; empty if all is well.
+    """
+
+    def __init__(self, interface: RedisInterface, history: History) -> None:
+        self._interface = interface
+        self._history = history
+        self._allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
+        self._monitor = Monitor(interface, policy=Last(_WAITING))
+        self._dirty: dict[Path, None] = {}
+        self._news = asyncio.Event()
+        self._tasks: list[asyncio.Task[None]] = []
+        self._shown: dict[str, None] = {}
+        self._heard: dict[str, float] = {}
+        self._seldom: dict[str, float] = {}
+        self._turn = 0
+        self._complete = False
+        self.names: list[str] = []
+        self.lost = ""
+
+    async def start(self) -> None:
+        """List the keys and begin to follow."""
+        if self._tasks:
+            return
+        await self._interface.initialize()
+        await self._monitor.listen()
+        self.names = sorted([name async for name in names(self._interface)])
+        for work in (self._follow(), self._fetch(), self._look()):
+            self._tasks.append(asyncio.create_task(work))
+
+    async def close(self) -> None:
+        """End."""
+        tasks, self._tasks = self._tasks, []
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        await self._monitor.close()
+
+    @property
+    def skipped(self) -> int:
+        """How many updates came too fast to be taken."""
+        return self._monitor.dropped
+
+    def shown(self, shown: Iterable[str]) -> None:
+        """Note that somebody looks at these keys: they are looked at first."""
+        for name in shown:
+            self._shown[name] = None
+
+    # --- what is published
+
+    async def _follow(self) -> None:
+        async for event in self._monitor:
+            self._take(event)
+
+    def _take(self, event: Event) -> None:
+        name = event.name
+        if len(self._heard) > _MOST_HEARD:
+            self._heard.clear()
+        self._heard[name] = time.monotonic()
+        if len(event.path) == 1 and event.deleted:
+            self._forget(name)
+        elif len(event.path) == 1 or name not in self._history.names:
+            self._note_name(name)
+        if event.value is ANNOUNCED:
+            self._history.add(event.path, PENDING, 0, event.received)
+            self._dirty.setdefault(event.path)
+            self._news.set()
+        else:
+            value = MISSING if event.deleted else event.value
+            self._history.add(event.path, value, event.size, event.received)
+
+    def _note_name(self, name: str) -> None:
+        if not self._history.knows(name) and self._complete:
+            self._history.begin(name, None)
+        index = _place(self.names, name)
+        if index == len(self.names) or self.names[index] != name:
+            self.names = [*self.names[:index], name, *self.names[index:]]
+
+    def _forget(self, name: str) -> None:
+        index = _place(self.names, name)
+        if index < len(self.names) and self.names[index] == name:
+            self.names = [*self.names[:index], *self.names[index + 1 :]]
+
+    # --- what is only announced
+
+    async def _fetch(self) -> None:
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            while self._dirty:
+                path = next(iter(self._dirty))
+                del self._dirty[path]
+                with suppress(ReemError, RedisError, OSError):
+                    await self._fetch_one(path)
+
+    async def _fetch_one(self, path: Path) -> None:
+        """Read the newest value at a path into the buffer: the document, and its arrays if there is room."""
+        reader = DocumentReader(self._interface.session, str(path[0]))
+        try:
+            tree = tree_of_outline(await outline(self._interface, path))
+            if self._allowance.take(sum([it.size for _, it in walk(tree, ()) if isinstance(it, Leaf)])):
+                tree = await reader.read(path[1:])
+        except MissingKey:
+            tree = MISSING
+        self._history.add(path, tree, weight(tree), time.time())
+
+    # --- what is not published
+
+    async def _look(self) -> None:
+        """Look at documents again and again."""
+        while True:
+            began = time.monotonic()
+            try:
+                seen = await self._look_once()
+                self.lost = self._ended()
+            except (RedisError, ReemError, OSError) as error:
+                self.lost, seen = str(error), 0
+            took = time.monotonic() - began
+            await asyncio.sleep(max(_LOOK_SECONDS - took, 4 * took, seen / _LOOK_BYTES))
+
+    def _ended(self) -> str:
+        """Return why following ended, if it did: what is shown would no longer be news."""
+        ended = [task for task in self._tasks if task.done() and not task.cancelled()]
+        return f"following ended: {ended[0].exception()!r}" if ended else ""
+
+    async def _look_once(self) -> int:
+        """Look which keys there are and at some of their documents; returns how many bytes those had."""
+        began = time.monotonic()
+        listed = {name async for name in names(self._interface)}
+        # The list may be older than what was heard meanwhile.
+        listed.update([name for name in self.names if self._heard.get(name, 0.0) > began - _QUIET_SECONDS])
+        present = sorted(listed)
+        gone = set(self.names).difference(present)
+        appeared = set(present).difference(self.names)
+        self.names = present
+        return await self._compare([*appeared, *gone, *self._chosen(present)])
+
+    def _chosen(self, present: Sequence[str]) -> list[str]:
+        """Return the keys whose turn it is, those that somebody sees first; all of them at the beginning."""
+        now = time.monotonic()
+        if not self._complete:
+            return list(present)
+        shown, self._shown = list(self._shown), {}
+        turn = [present[(self._turn + index) % len(present)] for index in range(min(_LOOK_KEYS, len(present)))]
+        self._turn = (self._turn + len(turn)) % max(len(present), 1)
+        names = dict.fromkeys([*shown[:_LOOK_KEYS], *turn])
+        return [name for name in names if self._seldom.get(name, 0.0) < now]
+
+    async def _compare(self, chosen: Sequence[str]) -> int:
+        total = 0
+        for start in range(0, len(chosen), _BATCH):
+            batch = chosen[start : start + _BATCH]
+            asked = time.monotonic()
+            texts = await document_texts(self._interface.session, batch)
+            total += sum([len(text or b"") for text in texts])
+            for name, text in zip(batch, texts, strict=True):
+                if self._heard.get(name, 0.0) < asked - _QUIET_SECONDS or not self._history.is_whole(name):
+                    self._compare_one(name, text)
+            await asyncio.sleep(0.002)  # a page that is asked for meanwhile goes first
+        self._complete = True
+        return total
+
+    def _compare_one(self, name: str, text: bytes | None) -> None:
+        if text is not None and len(text) > _LARGE:
+            self._seldom[name] = time.monotonic() + _SELDOM
+        if not self._history.knows(name):
+            self._history.begin(name, None if self._complete else text)
+        with suppress(BadData):
+            if not self._history.differs(name, text, time.time()):
+                return
+        if text is None:
+            self._history.add((name,), MISSING, 0, time.time())
+        elif b"$ship " in text:
+            self._dirty.setdefault((name,))
+            self._news.set()
+        else:
+            with suppress(ReemError):
+                self._history.add((name,), tree_of(text, name), len(text), time.time())
+
+
+def _place(ordered: Sequence[str], name: str) -> int:
+    return bisect_left(ordered, name)

@@ -1,0 +1,212 @@
+"""The rolling buffer: every change of the last seconds, within a number of bytes."""
+
+from __future__ import annotations
+
+import time
+from bisect import bisect_right
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
+from typing import Any
+
+from ..plan.paths import Path
+from ..plan.trees import MISSING
+from .timeline import UNKNOWN, Change, Kept, Timeline
+from .trees import same, tree_of
+
+__all__ = ["History"]
+
+_OVERHEAD = 300
+"""Bytes of memory that a change takes besides its value."""
+
+_TRIM_SECONDS = 1.0
+
+_LARGEST_TEXT = 1 << 18
+"""Bytes of a document's text up to which it is kept as the state before the first change."""
+
+
+class History:
+    """What is known of the past of every top-level key.
+
+    Args:
+        seconds: How long a change is kept.
+        budget: Bytes that all of it may take; the oldest goes first.
+
+    Attributes:
+        start: From when on the past is known, in seconds since 1970.
+        bytes: About how much memory it takes.
+        dropped: How many changes had to go before their time.
+    """
+
+    def __init__(self, seconds: float, budget: int) -> None:
+        self.seconds = seconds
+        self.budget = budget
+        self.start = time.time()
+        self.bytes = 0
+        self.dropped = 0
+        self._lines: dict[str, Timeline] = {}
+        self._all: deque[Change] = deque()
+        self._heavy: set[str] = set()  # keys whose base may hold arrays
+        self._trimmed = 0.0
+
+    # --- what happened
+
+    def add(self, path: Path, value: Any, size: int, when: float) -> None:
+        """Note a change: `value` is what is at `path` since; MISSING or PENDING stand for what they say."""
+        line = self._line(str(path[0]))
+        change = Change(when, path, value, size + _OVERHEAD)
+        line.add(change)
+        self._all.append(change)
+        self.bytes += change.size
+        self._trim(when)
+
+    def begin(self, name: str, text: bytes | None) -> None:
+        """Note what a key held before anything is known to have changed."""
+        if name in self._lines:
+            return
+        base = MISSING if text is None else text if len(text) <= _LARGEST_TEXT else UNKNOWN
+        line = self._lines[name] = Timeline(base, None if base is UNKNOWN else text)
+        self.bytes += line.base_size + _OVERHEAD
+
+    def differs(self, name: str, text: bytes | None, when: float) -> bool:
+        """Return whether a document's text, read just now, is not what the changes led to; remembers it."""
+        line = self._lines.get(name)
+        if line is None:
+            return text is not None
+        if text is not None and (len(text) > _LARGEST_TEXT or line.text == text):
+            return False
+        state = line.state(when)
+        if text is None:
+            return state is not MISSING
+        line.text = text
+        return state is MISSING or state is UNKNOWN or not same(tree_of(text, name), state)
+
+    def _line(self, name: str) -> Timeline:
+        if name not in self._lines:
+            self._lines[name] = Timeline(UNKNOWN)
+            self.bytes += _OVERHEAD
+        return self._lines[name]
+
+    def _trim(self, when: float) -> None:
+        """Make what is too old, or too much, part of the state before; in batches, since that costs a copy."""
+        if when >= self._trimmed + _TRIM_SECONDS:
+            self._trimmed = when
+            self._fold(sum(1 for _ in takewhile(lambda change: change.time < when - self.seconds, self._all)))
+            self.start = max(self.start, when - self.seconds)
+        while self.bytes > self.budget and self._all:
+            self._shed()
+            if self.bytes <= self.budget:
+                break
+            count = max(len(self._all) // 10, 1)
+            self.dropped += count
+            self._fold(count)
+
+    def _shed(self) -> None:
+        """Let go of the arrays of states that nobody can move the slider to any more."""
+        while self._heavy:
+            self.bytes -= self._lines[self._heavy.pop()].strip()
+
+    def _fold(self, count: int) -> None:
+        counts: Counter[str] = Counter()
+        for _ in range(count):
+            first = self._all.popleft()
+            counts[str(first.path[0])] += 1
+            self.start = max(self.start, first.time)
+        for name, changes in counts.items():
+            self.bytes -= self._lines[name].fold(changes)
+            self._heavy.add(name)
+
+    # --- what there was
+
+    @property
+    def names(self) -> Iterable[str]:
+        """All keys of which anything is known."""
+        return self._lines.keys()
+
+    def knows(self, name: str) -> bool:
+        """Return whether anything is known of a key."""
+        return name in self._lines
+
+    def is_whole(self, name: str) -> bool:
+        """Return whether all of a key is known, as far as it was heard of at all."""
+        line = self._lines.get(name)
+        return line is None or line.whole
+
+    def unchanged(self, name: str, since: float) -> bool:
+        """Return whether a key is known not to have changed since an instant: it is as it is now."""
+        line = self._lines.get(name)
+        return line is None or line.upto(since) == len(line.changes)
+
+    def existed(self, name: str, at: float) -> bool | None:
+        """Return whether there was such a key, None if that is not known."""
+        line = self._lines.get(name)
+        state = UNKNOWN if line is None else line.state(at)
+        return None if state is UNKNOWN else state is not MISSING
+
+    def tree(self, path: Path, at: float) -> Any:
+        """Return what was at a path: a tree not to be changed, MISSING or UNKNOWN."""
+        return self.kept(path, at).value
+
+    def kept(self, path: Path, at: float) -> Kept:
+        """Return what was at a path, and how old that is."""
+        line = self._lines.get(str(path[0]))
+        return Kept(UNKNOWN) if line is None else line.kept(path, at)
+
+    def last(self, paths: Sequence[Path], at: float) -> dict[Path, float]:
+        """Return when each path last changed before `at`, as far as that is known."""
+        groups: dict[str, list[Path]] = {}
+        for path in paths:
+            if path and path[0] in self._lines:
+                groups.setdefault(str(path[0]), []).append(path)
+        found: dict[Path, float] = {}
+        for name, group in groups.items():
+            found |= self._lines[name].last(group, at)
+        return found
+
+    def rate(self, name: str, at: float, over: float = 5.0) -> float | None:
+        """Return updates per second of a key in the seconds before `at`; None if there was none."""
+        line = self._lines.get(name)
+        if line is None:
+            return None
+        over = min(over, max(at - self.start, 1.0))
+        count = line.upto(at) - line.upto(at - over)
+        return count / over if count else None
+
+    def between(self, since: float, until: float) -> Iterator[Change]:
+        """Yield the changes after `since` and not after `until`, newest first."""
+        for change in reversed(self._all):
+            if change.time <= since:
+                return
+            if change.time <= until:
+                yield change
+
+    def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
+        """Yield what was at `path` at `start` and after each change."""
+        line = self._lines.get(str(path[0]))
+        return iter(()) if line is None else line.values(path, start, end)
+
+    def times(self, path: Path) -> list[float]:
+        """Return when there were changes that concern `path` (all of them for the root), in order."""
+        if not path:
+            return [change.time for change in self._all]
+        line = self._lines.get(str(path[0]))
+        return line.times(path) if line else []
+
+    def step(self, at: float, forward: bool, path: Path) -> float | None:
+        """Return the instant of the next change after `at`, or of the last one before it."""
+        times = self.times(path)
+        if forward:
+            index = bisect_right(times, at + 1e-6)
+            return times[index] if index < len(times) else None
+        earlier = [when for when in times if when < at - 1e-6]
+        return earlier[-1] if earlier else None
+
+    def matching(self, needle: str, at: float) -> Iterator[tuple[str, Any]]:
+        """Yield the keys, and what they held, that may have `needle` in the name of something below."""
+        needle_bytes = needle.encode()
+        for name, line in list(self._lines.items()):
+            if not line.changes and line.text is not None and needle_bytes not in line.text.lower():
+                continue
+            tree = line.state(at)
+            if tree is not UNKNOWN and tree is not MISSING:
+                yield name, tree

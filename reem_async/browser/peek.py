@@ -1,0 +1,144 @@
+"""Looking at parts of large documents: what is at some paths, never a whole document.
+
+Three round trips for any number of paths: the types; the lengths, and the short values; and the items
+of short lists, if all of them are plain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..errors import BadData
+from ..plan import Command, Plan, Reply
+from ..plan.paths import Path, to_jsonpath
+from ..plan.replies import type_name
+from ..session import Session
+from .addresses import is_addressable
+from .nodes import Node, node_of, shown_text
+from .trees import tree_of
+
+__all__ = ["document_texts", "keys_at", "peek"]
+
+_LONGEST = 2048
+"""Bytes of a text that are fetched to show its beginning; placeholders are shorter."""
+
+_SHORT_LIST = 8
+_CONTAINERS = {"object": "dict", "array": "list"}
+_PLAIN = {b"integer", b"number", b"boolean", b"null"}
+
+
+async def _ask(session: Session, commands: Sequence[Command]) -> list[Reply]:
+    """Return the replies, errors among them: what is not there, or not a document, is no reason to stop."""
+    return list(await session.run(Plan(list(commands), list))) if commands else []
+
+
+async def peek(session: Session, paths: Sequence[Path]) -> list[Node | None]:
+    """Return the node at each path, None where nothing is. Three round trips at most."""
+    nodes: list[Node | None] = [None] * len(paths)
+    where = [_place(session, path) for path in paths]
+    reach = [index for index, path in enumerate(paths) if all(map(is_addressable, path[1:]))]
+    for index in set(range(len(paths))) - set(reach):
+        nodes[index] = Node(paths[index], "unreachable", "its key cannot be addressed; read the dict that holds it")
+    replies = await _ask(
+        session, [(command, *where[index]) for index in reach for command in ("JSON.TYPE", "JSON.STRLEN")]
+    )
+    kinds: dict[int, str] = {}
+    texts: dict[int, int] = {}
+    for number, index in enumerate(reach):
+        kind = _kind(replies[2 * number])
+        if kind is not None:
+            kinds[index] = kind
+            texts[index] = _number(replies[2 * number + 1])
+    await _fill(session, paths, where, kinds, texts, nodes)
+    return nodes
+
+
+async def _fill(
+    session: Session,
+    paths: Sequence[Path],
+    where: Sequence[tuple[str, str]],
+    kinds: dict[int, str],
+    texts: dict[int, int],
+    nodes: list[Node | None],
+) -> None:
+    """Fetch the lengths of containers and the values of all else."""
+    asked = [(index, kind) for index, kind in kinds.items() if texts[index] <= _LONGEST]
+    replies = await _ask(session, [(_COMMANDS.get(kind, "JSON.GET"), *where[index]) for index, kind in asked])
+    for (index, kind), reply in zip(asked, replies, strict=True):
+        path = paths[index]
+        if kind in _CONTAINERS:
+            nodes[index] = Node(path, _CONTAINERS[kind], "", None, _number(reply))
+        elif isinstance(reply, bytes | bytearray):
+            nodes[index] = _scalar(path, bytes(reply))
+    for index in kinds.keys() - dict(asked).keys():
+        nodes[index] = Node(paths[index], "str", f"{texts[index]} bytes of text", texts[index])
+    await _preview(session, where, nodes)
+
+
+_COMMANDS = {"object": "JSON.OBJLEN", "array": "JSON.ARRLEN"}
+
+
+async def _preview(session: Session, where: Sequence[tuple[str, str]], nodes: list[Node | None]) -> None:
+    """Put the items of short lists of numbers into their nodes."""
+    short = [
+        index
+        for index, node in enumerate(nodes)
+        if node is not None and node.kind == "list" and node.count and node.count <= _SHORT_LIST
+    ]
+    kinds = await _ask(session, [("JSON.TYPE", key, f"{place}[*]") for key, place in (where[index] for index in short)])
+    plain = [
+        index
+        for index, reply in zip(short, kinds, strict=True)
+        if isinstance(reply, list) and set(_flat(reply)) <= _PLAIN
+    ]
+    replies = await _ask(session, [("JSON.GET", *where[index]) for index in plain])
+    for index, reply in zip(plain, replies, strict=True):
+        node = nodes[index]
+        if node is not None and isinstance(reply, bytes | bytearray):
+            (value,) = tree_of(bytes(reply), "") or [[]]
+            nodes[index] = node_of(node.path, value)
+
+
+def _scalar(path: Path, reply: bytes) -> Node | None:
+    try:
+        found = tree_of(reply, str(path[0]))
+    except BadData as error:
+        return Node(path, "unreadable", shown_text(str(error)))
+    return node_of(path, found[0]) if found else None
+
+
+async def keys_at(session: Session, path: Path) -> list[str] | int | None:
+    """Return the keys of the dict at `path`, the length of the list there, or None. One round trip."""
+    if not all(map(is_addressable, path[1:])):
+        return None
+    place = _place(session, path)
+    keys, length = await _ask(session, [("JSON.OBJKEYS", *place), ("JSON.ARRLEN", *place)])
+    if isinstance(keys, list) and keys and isinstance(keys[0], list):
+        return [key.decode(errors="replace") for key in keys[0]]
+    if isinstance(length, list) and length and isinstance(length[0], int):
+        return length[0]
+    return None
+
+
+async def document_texts(session: Session, names: Sequence[str]) -> list[bytes | None]:
+    """Return the text of each top-level key's document, None if it has none. One round trip."""
+    replies = await _ask(session, [("JSON.GET", session.keys(name).document) for name in names])
+    return [bytes(reply) if isinstance(reply, bytes | bytearray) else None for reply in replies]
+
+
+def _place(session: Session, path: Path) -> tuple[str, str]:
+    return session.keys(path[0]).document, to_jsonpath(path[1:])
+
+
+def _kind(reply: Reply) -> str | None:
+    return None if isinstance(reply, Exception) else type_name(reply)
+
+
+def _number(reply: Any) -> int:
+    flat = list(_flat(reply)) if isinstance(reply, list) else []
+    return flat[0] if flat and isinstance(flat[0], int) else 0
+
+
+def _flat(reply: list[Any]) -> list[Any]:
+    return [item for each in reply for item in (_flat(each) if isinstance(each, list) else [each])]

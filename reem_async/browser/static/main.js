@@ -1,0 +1,213 @@
+// The page: which path and which instant are shown, what keeps them up to date, and the keyboard.
+import { TimeBar } from "./slider.js";
+import { Tree } from "./tree.js";
+import { View } from "./view.js";
+import { addressUrl, el, getJson, setText } from "./util.js";
+
+const config = JSON.parse(document.body.dataset.config);
+const SILENCE = 5000; // ms without an event after which the connection counts as lost
+
+const app = {
+  config,
+  at: null, // null: now, or the end of a recording
+  previous: null, // the instant shown before
+  path: "",
+  span: { start: config.start, end: config.end },
+  heard: performance.now(),
+  done: 0,
+  took: 0,
+
+  now() { return this.at ?? this.span.end; },
+
+  // From when on changes are marked.
+  since() {
+    if (this.at !== null) return this.previous ?? this.at;
+    return config.live ? this.span.end - 1 : (this.previous ?? this.span.end);
+  },
+
+  spanFrom(said) {
+    this.span = { start: said.start, end: said.end };
+    lost("server", said.lost ? `${said.lost}. Trying again…` : "");
+    document.getElementById("source").title = said.note || config.title;
+    time.show();
+    if (config.live && this.at !== null && this.at < said.start - 0.5) this.seek(said.start); // it has left the buffer
+  },
+
+  // previous: from when on changes are marked; the instant shown before if it is not given.
+  seek(at, previous = null) {
+    if (at !== null) at = Math.min(Math.max(at, this.span.start), this.span.end);
+    this.previous = previous ?? this.at ?? this.span.end;
+    this.at = at;
+    time.show();
+    this.refresh();
+    clearTimeout(this.remembering);
+    this.remembering = setTimeout(() => history.replaceState(null, "", this.url()), 300);
+  },
+
+  url() {
+    return addressUrl(this.path) + (this.at === null ? "" : `?at=${this.at.toFixed(3)}`);
+  },
+
+  go(address, push = true) {
+    this.path = address;
+    if (push) history.pushState(null, "", this.url());
+    document.body.classList.toggle("has-view", address !== "");
+    document.title = `${address || config.title} · REEM`;
+    view.show(address);
+    time.loadActivity();
+    this.refresh();
+  },
+
+  // One refresh at a time; what was asked for meanwhile is one more after it.
+  async refresh(valueToo = true) {
+    this.valueToo ||= valueToo;
+    if (this.busy) { this.again = true; return; }
+    this.busy = true;
+    do {
+      this.again = false;
+      const began = performance.now(), value = this.valueToo;
+      this.valueToo = false;
+      const results = await Promise.allSettled([finder.shown ? finder.refresh() : tree.refresh(), value ? view.refresh() : null]);
+      for (const result of results) if (result.status === "rejected") this.failed(result.reason);
+      this.done = performance.now();
+      this.took = this.done - began;
+      if (value) [this.valueDone, this.valueTook] = [this.done, this.took];
+    } while (this.again);
+    this.busy = false;
+  },
+
+  // Something changed, or may have: a page that takes long to make is made less often.
+  news(paths, many) {
+    const now = performance.now();
+    this.owed ||= many || view.concerns(paths);
+    if (this.busy || now < this.done + this.took) return; // the next event comes within a second
+    const due = now > (this.valueDone ?? 0) + Math.max(1000, 10 * (this.valueTook ?? 0));
+    this.refresh(this.owed || due);
+    this.owed = false;
+  },
+
+  failed(error) {
+    if (error.name === "AbortError") return;
+    if (error.status === 503) lost("server", error.message);
+    else if (error.status === 0) lost("page", error.message);
+    else if (error.status === undefined) throw error;
+  },
+};
+
+const troubles = new Map();
+
+// Say what is wrong in the banner, or that it is over.
+function lost(what, message) {
+  if (message) troubles.set(what, message);
+  else troubles.delete(what);
+  const text = troubles.get("page") ?? troubles.get("server") ?? "";
+  const banner = document.getElementById("banner");
+  setText(banner, text && `Connection lost: ${text}`);
+  banner.hidden = !text;
+  document.getElementById("dot").className = `dot ${text ? "lost" : "ok"}`;
+}
+
+// The search box, whose results take the place of the tree.
+class Finder {
+  constructor() {
+    this.box = document.getElementById("search");
+    this.element = document.getElementById("tree");
+    this.box.addEventListener("input", () => { clearTimeout(this.timer); this.timer = setTimeout(() => this.changed(), 120); });
+    this.box.addEventListener("keydown", (event) => this.onKey(event));
+  }
+
+  get shown() { return this.box.value.trim() !== ""; }
+
+  changed() {
+    this.element.replaceChildren();
+    this.element.classList.toggle("found", this.shown);
+    tree.rows.clear();
+    app.refresh();
+  }
+
+  async refresh() {
+    const text = this.box.value.trim();
+    const answer = await getJson("search", { q: text, at: app.at });
+    if (text !== this.box.value.trim()) return;
+    tree.branches = new Map([["", { address: "", total: answer.found.length, start: 0, nodes: answer.found.map((node) => ({ ...node, label: node.shown, count: null, text: node.text || (node.count === null ? "" : `${node.count} items`) })) }]]);
+    if (answer.found.length) { tree.render(); return; }
+    this.element.replaceChildren(el("p", { class: "empty" }, `No key has “${text}” in its name.`));
+  }
+
+  onKey(event) {
+    const first = this.element.querySelector(".row");
+    if (event.key === "Escape") this.clear();
+    else if (event.key === "Enter" && first) app.go(first.address);
+    else if (event.key === "ArrowDown" && first) tree.focus(first);
+    else return;
+    event.preventDefault();
+  }
+
+  clear() {
+    this.box.value = "";
+    this.changed();
+    this.box.blur();
+  }
+}
+
+function listen() {
+  const events = new EventSource("/api/events");
+  events.onopen = () => { app.heard = performance.now(); lost("page", ""); app.refresh(); };
+  events.onmessage = (event) => {
+    app.heard = performance.now();
+    lost("page", "");
+    const said = JSON.parse(event.data);
+    app.spanFrom(said);
+    if (config.live && app.at === null && !document.hidden) app.news(said.paths, said.more);
+    if (config.live && performance.now() - (app.counted ?? 0) > 1000) { app.counted = performance.now(); time.loadActivity(); }
+  };
+  events.onerror = () => {
+    lost("page", "the program behind this page (reem browse) does not answer. Trying again…");
+    if (events.readyState === EventSource.CLOSED) setTimeout(listen, 2000);
+  };
+}
+
+setInterval(() => {
+  if (performance.now() - app.heard > SILENCE && !document.hidden) lost("page", "the program behind this page (reem browse) is silent. Trying again…");
+}, 1000);
+
+function route() {
+  const address = location.pathname.startsWith("/view/") ? decodeURIComponent(location.pathname.slice(6)) : "";
+  const at = Number(new URLSearchParams(location.search).get("at"));
+  app.at = at ? Math.min(Math.max(at, app.span.start), app.span.end) : null;
+  app.go(address, false);
+}
+
+function onKey(event) {
+  const typing = event.target.matches?.("input[type=text], input[type=search], textarea, select");
+  if (event.ctrlKey || event.metaKey || event.altKey || typing || document.querySelector("dialog[open]")) return;
+  const pressed = event.target.closest?.("button, summary, a");
+  if (event.key === "/") { finder.box.focus(); finder.box.select(); }
+  else if (event.key === "?") document.getElementById("help").showModal();
+  else if (event.key === "ArrowLeft") time.step(false, event.shiftKey);
+  else if (event.key === "ArrowRight") time.step(true, event.shiftKey);
+  else if (event.key === " " && !pressed) time.toggle();
+  else if (event.key === "l" || event.key === "End") { time.pause(); app.seek(null); }
+  else if (event.key === "Home") { time.pause(); app.seek(app.span.start); }
+  else return;
+  event.preventDefault();
+}
+
+const time = new TimeBar(app);
+const tree = new Tree(document.getElementById("tree"), app, "", `reem:open:${config.title}`);
+const view = new View(document.getElementById("view"), app);
+const finder = new Finder();
+app.time = time;
+
+document.getElementById("help-button").addEventListener("click", () => document.getElementById("help").showModal());
+document.addEventListener("click", (event) => {
+  const link = event.target.closest("a[data-go]");
+  if (!link || event.ctrlKey || event.metaKey || event.shiftKey) return;
+  event.preventDefault();
+  app.go(link.dataset.go);
+});
+document.addEventListener("keydown", onKey);
+document.addEventListener("visibilitychange", () => { app.heard = performance.now(); if (!document.hidden) app.refresh(); });
+window.addEventListener("popstate", route);
+route();
+listen();

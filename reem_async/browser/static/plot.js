@@ -1,0 +1,215 @@
+// Lines and bars on a canvas: axes, a crosshair with the values under it, and a mark for the instant shown.
+import { clockText, el, numberText } from "./util.js";
+
+const LEFT = 62, RIGHT = 12, TOP = 10, BOTTOM = 24;
+
+const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 21600, 86400];
+
+function ticks(low, high, most, clock = false) {
+  const span = high - low || 1;
+  const raw = span / Math.max(most, 1);
+  const power = 10 ** Math.floor(Math.log10(raw));
+  const steps = clock && raw > 1 ? MINUTES : [1, 2, 5, 10].map((each) => each * power);
+  const step = steps.find((each) => each >= raw) ?? span;
+  const found = [];
+  for (let at = Math.ceil(low / step) * step; at <= high + step * 1e-9 && found.length < 30; at += step) found.push(at);
+  return { step, found };
+}
+
+function tickText(value, step) {
+  const digits = Math.max(0, Math.min(8, -Math.floor(Math.log10(step) + 1e-9)));
+  return Math.abs(value) >= 1e6 || (step < 1e-6 && value !== 0) ? value.toExponential(2) : value.toFixed(digits);
+}
+
+export class Plot {
+  // options.time: the x axis is an instant; options.onPick: called with the x that was clicked.
+  constructor(parent, options = {}) {
+    this.options = options;
+    this.legend = el("div", { class: "legend" });
+    this.canvas = el("canvas", { class: "plot", role: "img" });
+    parent.append(this.legend, this.canvas);
+    this.data = { names: [], times: [], lines: [] };
+    this.hover = null;
+    this.cursor = null;
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+    this.canvas.addEventListener("pointermove", (event) => this.point(event));
+    this.canvas.addEventListener("pointerleave", () => { this.hover = null; this.draw(); });
+    this.canvas.addEventListener("click", (event) => options.onPick?.(this.xAt(event)));
+    if (options.onPick) this.canvas.style.cursor = "crosshair";
+  }
+
+  set(data, cursor = null) {
+    this.data = data;
+    this.cursor = cursor;
+    this.draw();
+  }
+
+  xAt(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const part = (event.clientX - box.left - LEFT) / Math.max(box.width - LEFT - RIGHT, 1);
+    return this.x0 + Math.min(Math.max(part, 0), 1) * (this.x1 - this.x0);
+  }
+
+  point(event) {
+    this.hover = this.xAt(event);
+    this.draw();
+  }
+
+  range() {
+    const { times, lines } = this.data;
+    this.x0 = this.data.start ?? times[0] ?? 0;
+    this.x1 = this.data.end ?? times[times.length - 1] ?? 1;
+    if (this.x1 <= this.x0) this.x1 = this.x0 + 1;
+    let low = Infinity, high = -Infinity;
+    for (const line of lines) for (const value of line) {
+      if (value === null) continue;
+      if (value < low) low = value;
+      if (value > high) high = value;
+    }
+    if (low > high) [low, high] = [0, 1];
+    const pad = (high - low) * 0.06 || Math.abs(high) * 0.05 || 1;
+    this.y0 = low - pad;
+    this.y1 = high + pad;
+    this.low = low;
+    this.high = high;
+  }
+
+  draw() {
+    const { canvas } = this, box = canvas.getBoundingClientRect();
+    if (!box.width) return;
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = Math.round(box.width * ratio);
+    canvas.height = Math.round(box.height * ratio);
+    const context = canvas.getContext("2d");
+    context.scale(ratio, ratio);
+    this.style = getComputedStyle(canvas);
+    this.range();
+    this.axes(context, box.width, box.height);
+    if (this.data.counts) this.bars(context, box.width, box.height);
+    else this.curves(context, box.width, box.height);
+    this.readout();
+    canvas.setAttribute("aria-label", this.options.label ?? `Plot from ${numberText(this.low)} to ${numberText(this.high)}`);
+  }
+
+  colour(name) { return this.style.getPropertyValue(name).trim(); }
+
+  place(width, height) {
+    const x = (value) => LEFT + ((value - this.x0) / (this.x1 - this.x0)) * (width - LEFT - RIGHT);
+    const y = (value) => height - BOTTOM - ((value - this.y0) / (this.y1 - this.y0)) * (height - TOP - BOTTOM);
+    return { x, y };
+  }
+
+  axes(context, width, height) {
+    const { x, y } = this.place(width, height);
+    context.font = `11px ${this.colour("--mono")}`;
+    context.strokeStyle = this.colour("--line");
+    context.fillStyle = this.colour("--faint");
+    context.lineWidth = 1;
+    context.textAlign = "right";
+    context.textBaseline = "middle";
+    const rows = ticks(this.y0, this.y1, (height - TOP - BOTTOM) / 45);
+    for (const at of rows.found) {
+      context.beginPath();
+      context.moveTo(LEFT, Math.round(y(at)) + 0.5);
+      context.lineTo(width - RIGHT, Math.round(y(at)) + 0.5);
+      context.stroke();
+      context.fillText(tickText(at, rows.step), LEFT - 7, y(at));
+    }
+    context.textBaseline = "top";
+    context.textAlign = "center";
+    const clock = Boolean(this.options.time), offset = clock ? Math.floor(this.x0 / 3600) * 3600 : 0;
+    const columns = ticks(this.x0 - offset, this.x1 - offset, (width - LEFT - RIGHT) / 90, clock);
+    for (const at of columns.found) {
+      const text = clock ? clockText(at + offset + 1e-6, columns.step < 1 ? 1 : 0) : tickText(at, columns.step);
+      const where = Math.min(Math.max(x(at + offset), LEFT + 14), width - RIGHT - 28);
+      context.fillText(text, where, height - BOTTOM + 7);
+    }
+  }
+
+  curves(context, width, height) {
+    const { x, y } = this.place(width, height), { times, lines } = this.data;
+    lines.forEach((line, index) => {
+      context.strokeStyle = this.colour(`--curve-${index % 8}`);
+      context.fillStyle = context.strokeStyle;
+      context.lineWidth = 1.6;
+      context.lineJoin = "round";
+      context.beginPath();
+      let before = null;
+      line.forEach((value, at) => {
+        if (value === null) { before = null; return; }
+        const across = x(Math.max(times[at], this.x0)), up = y(value);
+        if (before === null) context.moveTo(across, up);
+        else if (this.options.time) { context.lineTo(across, before); context.lineTo(across, up); }
+        else context.lineTo(across, up);
+        before = up;
+      });
+      if (before !== null && this.options.time) context.lineTo(x(this.x1), before); // it still is what it was
+      context.stroke();
+      if (times.length === 1 && before !== null) { context.beginPath(); context.arc(x(times[0]), before, 3, 0, 7); context.fill(); }
+    });
+    if (this.cursor !== null) this.upright(context, x(this.cursor), height, "--mark", 2);
+    if (this.hover !== null) this.upright(context, x(this.hover), height, "--faint", 1);
+  }
+
+  bars(context, width, height) {
+    const { x, y } = this.place(width, height), { counts } = this.data;
+    const each = (this.x1 - this.x0) / counts.length;
+    context.fillStyle = this.colour("--curve-0");
+    counts.forEach((count, index) => {
+      const left = x(this.x0 + index * each), right = x(this.x0 + (index + 1) * each);
+      context.fillRect(left, y(count), Math.max(right - left - (right - left > 4 ? 1 : 0), 0.5), y(0) - y(count));
+    });
+  }
+
+  upright(context, across, height, colour, thick) {
+    context.strokeStyle = this.colour(colour);
+    context.lineWidth = thick;
+    context.beginPath();
+    context.moveTo(across, TOP);
+    context.lineTo(across, height - BOTTOM);
+    context.stroke();
+  }
+
+  // The last index whose x is not after `at`.
+  indexAt(at) {
+    const { times } = this.data;
+    let low = 0, high = times.length;
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (times[middle] <= at) low = middle + 1; else high = middle;
+    }
+    return low - 1;
+  }
+
+  readout() {
+    const { times, lines, names, counts } = this.data;
+    const at = this.hover ?? this.cursor;
+    if (counts) {
+      const each = (this.x1 - this.x0) / Math.max(counts.length, 1);
+      const index = at === null ? -1 : Math.min(Math.floor((at - this.x0) / each), counts.length - 1);
+      const from = this.x0 + index * each;
+      return this.legend.replaceChildren(index < 0 ? "" : `${numberText(from)} … ${numberText(from + each)}: ${counts[index]}`);
+    }
+    const index = at === null ? times.length - 1 : this.indexAt(at);
+    if (at === null && lines.length === 1) return this.legend.replaceChildren();
+    const parts = lines.map((line, number) => {
+      const swatch = el("i");
+      swatch.style.background = `var(--curve-${number % 8})`;
+      const name = names[number] ? `${names[number]} ` : "";
+      return el("span", {}, ...(lines.length > 1 ? [swatch] : []), `${name}${numberText(line[index] ?? null)}`);
+    });
+    const where = index < 0 || at === null ? null : el("span", {}, this.options.time ? clockText(at) : `at ${times[index]}`);
+    return this.legend.replaceChildren(...parts, ...(where ? [where] : []));
+  }
+}
+
+export class Histogram extends Plot {
+  range() {
+    const { low, high, counts } = this.data;
+    [this.x0, this.x1] = [low ?? 0, high ?? 1];
+    if (this.x1 <= this.x0) [this.x0, this.x1] = [this.x0 - 0.5, this.x0 + 0.5];
+    [this.y0, this.y1] = [0, Math.max(...(counts?.length ? counts : [1])) * 1.06];
+    [this.low, this.high] = [this.x0, this.x1];
+  }
+}

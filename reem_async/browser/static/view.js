@@ -1,0 +1,271 @@
+// The value: what is at the chosen path, drawn anew when its type changes and brought up to date when it does not.
+import { ArrayView } from "./arrays.js";
+import { Plot } from "./plot.js";
+import { Tree } from "./tree.js";
+import { addressUrl, ageText, bytesText, copy, el, getJson, getPicture, postWrite, query, setText, toast } from "./util.js";
+
+const NAMES = { NoneType: "null", str: "text", int: "whole number", float: "number", bool: "true or false", numpy: "array" };
+const SCALARS = ["str", "int", "float", "bool", "NoneType"];
+
+export class View {
+  constructor(element, app) {
+    this.element = element;
+    this.app = app;
+    this.address = "";
+  }
+
+  show(address) {
+    this.address = address;
+    this.shape = null;
+    this.body = null;
+    this.stop?.abort();
+    this.stop = new AbortController();
+    if (address) return;
+    this.element.replaceChildren(el("div", { class: "empty" }, el("p", {}, "Choose a key to see its value."),
+      el("p", {}, el("kbd", {}, "/"), " searches, ", el("kbd", {}, "?"), " shows the keyboard.")));
+  }
+
+  concerns(addresses) {
+    const { address } = this;
+    return address !== "" && addresses.some((each) => address.startsWith(each) || each.startsWith(address));
+  }
+
+  async refresh() {
+    const { address, app } = this, signal = this.stop?.signal;
+    if (!address) return;
+    try {
+      const node = await getJson("node", { path: address, at: app.at }, signal);
+      if (address !== this.address) return;
+      if (node.address !== address) { app.go(node.address, false); history.replaceState(null, "", app.url()); return; }
+      const shape = `${node.kind}|${node.kind === "numpy" ? node.text : ""}`;
+      if (shape !== this.shape) this.build(node, shape);
+      this.facts(node);
+      this.note.hidden = true;
+      await this.body.update(node, signal);
+    } catch (error) {
+      if (error.name === "AbortError" || address !== this.address) return;
+      if (![400, 404, 409, 422].includes(error.status)) throw error;
+      this.missing(error.message);
+    }
+  }
+
+  // What is there no longer, or not yet, or not kept: the page stays as it is, with a note above it.
+  missing(message) {
+    if (!this.body || this.shape === "missing") {
+      this.shape = "missing";
+      this.frame(null);
+      this.body = { update: () => {} };
+    }
+    setText(this.note, message);
+    this.note.hidden = false;
+  }
+
+  frame(node) {
+    const crumbs = [];
+    const parts = this.address.match(/\.?[^.[\]"]+|\[\d+\]|\[?"(?:[^"\\]|\\.)*"\]?/g) ?? [this.address];
+    let upto = "";
+    parts.forEach((part, index) => {
+      upto += part;
+      const here = upto.replace(/^\./, "");
+      crumbs.push(index === parts.length - 1 ? el("bdi", {}, part) : el("a", { class: "crumb", href: addressUrl(here), "data-go": here }, el("bdi", {}, part)));
+    });
+    this.what = el("span", { class: "what" });
+    this.note = el("p", { class: "note", role: "status", hidden: true });
+    this.main = el("div");
+    this.element.replaceChildren(
+      el("div", { class: "head" }, el("a", { class: "back", href: "/", "data-go": "" }, "‹ all keys"), el("h1", {}, ...crumbs), this.what),
+      this.note, this.main, ...(node ? this.extras(node) : []));
+  }
+
+  build(node, shape) {
+    this.shape = shape;
+    this.frame(node);
+    const make = { dict: TreeBody, list: ListBody, str: TextBody, bytes: BytesBody, numpy: ArrayView, int: NumberBody, float: NumberBody, bool: NumberBody }[node.kind] ?? PlainBody;
+    this.body = new make(this.main, this.app, this.address);
+  }
+
+  facts(node) {
+    const size = node.kind === "dict" || node.kind === "list" ? `${node.count} ${node.count === 1 ? "item" : "items"}` : bytesText(node.size);
+    const age = node.time === null ? "" : ageText(Math.max(this.app.now() - node.time, 0));
+    const words = [NAMES[node.kind] ?? node.kind, node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
+    if (node.rate >= 2) words.push(`${Math.round(node.rate)} Hz`);
+    if (age) words.push(age === "now" ? "changed now" : `changed ${age} ago`);
+    setText(this.what, words.filter(Boolean).join(" · "));
+    this.node = node;
+    if (this.editor) this.editor.hidden = this.app.at !== null;
+    if (this.downloads) for (const link of this.downloads) link.href = this.link(link.dataset.format);
+  }
+
+  link(format) {
+    return `/view/${encodeURIComponent(this.address)}?${query({ format, at: this.app.at, slice: format === "json" ? null : this.body?.chosen?.() })}`;
+  }
+
+  extras(node) {
+    const extras = [];
+    if (this.app.config.write && [...SCALARS, "dict", "list"].includes(node.kind)) extras.push((this.editor = this.editCard()));
+    const formats = { numpy: ["npy", "csv", "png", "json"], list: ["json", "csv", "npy"] }[node.kind] ?? ["json"];
+    this.downloads = formats.map((format) => el("a", { "data-format": format, href: this.linkFirst(format), download: "" }, format));
+    const snippet = Object.keys(node.snippets ?? {}).length ? this.snippetCard(node.snippets) : null;
+    const files = el("div", { class: "card row2" }, el("span", { class: "what" }, "Download"), ...this.downloads);
+    return [...extras, snippet, files].filter(Boolean);
+  }
+
+  linkFirst(format) { return `/view/${encodeURIComponent(this.address)}?format=${format}`; }
+
+  snippetCard(snippets) {
+    const names = Object.keys(snippets), code = el("pre", {}, snippets[names[0]]);
+    const choose = el("select", { "aria-label": "Front", onchange: () => { code.textContent = snippets[choose.value]; } }, ...names.map((name) => el("option", { value: name }, name)));
+    return el("details", { class: "card" }, el("summary", {}, "Read it with Python"),
+      el("div", { class: "tools" }, choose), el("div", { class: "snippet" }, code, el("button", { type: "button", onclick: () => copy(code.textContent) }, "Copy")));
+  }
+
+  editCard() {
+    const area = el("textarea", { "aria-label": "New value, as JSON", spellcheck: false, rows: 3 });
+    const write = el("button", { type: "button", class: "primary", onclick: () => this.write(area.value) }, "Write…");
+    const card = el("details", { class: "card edit", ontoggle: async () => { if (card.open) area.value = await this.jsonText(); } },
+      el("summary", {}, "Edit"), area, el("div", { class: "tools" }, write, el("span", {}, "JSON, such as 1.5, true, \"text\" or {\"a\": [1, 2]}")));
+    return card;
+  }
+
+  async jsonText() {
+    if (SCALARS.includes(this.node.kind) && this.node.kind !== "str") return this.node.text;
+    return (await fetch(this.linkFirst("json"))).text();
+  }
+
+  async write(text) {
+    try {
+      JSON.parse(text);
+    } catch (error) {
+      toast(`Not JSON: ${error.message}`);
+      return;
+    }
+    const dialog = document.getElementById("confirm");
+    document.getElementById("confirm-path").textContent = this.address;
+    document.getElementById("confirm-old").textContent = (await this.jsonText()).slice(0, 2000);
+    document.getElementById("confirm-new").textContent = text.slice(0, 2000);
+    dialog.returnValue = "no";
+    dialog.showModal();
+    await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
+    if (dialog.returnValue !== "yes") return;
+    try {
+      await postWrite(this.address, text, this.app.config.key);
+      toast("Written");
+      this.app.refresh();
+    } catch (error) {
+      toast(error.message);
+    }
+  }
+}
+
+// Numbers over time, below a value.
+class Course {
+  constructor(parent, app, address) {
+    this.app = app;
+    this.address = address;
+    this.card = el("div", { class: "card" });
+    parent.append(this.card);
+    this.plot = new Plot(this.card, { time: true, onPick: (at) => { app.time.pause(); app.seek(at); }, label: `Course of ${address} over time; a click shows that instant` });
+  }
+
+  async update(signal) {
+    const { app } = this, key = app.config.live && app.at === null ? null : `${app.config.live ? Math.floor(app.span.end / 2) : ""}`;
+    if (key === null || key !== this.key) {
+      this.data = await getJson("series", { path: this.address }, signal);
+      this.key = key;
+    }
+    this.card.hidden = !this.data.lines.length;
+    if (!this.card.hidden) this.plot.set(this.data, app.at);
+  }
+}
+
+class NumberBody {
+  constructor(parent, app, address) {
+    this.big = el("div", { class: "big" });
+    parent.append(this.big);
+    this.course = new Course(parent, app, address);
+  }
+
+  async update(node, signal) {
+    this.big.className = `big is-${node.kind}`;
+    setText(this.big, node.text);
+    await this.course.update(signal);
+  }
+}
+
+class PlainBody {
+  constructor(parent) {
+    this.big = el("div", { class: "big is-NoneType" });
+    parent.append(this.big);
+  }
+
+  update(node) { setText(this.big, node.text || node.kind); }
+}
+
+class TextBody {
+  constructor(parent) {
+    this.text = el("pre", { class: "text card is-str", dir: "auto" });
+    this.cut = el("p", { class: "hint", hidden: true }, "Only the beginning is shown.");
+    parent.append(this.text, this.cut);
+  }
+
+  update(node) {
+    setText(this.text, node.full || " ");
+    this.cut.hidden = !node.cut;
+  }
+}
+
+class TreeBody {
+  constructor(parent, app, address) {
+    const rows = el("div", { class: "subtree", role: "tree", "aria-label": `Inside ${address}` });
+    parent.append(el("div", { class: "card" }, rows));
+    this.tree = new Tree(rows, app, address, null);
+  }
+
+  async update(node, signal) { await this.tree.refresh(signal); }
+}
+
+class ListBody {
+  constructor(parent, app, address) {
+    this.course = new Course(parent, app, address);
+    this.tree = new TreeBody(parent, app, address);
+  }
+
+  async update(node, signal) {
+    this.course.card.hidden = true;
+    if (node.text) await this.course.update(signal);
+    await this.tree.update(node, signal);
+  }
+}
+
+class BytesBody {
+  constructor(parent, app, address) {
+    this.app = app;
+    this.address = address;
+    this.image = el("img", { alt: `Picture at ${address}` });
+    this.picture = el("div", { class: "picture", hidden: true }, this.image);
+    this.dump = el("pre", {});
+    this.hex = el("details", { class: "card", open: true }, el("summary", {}, "Bytes"), this.dump);
+    parent.append(this.picture, this.hex);
+  }
+
+  async update(node, signal) {
+    const values = { path: this.address, at: this.app.at };
+    const said = await getJson("bytes", values, signal);
+    setText(this.dump, said.rows.map(([at, hex, text]) => `${at}  ${hex.padEnd(47)}  ${text}`).join("\n") + (said.bytes > 1024 ? "\n…" : ""));
+    if (this.picture.hidden === said.picture) this.hex.open = !said.picture;
+    this.picture.hidden = !said.picture;
+    if (!said.picture) return;
+    const { blob } = await getPicture("picture", values, signal);
+    await swap(this.image, blob);
+  }
+}
+
+// Put a new picture in the place of an old one once it is decoded: nothing flickers.
+export async function swap(image, blob) {
+  const url = URL.createObjectURL(blob), before = image.src;
+  const next = new Image();
+  next.src = url;
+  await next.decode().catch(() => {});
+  image.src = url;
+  if (before.startsWith("blob:")) URL.revokeObjectURL(before);
+}

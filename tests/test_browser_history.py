@@ -1,0 +1,165 @@
+"""The rolling buffer: what was where at which instant, within its bytes."""
+
+from __future__ import annotations
+
+import copy
+import random
+
+import numpy as np
+import pytest
+
+from reem_async.browser.history import History
+from reem_async.browser.source import numbers_in
+from reem_async.browser.timeline import PENDING, UNKNOWN
+from reem_async.browser.trees import same
+from reem_async.plan.trees import MISSING, get, removed, replaced
+
+
+@pytest.fixture
+def history():
+    it = History(1000.0, 1 << 20)
+    it.start = 0.0
+    return it
+
+
+def test_a_state_before_and_after_changes(history):
+    history.begin("arm", b'{"q": [1, 2], "on": true}')
+    history.add(("arm", "q", 1), 5, 8, 10.0)
+    history.add(("arm", "on"), MISSING, 0, 11.0)
+    history.add(("arm",), {"q": []}, 8, 12.0)
+    history.add(("arm",), MISSING, 0, 13.0)
+    found = [history.tree(("arm",), at) for at in (9.9, 10.0, 11.5, 12.0, 13.0)]
+    assert found == [{"q": [1, 2], "on": True}, {"q": [1, 5], "on": True}, {"q": [1, 5]}, {"q": []}, MISSING]
+    assert [history.existed("arm", at) for at in (9.0, 12.5, 13.5)] == [True, True, False]
+
+
+def test_what_was_never_seen_is_unknown_and_not_made_up(history):
+    history.add(("arm", "q"), 5, 8, 10.0)
+    assert history.tree(("arm",), 11.0) is UNKNOWN
+    assert history.existed("arm", 11.0) is None
+    assert history.tree(("nobody",), 11.0) is UNKNOWN
+    history.add(("arm",), {"q": 6}, 8, 12.0)
+    assert history.tree(("arm", "q"), 12.5) == 6
+
+
+def test_removing_an_item_of_a_list_moves_those_behind_it(history):
+    history.begin("l", b"[[0], [1], [2]]")
+    history.add(("l", 1, 0), 11, 8, 1.0)
+    history.add(("l", 0), MISSING, 0, 2.0)
+    history.add(("l", 1, 0), 22, 8, 3.0)
+    assert history.tree(("l",), 3.0) == [[11], [22]]
+    assert history.tree(("l",), 1.5) == [[0], [11], [2]]
+
+
+def test_an_array_that_was_not_kept_shows_the_one_before_and_how_late_it_is(history):
+    frame = np.zeros((4, 4), np.uint8)
+    history.begin("cam", b"{}")
+    history.add(("cam", "image"), frame, 16, 5.0)
+    history.add(("cam", "image"), PENDING, 0, 6.0)
+    history.add(("cam", "image"), PENDING, 0, 8.0)
+    kept = history.kept(("cam", "image"), 9.0)
+    assert kept.value is frame
+    assert kept.late == pytest.approx(3.0)
+    assert history.kept(("cam", "image"), 5.5).late == 0.0
+    assert history.last([("cam",)], 9.0) == {("cam",): 8.0}
+
+
+def brute(base, changes, at):
+    tree = copy.deepcopy(base)
+    for when, path, value in changes:
+        if when <= at:
+            tree = removed(tree, path[1:]) if value is MISSING else replaced(tree, path[1:], value)
+    return tree
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_instant_equals_a_replay_of_all_changes_whatever_was_folded(seed):
+    """Sets, deletions in dicts and in lists, whole replacements, with old changes made part of the base."""
+    chance = random.Random(seed)
+    history = History(30.0, 1 << 30)
+    history.start = 0.0
+    base = {"a": {"x": 0, "y": [0, 1, 2, 3]}, "b": [{"c": 1}, {"c": 2}], "s": 0}
+    history.begin("k", b'{"a": {"x": 0, "y": [0, 1, 2, 3]}, "b": [{"c": 1}, {"c": 2}], "s": 0}')
+    changes = []
+    tree = base
+    for number in range(400):
+        when = number * 0.25
+        path = chance.choice(
+            [("a", "x"), ("a", "y"), ("a", "y", 1), ("b", 0, "c"), ("b", 1), ("s",), ("a",), (), ("n",)]
+        )
+        value = chance.choice([number, [number] * 3, {"c": number, "x": 1, "y": [5, 6, 7]}, MISSING])
+        if path == ():
+            value = copy.deepcopy(base)
+        if path in (("a",), ("b", 1)) and value is not MISSING:
+            value = {"x": number, "y": [1, 2, 3], "c": 0}
+        if path == ("a", "y", 1) or (value is MISSING and path == ("b", 1)):
+            value = MISSING if chance.random() < 0.3 and get(tree, path) is not MISSING else number
+        if len(path) > 1 and get(tree, path[:-1]) is MISSING:
+            continue
+        try:
+            tree = removed(tree, path) if value is MISSING else replaced(tree, path, value)
+        except Exception:  # does not fit: no server would have done it
+            continue
+        changes.append((when, ("k", *path), value))
+        history.add(("k", *path), value if value is MISSING else copy.deepcopy(value), 8, when)
+    assert history.start > 60, "nothing was folded"
+    for at in np.linspace(history.start, 101, 50):
+        assert same(history.tree(("k",), at), brute(base, changes, at)), at
+
+
+def test_the_budget_holds_and_the_newest_stays():
+    history = History(1000.0, 200_000)
+    history.start = 0.0
+    for number in range(500):
+        history.add(("cam",), np.full(5000, number % 256, np.uint8), 5000, float(number + 1))
+        assert history.bytes <= 200_000 + 5500
+    assert history.dropped > 300
+    assert history.tree(("cam",), 500.0)[0] == 499 % 256
+    assert history.start > 400
+    counted = sum(change.size for change in history.between(0, 1e9))
+    assert counted <= history.bytes
+
+
+def test_what_is_older_than_the_span_is_forgotten():
+    history = History(10.0, 1 << 20)
+    history.start = 0.0
+    for number in range(100):
+        history.add(("n",), number, 8, float(number))
+    assert len(list(history.between(0, 1e9))) <= 13
+    assert history.start == pytest.approx(89.0, abs=1.5)
+    assert history.tree(("n",), 95.0) == 95
+
+
+def test_a_document_that_differs_from_what_was_heard_is_noticed_once(history):
+    history.begin("k", b'{"a": 1}')
+    assert not history.differs("k", b'{"a": 1}', 1.0)
+    history.add(("k", "a"), 2, 8, 2.0)
+    assert not history.differs("k", b'{"a":2}', 3.0), "the published change explains it"
+    assert history.differs("k", b'{"a":3}', 4.0)
+    assert history.differs("k", None, 5.0)
+    assert history.differs("new", b"1", 5.0)
+    assert not history.differs("never", None, 5.0)
+
+
+def test_steps_and_series(history):
+    history.begin("k", b'{"x": 0, "q": [1, 2]}')
+    for when, path, value in ((1, "x", 1.5), (2, "q", [3, 4]), (3, "x", 2.5), (4, "x", "text"), (5, "x", 3)):
+        history.add(("k", path), value, 8, float(when))
+    history.add(("k", "q", 0), 9, 8, 6.0)
+    assert history.step(2.0, True, ()) == 3.0
+    assert history.step(2.0, False, ()) == 1.0
+    assert history.step(1.0, True, ("k", "q")) == 2.0
+    assert history.step(0.5, False, ()) is None
+    assert history.step(6.0, True, ()) is None
+    series = numbers_in(history.values(("k", "x"), 0.0, 9.0))
+    assert (series.times, series.lines) == ([0, 1, 3, 4, 5], [[0, 1.5, 2.5, None, 3]])
+    series = numbers_in(history.values(("k", "q"), 0.0, 9.0))
+    assert (series.names, series.times, series.lines) == (["[0]", "[1]"], [0, 2, 6], [[1, 3, 9], [2, 4, 4]])
+
+
+def test_the_rate_is_that_of_the_last_seconds(history):
+    for number in range(100):
+        history.add(("k", "x"), number, 8, 10 + number / 10)
+    assert history.rate("k", 20.0) == pytest.approx(10.0, abs=0.5)
+    assert history.rate("k", 40.0) is None
+    assert history.rate("other", 20.0) is None

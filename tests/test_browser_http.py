@@ -1,0 +1,357 @@
+"""What the browser answers, over a real port and from a real server."""
+
+from __future__ import annotations
+
+import io
+import os
+import pathlib
+import threading
+import time
+
+import numpy as np
+import orjson
+import pytest
+import redis
+from browserkit import client_of, live, served
+from conftest import assert_same, eventually, python
+from PIL import Image
+
+import reem
+from reem_async.server import EmbeddedServer
+
+
+@pytest.fixture(scope="module")
+def page(server_url):
+    """A browser of the server of this test run, that may only look."""
+    with served(live(server_url)) as (address, source):
+        yield address, source
+
+
+@pytest.fixture
+def ask(page):
+    with client_of(page[0]) as client:
+        yield client
+
+
+IMAGE = np.random.default_rng(1).integers(0, 256, (40, 60, 3), np.uint8)
+
+
+@pytest.fixture
+def robot(kvs, key):
+    """A key with a bit of everything."""
+    name = key("robot")
+    kvs[name] = {
+        "n": 1,
+        "f": 0.1 + 0.2,
+        "big": 2**60 + 1,
+        "s": "hello",
+        "b": True,
+        "none": None,
+        "q": [1, 2.5, 3],
+        "nested": [{"a": 1}, {"a": 2}],
+        "image": IMAGE,
+        "depth": np.array([[0.5, np.nan], [2.0, 3.0]], np.float32),
+        "raw": b"\x00\x01\xff",
+        "a.b": {"c d": 5},
+    }
+    return name
+
+
+# --- looking -------------------------------------------------
+
+
+def test_the_tree_has_types_sizes_and_values(ask, robot):
+    rows = ask.rows(robot)
+    said = {label: (row["kind"], row["text"], row["size"], row["count"]) for label, row in rows.items()}
+    assert said == {
+        "n": ("int", "1", 8, None),
+        "f": ("float", "0.30000000000000004", 8, None),
+        "big": ("int", str(2**60 + 1), 8, None),
+        "s": ("str", '"hello"', 5, None),
+        "b": ("bool", "true", 8, None),
+        "none": ("NoneType", "null", 8, None),
+        "q": ("list", "[1, 2.5, 3]", None, 3),
+        "nested": ("list", "", None, 2),
+        "image": ("numpy", "uint8[40,60,3]", 7200, None),
+        "depth": ("numpy", "float32[2,2]", 16, None),
+        "raw": ("bytes", "bytes", 3, None),
+        "a.b": ("dict", "", None, 1),
+    }
+    assert ask.rows(rows["a.b"]["address"])["c d"]["text"] == "5"
+    assert ask.rows(rows["nested"]["address"])["[1]"]["address"] == f"{robot}.nested[1]"
+    eventually(lambda: robot in ask.rows())
+
+
+def test_long_branches_come_in_pages(ask, kvs, key):
+    kvs[key()] = {f"k{number:04}": number for number in range(1500)}
+    (branch,) = ask.json("tree", open=f"100:1450:{key()}")["branches"]
+    assert (branch["total"], branch["start"], len(branch["nodes"])) == (1500, 1450, 50)
+    assert branch["nodes"][0]["label"] == "k1450"
+    (branch,) = ask.json("tree", open=f"999999:0:{key()}")["branches"]
+    assert len(branch["nodes"]) == 1000
+
+
+def test_long_texts_are_not_fetched_for_the_tree_but_for_the_view(ask, kvs, key):
+    kvs[key()] = {"t": "x" * 100_000}
+    assert ask.rows(key())["t"]["text"] == "100000 bytes of text"
+    assert ask.json("node", path=f"{key()}.t")["full"] == "x" * 100_000
+
+
+def test_the_snippet_of_a_path_reads_it(ask, robot):
+    """Both are run as programs of their own."""
+    for front, code in ask.json("node", path=f'{robot}["a.b"]["c d"]')["snippets"].items():
+        done = python(code + "print(value)")
+        assert done.returncode == 0, (front, done.stderr)
+        assert done.stdout.strip() == "5", front
+
+
+def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
+    about = ask.json("array", path=f"{robot}.image")
+    assert (about["dtype"], about["shape"], about["view"]) == ("uint8", [40, 60, 3], "image")
+    answer = ask.ask("image", path=f"{robot}.image")
+    assert answer.headers["content-type"] == "image/png"
+    with Image.open(io.BytesIO(answer.content)) as image:
+        assert (np.asarray(image) == IMAGE).all()
+    said = orjson.loads(ask.ask("image", path=f"{robot}.depth", map="viridis").headers["x-picture"])
+    assert said == {"low": 0.5, "high": 3.0, "bad": 1, "size": [2, 2], "late": 0.0}
+    page = ask.json("table", path=f"{robot}.image", slice=":,:,1", row=39, column=58)
+    assert page["cells"] == [[str(value) for value in IMAGE[39, 58:, 1]]]
+    assert ask.json("line", path=f"{robot}.image", slice="3,:,0")["lines"] == [IMAGE[3, :, 0].tolist()]
+    assert sum(ask.json("histogram", path=f"{robot}.image")["counts"]) == IMAGE.size
+    assert ask.json("array", path=f"{robot}.q")["shape"] == [3]
+
+
+@pytest.mark.parametrize(
+    ("what", "values", "status"),
+    [
+        ("image", {"path": "{}.q"}, 400),
+        ("image", {"path": "{}.image", "slice": "0,0,9"}, 400),
+        ("image", {"path": "{}.image", "map": "nope"}, 400),
+        ("image", {"path": "{}.image", "low": "nan"}, 400),
+        ("table", {"path": "{}.image"}, 400),
+        ("table", {"path": "{}.n"}, 400),
+        ("table", {"path": "{}.missing"}, 404),
+        ("node", {"path": "{}..x"}, 400),
+        ("node", {"path": "../../etc/passwd"}, 400),
+        ("node", {"path": "x" * 5000}, 400),
+        ("node", {"path": "{}", "at": "later"}, 400),
+        ("tree", {"open": "many:0:"}, 400),
+        ("step", {}, 400),
+        ("picture", {"path": "{}.raw"}, 400),
+        ("nothing", {}, 404),
+    ],
+)
+def test_what_cannot_be_shown_is_an_error_that_says_so(ask, robot, what, values, status):
+    answer = ask.ask(what, **{name: value.format(robot) for name, value in values.items()})
+    assert answer.status_code == status
+    assert status == 404 or len(answer.json()["error"]) > 10
+
+
+def test_what_is_not_there_is_told_to_a_page_that_waits_for_it(ask, robot):
+    """It is no error: the browser's console stays empty."""
+    for what in ("node", "array"):
+        assert "nothing is stored" in ask.json(what, path=f"{robot}.missing")["missing"]
+
+
+def test_downloads(ask, robot):
+    def get(path, **values):
+        return ask.http.get(f"/view/{robot}.{path}", params=values)
+
+    answer = get("image", format="npy")
+    assert answer.headers["content-disposition"].startswith(f'attachment; filename="{robot}.image.npy"')
+    assert_same(np.load(io.BytesIO(answer.content), allow_pickle=False), IMAGE)
+    part = get("image", format="npy", slice="3,:,0")
+    assert_same(np.load(io.BytesIO(part.content), allow_pickle=False), IMAGE[3, :, 0])
+    assert get("q", format="csv").text.split() == ["1.0", "2.5", "3.0"]
+    assert get("image", format="csv", slice="0,:,:").text.splitlines()[5] == ",".join(map(str, IMAGE[0, 5]))
+    with Image.open(io.BytesIO(get("image", format="png").content)) as image:
+        assert (np.asarray(image) == IMAGE).all()
+    assert get("n", format="json").json() == 1
+    whole = ask.http.get(f"/view/{robot}", params={"format": "json"}).json()
+    assert whole["depth"] == [[0.5, None], [2.0, 3.0]]
+    assert whole["image"] == IMAGE.tolist()
+    assert whole["raw"] == {"type": "bytes", "what": "bytes", "bytes": 3}
+    for path, kind in (("n", "npy"), ("s", "csv"), ("n", "exe"), ("image", "csv"), ("raw", "png")):
+        assert get(path, format=kind).status_code == 400, (path, kind)
+
+
+def test_formulas_in_csv_are_quoted(ask, kvs, key):
+    kvs[key()] = np.array(["=1+1", "plain", "@x"])
+    assert ask.http.get(f"/view/{key()}", params={"format": "csv"}).text.split() == ["'=1+1", "plain", "'@x"]
+
+
+def test_bytes_that_are_a_picture_are_shown_as_one(ask, kvs, key):
+    file = io.BytesIO()
+    Image.fromarray(IMAGE).save(file, "PNG")
+    kvs[key()] = {"png": file.getvalue(), "html": b"<script>alert(1)</script>"}
+    answer = ask.ask("picture", path=f"{key()}.png")
+    assert (answer.headers["content-type"], answer.content) == ("image/png", file.getvalue())
+    assert answer.headers["x-content-type-options"] == "nosniff"
+    assert ask.ask("picture", path=f"{key()}.html").status_code == 400
+    assert ask.json("bytes", path=f"{key()}.html")["rows"][0][2] == "<script>alert(1)"
+
+
+def test_search_finds_keys_and_what_is_below(ask, robot, key):
+    eventually(
+        lambda: f"{robot}.nested[0].a" in [row["address"] for row in ask.json("search", q=f"{key.prefix}")["found"]]
+    )
+    found = [row["address"] for row in ask.json("search", q=f"{robot}.NES".upper())["found"]]
+    assert found == [
+        f"{robot}.nested",
+        f"{robot}.nested[0]",
+        f"{robot}.nested[0].a",
+        f"{robot}.nested[1]",
+        f"{robot}.nested[1].a",
+    ]
+    assert ask.json("search", q="no such thing")["found"] == []
+    assert ask.json("search", q="")["found"] == []
+
+
+# --- time -------------------------------------------------
+
+
+def test_the_past_is_as_it_was(ask, page, pspace, key):
+    name = key("arm")
+    before = time.time()
+    pspace[name] = {"q": [0.0, 0.0], "mode": "idle"}
+    eventually(lambda: ask.json("tree", open="10:0:")["end"] > before and name in ask.rows())
+    times = []
+    for step in range(1, 6):
+        pspace[name]["q"] = [float(step), 0.5]
+        eventually(lambda step=step: ask.json("series", path=f"{name}.q")["lines"][0][-1:] == [float(step)])
+        times.append(ask.json("tree", open="1:0:")["end"])
+    pspace[name]["mode"] = "run"
+    eventually(lambda: ask.rows(name)["mode"]["text"] == '"run"')
+    for step, at in enumerate(times, 1):
+        assert ask.rows(name, at=at)["q"]["text"] == f"[{step}, 0.5]"
+        assert ask.rows(name, at=at)["mode"]["text"] == '"idle"'
+    marks = ask.rows(name, at=times[2], since=times[1])
+    assert (marks["q"]["mark"], marks["mode"]["mark"]) == ("changed", "")
+    assert ask.rows(at=times[2], since=times[1])[name]["mark"] == "inside"
+    assert ask.json("step", at=times[1], forward=1, path=f"{name}.q")["at"] > times[1]
+    assert ask.json("step", at=times[1], forward=0, path=f"{name}.q")["at"] < times[1]
+    assert name not in ask.rows(at=before - 0.001)
+    assert "missing" in ask.json("node", path=name, at=before - 0.001)
+    assert sum(ask.json("activity", bins=50, path=name)["counts"]) == 7
+    del pspace[name]
+    eventually(lambda: name not in ask.rows())
+    assert ask.rows(name, at=times[0])["mode"]["text"] == '"idle"'
+    assert name in ask.rows(at=times[0])
+
+
+def test_arrays_of_the_past(ask, pspace, key):
+    name = key("cam")
+    frames = [np.full((200, 200), value, np.uint8) for value in (10, 20)]
+    times = []
+    for frame in frames:
+        pspace[name] = {"image": frame}
+        eventually(lambda frame=frame: kept(ask, name) == int(frame[0, 0]))
+        times.append(time.time())
+    for frame, at in zip(frames, times, strict=True):
+        assert int(ask.json("table", path=f"{name}.image", at=at)["cells"][0][0]) == frame[0, 0]
+
+
+def kept(ask, name):
+    """What the buffer has as of now: asked for as the past."""
+    answer = ask.ask("table", path=f"{name}.image", at=time.time())
+    return int(answer.json()["cells"][0][0]) if answer.status_code == 200 else None
+
+
+def test_what_is_only_stored_is_noticed_too(ask, kvs, key):
+    kvs[key()] = {"x": 1}
+    eventually(lambda: key() in ask.rows(at=time.time()))
+    at = ask.json("tree", open="1:0:")["end"]
+    kvs[key()]["x"] = 2
+    eventually(lambda: ask.json("series", path=f"{key()}.x")["lines"][0][-1] == 2.0)
+    assert ask.rows(key(), at=at)["x"]["text"] == "1"
+    assert ask.rows(key())["x"]["time"] > at
+
+
+def test_events_name_what_changed_and_are_few(ask, pspace, key):
+    pspace[key()] = {"x": 0}
+    with ask.http.stream("GET", "/api/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        lines = stream.iter_lines()
+        next(lines)
+        stop = threading.Event()
+
+        def publish():
+            number = 0
+            while not stop.is_set():
+                pspace[key()]["x"] = number = number + 1
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            said, began = [], time.monotonic()
+            while len(said) < 5:
+                line = next(lines)
+                if line.startswith("data: ") and f"{key()}.x" in orjson.loads(line[6:])["paths"]:
+                    said.append(time.monotonic() - began)
+        finally:
+            stop.set()
+            thread.join()
+    assert said[4] - said[0] > 0.3, "more than ten a second"
+
+
+def test_a_server_that_goes_away_is_said_and_so_is_its_return(tmp_path):
+    with EmbeddedServer(directory=tmp_path / "data") as server:
+        port = server.port
+        with reem.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
+            reem.KeyValueStore(interface)["a"] = 1
+        with served(live(f"redis://127.0.0.1:{port}")) as (address, _), client_of(address) as ask:
+            assert ask.rows()["a"]["text"] == "1"
+            server.stop()
+            eventually(lambda: "no server answers" in ask.json("tree")["lost"])
+            assert ask.ask("node", path="a").status_code == 503
+            with EmbeddedServer(port, tmp_path / "data"):
+                eventually(lambda: ask.json("tree")["lost"] == "")
+                assert ask.rows()["a"]["text"] == "1"
+
+
+# --- size -------------------------------------------------
+
+
+def memory_of(pid):
+    lines = pathlib.Path(f"/proc/{pid}/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) << 10
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the memory is read from /proc")
+def test_ten_thousand_keys_and_eight_megabytes():
+    """The first page comes at once, and what is looked at is let go again."""
+    with EmbeddedServer() as server:
+        fill(server)
+        with served(live(server.url)) as (address, source), client_of(address) as ask:
+            began = time.monotonic()
+            assert ask.http.get("/").status_code == 200
+            (branch,) = ask.json("tree", open="100:0:")["branches"]
+            took = time.monotonic() - began
+            assert (branch["total"], len(branch["nodes"])) == (10_001, 100)
+            assert took < 1.0
+            eventually(
+                lambda: "key_09999.b" in [row["address"] for row in ask.json("search", q="key_09999.b")["found"]]
+            )
+            look(ask)
+            before = memory_of(os.getpid())
+            for _ in range(10):
+                look(ask)
+            assert memory_of(os.getpid()) - before < 60 << 20
+            assert source.history.bytes < 16 << 20
+
+
+def look(ask):
+    assert ask.json("array", path="big")["shape"] == [1000, 1000]
+    assert len(ask.ask("image", path="big", side=400).content) > 1000
+    assert ask.json("table", path="big", row=999, column=999)["cells"] == [["999999"]]
+
+
+def fill(server):
+    """Ten thousand small keys in one go, and a large array."""
+    with redis.Redis.from_url(server.url) as client:
+        pipeline = client.pipeline(transaction=False)
+        for number in range(10_000):
+            pipeline.execute_command("JSON.SET", f"key_{number:05}", "$", f'{{"a":{number},"b":[1,2]}}')
+        pipeline.execute()
+    with reem.RedisInterface(server) as interface:
+        reem.KeyValueStore(interface)["big"] = np.arange(1e6).reshape(1000, 1000)

@@ -1,0 +1,355 @@
+"""The page, in headless Chromium: clicking, searching, dragging the slider, and what is seen then."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+
+import numpy as np
+import pytest
+from browserkit import live, served
+from conftest import eventually
+
+from reem.server import EmbeddedServer
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+if CHROMIUM is None:
+    pytest.skip("Chromium is not installed: apt-get install chromium", allow_module_level=True)
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
+expect = playwright.expect
+
+FLAGS = [
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def address(server_url):
+    with served(live(server_url), allow_write=True) as (address, _):
+        yield address
+
+
+class Visitor:
+    """Opens pages and remembers what their consoles said."""
+
+    def __init__(self, chromium, address):
+        self.chromium = chromium
+        self.address = address
+        self.contexts = []
+        self.said = []
+        self.asked = []
+
+    def open(self, path="/", address=None, **options):
+        context = self.chromium.new_context(viewport={"width": 1200, "height": 760}, **options)
+        context.set_default_timeout(10_000)
+        self.contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: self.said.append(f"{message.type}: {message.text}"))
+        page.on("pageerror", lambda error: self.said.append(f"error: {error}"))
+        page.on("request", lambda request: self.asked.append(request.url))
+        page.goto((address or self.address) + path)
+        return page
+
+
+@pytest.fixture
+def visit(chromium, address, key):  # the key, since pages must be closed before what they show is removed
+    """Opens pages; at the end nothing was said on the console, and nothing was asked of anybody else."""
+    visitor = Visitor(chromium, address)
+    yield visitor
+    for context in visitor.contexts:
+        context.close()
+    assert visitor.said == []
+    elsewhere = [url for url in visitor.asked if not url.startswith(("http://127.0.0.1:", "blob:http://127.0.0.1:"))]
+    assert elsewhere == []
+
+
+def row(page, address, where="#tree"):
+    return page.locator(f'{where} .row[data-address="{address}"]')
+
+
+def test_the_tree_opens_closes_and_remembers(visit, kvs, key):
+    name = key("robot")
+    kvs[name] = {"arm": {"q": [1.5, 2.5], "on": True}, "image": np.zeros((20, 30), np.uint8)}
+    page = visit.open()
+    row(page, name).locator(".twist").click()
+    expect(row(page, f"{name}.image")).to_contain_text("uint8[20,30]")
+    expect(row(page, f"{name}.image")).to_contain_text("600 B")
+    row(page, f"{name}.arm").locator(".twist").click()
+    expect(row(page, f"{name}.arm.q")).to_contain_text("[1.5, 2.5]")
+    page.reload()
+    expect(row(page, f"{name}.arm.on")).to_contain_text("true")
+    expect(row(page, f"{name}.arm")).to_have_attribute("aria-expanded", "true")
+    row(page, name).locator(".twist").click()
+    expect(row(page, f"{name}.arm")).to_have_count(0)
+
+
+def test_values_are_live_and_addresses_lead_to_them(visit, pspace, key):
+    name = key("battery")
+    pspace[name] = {"volt": 12.5, "name": "main", "full": False}
+    page = visit.open(f"/view/{name}.volt")
+    expect(page.locator(".big")).to_have_text("12.5")
+    for value in (11.75, 9.25):
+        pspace[name]["volt"] = value
+        expect(page.locator(".big")).to_have_text(str(value))
+    page.reload()
+    expect(page.locator(".big")).to_have_text("9.25")
+    expect(page.locator("canvas.plot")).to_be_visible()
+    page.locator(".crumb").click()
+    expect(page).to_have_url(re.compile(f"/view/{name}$"))
+    expect(row(page, f"{name}.name", "#view")).to_contain_text('"main"')
+    row(page, f"{name}.full", "#view").click()
+    expect(page.locator(".big")).to_have_text("false")
+    page.go_back()
+    page.go_back()
+    expect(page.locator(".big")).to_have_text("9.25")
+
+
+def test_search(visit, kvs, key):
+    kvs[key("alpha")] = {"needle_x": 1}
+    kvs[key("beta")] = {"other": 2}
+    page = visit.open()
+    expect(row(page, key("beta"))).to_be_visible()
+    page.keyboard.press("/")
+    expect(page.locator("#search")).to_be_focused()
+    page.keyboard.type("NEEDLE_")
+    expect(row(page, f"{key('alpha')}.needle_x")).to_contain_text("1")
+    expect(page.locator("#tree .row")).to_have_count(1)
+    page.keyboard.press("Enter")
+    expect(page.locator(".head h1")).to_have_text(f"{key('alpha')}.needle_x")
+    page.locator("#search").fill("no such key anywhere")
+    expect(page.locator("#tree")).to_contain_text("No key has")
+    page.locator("#search").press("Escape")
+    expect(row(page, key("beta"))).to_be_visible()
+
+
+def test_dragging_the_slider_shows_the_past(visit, pspace, key):
+    name = key("arm")
+    pspace[name] = {"mode": "idle", "x": 0.0}
+    page = visit.open(f"/view/{name}.mode")
+    expect(page.locator("pre.text")).to_have_text("idle")
+    until = time.monotonic() + 1.2
+    while time.monotonic() < until:  # time must pass, or there is no past to go to
+        pspace[name]["x"] = time.monotonic()
+        page.wait_for_timeout(50)
+    pspace[name]["mode"] = "run"
+    expect(page.locator("pre.text")).to_have_text("run")
+    row(page, name).locator(".twist").click()
+    at = when(page, name)
+    box = page.locator("#slider").bounding_box()
+    span = page.evaluate("Number(document.getElementById('slider').max)")
+    assert span > 1
+    page.mouse.move(box["x"] + box["width"] - 8, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    part = 1 - (page.evaluate("Date.now() / 1000") - at + 0.5) / span
+    page.mouse.move(box["x"] + 8 + (box["width"] - 16) * part, box["y"] + box["height"] / 2, steps=5)
+    page.mouse.up()
+    expect(page.locator("pre.text")).to_have_text("idle")
+    expect(row(page, f"{name}.mode")).to_contain_text('"idle"')
+    expect(page.locator("#live")).to_have_attribute("aria-pressed", "false")
+    expect(page).to_have_url(re.compile(r"\?at=\d+"))
+    page.keyboard.press("Shift+ArrowRight")
+    expect(page.locator("pre.text")).to_have_text("run")
+    page.locator("#forth").click()
+    page.locator("#live").click()
+    expect(page.locator("#live")).to_have_attribute("aria-pressed", "true")
+    pspace[name]["mode"] = "done"
+    expect(page.locator("pre.text")).to_have_text("done")
+
+
+def when(page, name):
+    """When the mode was last changed."""
+    return page.evaluate("async (path) => (await (await fetch('/api/node?path=' + path)).json()).time", f"{name}.mode")
+
+
+def test_stepping_and_playing_with_the_keyboard(visit, pspace, key):
+    name = key("n")
+    pspace[name] = 0
+    page = visit.open(f"/view/{name}")
+    expect(page.locator(".big")).to_have_text("0")
+    for number in (1, 2, 3):
+        page.wait_for_timeout(150)
+        pspace[name] = number
+        expect(page.locator(".big")).to_have_text(str(number))
+    page.wait_for_timeout(150)
+    page.keyboard.press("Shift+ArrowLeft")
+    expect(page.locator(".time")).to_have_class(re.compile("past"))
+    page.keyboard.press("Shift+ArrowLeft")
+    expect(page.locator(".big")).to_have_text("2")
+    expect(row(page, name)).to_have_class(re.compile("changed"))
+    page.keyboard.press("Shift+ArrowLeft")
+    expect(page.locator(".big")).to_have_text("1")
+    page.keyboard.press("Shift+ArrowRight")
+    expect(page.locator(".big")).to_have_text("2")
+    page.keyboard.press("Space")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Pause")
+    expect(page.locator(".big")).to_have_text("3")
+    page.keyboard.press("Space")
+    expect(page.locator("#play")).to_have_attribute("aria-label", "Play")
+    page.keyboard.press("l")
+    expect(page.locator("#live")).to_have_attribute("aria-pressed", "true")
+    page.keyboard.press("?")
+    expect(page.locator("#help")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.locator("#help")).to_be_hidden()
+
+
+def test_arrays_have_tabs(visit, kvs, key):
+    name = key("cam")
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[:, :, 0] = 255
+    kvs[name] = {"rgb": image, "deep": np.arange(2 * 30 * 40.0).reshape(2, 30, 40), "long": np.sin(np.arange(5e5))}
+    page = visit.open(f"/view/{name}.rgb")
+    expect(page.locator("#tab-image")).to_have_attribute("aria-selected", "true")
+    eventually(lambda: colour(page) == [255, 0, 0])
+    page.locator("input[type=checkbox]").check()
+    eventually(lambda: colour(page) == [0, 0, 255])
+    page.locator("#tab-table").click()
+    expect(page.locator("tbody td").first).to_have_text("255")
+    expect(page.locator(".pager")).to_contain_text("rows 0–49 of 60")
+    page.get_by_label("Rows after").click()
+    expect(page.locator("tbody th").first).to_have_text("50")
+    page.goto(f"{visit.address}/view/{name}.deep")
+    box = page.get_by_label("Axis 0 of 2 items")
+    expect(page.locator(".scale")).to_contain_text("1199")
+    box.press("ArrowUp")
+    expect(page.locator(".scale")).to_contain_text("2399")
+    box.fill("9")
+    box.press("Enter")
+    expect(page.locator("#toast")).to_contain_text("neither")
+    page.goto(f"{visit.address}/view/{name}.long")
+    expect(page.locator("#tab-line")).to_have_attribute("aria-selected", "true")
+    expect(page.locator("canvas.plot")).to_be_visible()
+    page.locator("#tab-histogram").click()
+    expect(page.locator("#tab-histogram")).to_have_attribute("aria-selected", "true")
+    page.locator("#tab-table").click()
+    page.get_by_label("Go to row").fill("499999")
+    page.get_by_label("Go to row").press("Enter")
+    expect(page.locator("tbody th").last).to_have_text("499999")
+
+
+def colour(page):
+    """The colour in the middle of the picture that is shown."""
+    return page.evaluate(
+        """() => {
+            const image = document.querySelector(".picture img");
+            if (!image || !image.complete || !image.naturalWidth) return null;
+            const canvas = document.createElement("canvas");
+            [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+            const context = canvas.getContext("2d");
+            context.drawImage(image, 0, 0);
+            return [...context.getImageData(canvas.width / 2, canvas.height / 2, 1, 1).data].slice(0, 3);
+        }"""
+    )
+
+
+def test_scripts_in_keys_and_values_are_only_text(visit, kvs, key):
+    evil = '<img src=x onerror="window.broken=1"><script>window.broken=1</script>'
+    name = key("x<b>\u202e")
+    kvs[name] = {evil.replace('"', ""): evil, "list": [evil, {"<i>": evil}]}
+    page = visit.open()
+    shown = page.locator("#tree .row", has_text=key("x<b>\\u202e"))
+    shown.locator(".twist").click()
+    expect(page.locator("#tree")).to_contain_text("<script>window.broken=1")
+    shown.click()
+    expect(page.locator("#view")).to_contain_text("onerror=")
+    page.locator("#view .row").first.click()
+    expect(page.locator("pre.text")).to_have_text(evil)
+    assert page.evaluate("window.broken") is None
+    assert page.locator("img[onerror], #view b, #tree b, #tree script").count() == 0
+
+
+def test_writing_asks_first_and_tells_subscribers(visit, pspace, kvs, key):
+    name = key("gain")
+    pspace[name] = {"kp": 2.0}
+    page = visit.open(f"/view/{name}.kp")
+    page.get_by_text("Edit", exact=True).click()
+    area = page.get_by_label("New value, as JSON")
+    expect(area).to_have_value("2.0")
+    area.fill("3.5")
+    page.get_by_text("Write…").click()
+    expect(page.locator("#confirm-old")).to_have_text("2.0")
+    page.get_by_role("button", name="Cancel").click()
+    assert kvs[name]["kp"].read() == 2.0
+    page.get_by_text("Write…").click()
+    page.get_by_role("button", name="Write", exact=True).click()
+    expect(page.locator(".big")).to_have_text("3.5")
+    assert kvs[name]["kp"].read() == 3.5
+    area.fill("three")
+    page.get_by_text("Write…").click()
+    expect(page.locator("#toast")).to_contain_text("Not JSON")
+    expect(page.locator("#confirm")).to_be_hidden()
+
+
+def test_what_is_gone_is_said_and_comes_back(visit, pspace, kvs, key):
+    name = key("here")
+    page = visit.open(f"/view/{name}")
+    expect(page.locator(".note")).to_contain_text("nothing is stored")
+    pspace[name] = "now"
+    expect(page.locator("pre.text")).to_have_text("now")
+    del pspace[name]
+    expect(page.locator(".note")).to_contain_text("nothing is stored")
+
+
+def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, key):
+    kvs[key("a_rather_long_name_of_a_key")] = {"x": list(range(40)), "text": "word " * 200}
+    name = key("a_rather_long_name_of_a_key")
+    page = visit.open("/")
+    page.set_viewport_size({"width": 360, "height": 640})
+    row(page, name).click()
+    expect(page.locator("nav")).to_be_hidden()
+    row(page, f"{name}.text", "#view").click()
+    expect(page.locator("pre.text")).to_be_visible()
+    for _ in range(2):
+        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert page.evaluate(
+            "document.querySelector('#view').scrollWidth <= document.querySelector('#view').clientWidth"
+        )
+        page.get_by_text("all keys").click()
+        expect(row(page, name)).to_be_visible()
+        page.go_back()
+    expect(page.locator("#live")).to_be_in_viewport()
+
+
+def test_lost_connections_are_seen_and_mended(chromium, tmp_path):
+    visitor = Visitor(chromium, None)
+    with EmbeddedServer(directory=tmp_path / "data") as server:
+        port = server.port
+        with served(live(f"redis://127.0.0.1:{port}")) as (address, _):
+            page = visitor.open("/", address)
+            expect(page.locator("#tree")).to_contain_text("reem set demo 1")
+            expect(page.locator("#banner")).to_be_hidden()
+            server.stop()
+            expect(page.locator("#banner")).to_contain_text("no server answers")
+            with EmbeddedServer(port, tmp_path / "data"):
+                expect(page.locator("#banner")).to_be_hidden()
+        expect(page.locator("#banner")).to_contain_text("reem browse")
+        assert [
+            text
+            for text in visitor.said
+            if text.startswith("error: ") and "Failed to load" not in text and "ERR_" not in text
+        ] == []
+    visitor.contexts[0].close()
+
+
+def test_ten_thousand_rows_do_not_make_the_page_slow(visit, kvs, key):
+    kvs[key()] = {f"k{number:05}": number for number in range(10_000)}
+    page = visit.open(f"/view/{key()}")
+    expect(page.locator("#view .row")).to_have_count(100)
+    expect(page.locator("#view .more")).to_contain_text("1–100 of 10,000")
+    page.locator("#view .more").get_by_text("100 ›").click()
+    expect(page.locator("#view .row").first).to_contain_text("k00100")

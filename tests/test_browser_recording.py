@@ -1,0 +1,115 @@
+"""A recording in the browser: the same pages, over the time it was made."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+from browserkit import client_of, served
+from conftest import python
+
+import reem_async
+from reem_async.browser.logsource import LogSource
+from reem_async.errors import ReadOnly
+from reem_async.recording import Recorder
+from reem_async.server import EmbeddedServer
+
+pytest.importorskip("mcap", reason="mcap is not installed: pip install 'reem[tools]'")
+
+
+async def record(path):
+    """Record an arm that moves and a camera; returns when each step was."""
+    times = []
+    with EmbeddedServer() as server:
+        async with reem_async.RedisInterface(server) as interface:
+            pspace = reem_async.PublishSpace(interface)
+            await pspace["arm"].write({"q": [0.0, 0.0], "mode": "idle", "fixed": 7})
+            async with Recorder(interface, ["*"], path):
+                for step in range(1, 6):
+                    await pspace["arm"]["q"].write([float(step), 0.5])
+                    await pspace["cam"].write({"image": np.full((40, 50), 10 * step, np.uint8), "step": step})
+                    await asyncio.sleep(0.05)
+                    times.append(asyncio.get_running_loop().time())
+                await pspace["arm"]["mode"].write("done")
+                await pspace["cam"].delete()
+                await asyncio.sleep(0.1)
+    return times
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    asyncio.run(record(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def ask(run):
+    with served(lambda: LogSource(run)) as (address, _), client_of(address) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def steps(ask):
+    """An instant right after each of the five steps."""
+    series = ask.json("series", path="cam.step")
+    values = dict(zip(series["lines"][0], series["times"], strict=True))
+    return [values[float(step)] + 0.01 for step in range(1, 6)]
+
+
+def test_every_instant_is_shown_as_it_was(ask, steps):
+    for step, at in enumerate(steps, 1):
+        assert ask.rows("arm", at=at)["q"]["text"] == f"[{step}, 0.5]"
+        assert ask.rows("arm", at=at)["mode"]["text"] == '"idle"'
+        assert ask.rows("cam", at=at)["image"]["text"] == "uint8[40,50]"
+        assert ask.json("table", path="cam.image", at=at)["cells"][0][0] == str(10 * step)
+    assert list(ask.rows()) == ["arm"], "the camera was deleted at the end"
+    assert ask.rows("arm")["mode"]["text"] == '"done"'
+
+
+def test_the_span_and_the_changes_in_it(ask, steps):
+    said = ask.json("tree", open="10:0:", at=steps[2], since=steps[1])
+    assert said["start"] < steps[0] < steps[4] < said["end"]
+    marks = {row["label"]: row["mark"] for row in said["branches"][0]["nodes"]}
+    assert marks == {"arm": "inside", "cam": "changed"}
+    rows = ask.rows("arm", at=steps[2], since=steps[1])
+    assert {label: row["mark"] for label, row in rows.items()} == {"q": "changed", "mode": "", "fixed": ""}
+    assert steps[1] < rows["q"]["time"] <= steps[2]
+    assert steps[2] < ask.json("step", at=steps[2], forward=1, path="")["at"] < steps[3]
+    assert steps[1] < ask.json("step", at=steps[2], forward=0, path="arm.q")["at"] < steps[2]
+    assert ask.json("step", at=said["end"], forward=1, path="")["at"] is None
+    at, found = said["end"], []
+    while (at := ask.json("step", at=at, forward=0, path="cam")["at"]) is not None:
+        found.append(at)
+        (branch,) = ask.json("tree", open="10:0:", at=at, since=at - 1e-4)["branches"]
+        assert {row["label"]: row["mark"] for row in branch["nodes"]}.get("cam", "changed") == "changed"
+    assert len(found) == 6, "five pictures and the end of them"
+    assert sum(ask.json("activity", bins=20, path="arm.mode")["counts"]) >= 1
+    assert sum(ask.json("activity", bins=20, path="")["counts"]) >= 11
+
+
+def test_series_search_and_downloads(ask, steps):
+    assert ask.json("series", path="arm.q")["lines"][0][-5:] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert [row["address"] for row in ask.json("search", q="q")["found"]] == ["arm.q", "arm.q[0]", "arm.q[1]"]
+    assert ask.http.get("/view/cam", params={"format": "json", "at": steps[3]}).json()["step"] == 4
+
+
+def test_the_snippet_reads_that_very_instant(ask, steps):
+    (code,) = ask.json("node", path="arm.q", at=steps[1])["snippets"].values()
+    done = python(code + "print(value, len(times))")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("[2.0, 0.5] ")
+
+
+def test_it_cannot_be_written(run):
+    with served(lambda: LogSource(run), allow_write=True) as (address, source), client_of(address) as ask:
+        answer = ask.http.post("/api/write", json={"path": "arm.mode", "value": 1}, headers={"origin": address})
+        assert answer.status_code == 403
+        with pytest.raises(ReadOnly):
+            asyncio.run(source.write(("arm",), 1))
+
+
+def test_events_go_on_so_that_the_page_knows_all_is_well(ask):
+    with ask.http.stream("GET", "/api/events") as stream:
+        assert next(line for line in stream.iter_lines() if line.startswith("data: ")).count('"paths":[]') == 1
