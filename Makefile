@@ -3,13 +3,22 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check chaos bench clean
+.PHONY: demo test modes coverage check chaos bench clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
 
 test: $(VENV)/ready  ## run every test on an embedded real server
 	$(BIN)/python -m pytest -q
+
+modes: $(VENV)/ready  ## tests once in Python's development mode, and once without assert statements
+	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_connection.py tests/test_facade_store.py
+	$(BIN)/python -O -m pytest -q -W "ignore:assertions not in test modules" \
+		tests/test_bad_input.py tests/test_store.py tests/test_pure.py tests/test_regressions.py
+
+coverage: $(VENV)/ready  ## branches that the tests take, without those that run in other processes
+	$(BIN)/python -m coverage run --branch --source=reem,reem_async -m pytest -q
+	$(BIN)/python -m coverage report --skip-covered --sort=cover | tail -60
 
 check: $(VENV)/ready  ## format, lint and type checks
 	$(BIN)/ruff format --check .
