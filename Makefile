@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test modes coverage check chaos bench clean
+.PHONY: demo test modes fuzz coverage check chaos bench clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -15,6 +15,9 @@ modes: $(VENV)/ready  ## tests once in Python's development mode, and once witho
 	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_connection.py tests/test_facade_store.py
 	$(BIN)/python -O -m pytest -q -W "ignore:assertions not in test modules" \
 		tests/test_bad_input.py tests/test_store.py tests/test_pure.py tests/test_regressions.py
+
+fuzz: $(VENV)/ready  ## random bytes against everything that decodes, for a minute each
+	$(BIN)/python -m tests.fuzz
 
 coverage: $(VENV)/ready  ## branches that the tests take, without those that run in other processes
 	$(BIN)/python -m coverage run --branch --source=reem,reem_async -m pytest -q

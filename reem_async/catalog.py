@@ -15,12 +15,9 @@ from .plan.patterns import escaped, parse_pattern
 from .plan.placeholders import MARK_BYTES, Placeholder, find
 from .plan.reads import get_command, present
 from .plan.replies import loads
-from .session import Session
-from .transport import Transport
+from .plan.scan import documents
 
 __all__ = ["Outline", "names", "outline"]
-
-_PAGE = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,29 +62,16 @@ async def names(interface: RedisInterface, pattern: str = "*") -> AsyncIterator[
     glob = escaped(session.namespace) + parse_pattern(pattern).glob
     seen: set[str] = set()
     for node in await session.transport.nodes():
-        async for key in documents(session, node, glob):
-            name = key.decode(errors="replace")[len(session.namespace) :]
-            if name not in seen and _is_name(name):
-                seen.add(name)
-                yield name
-
-
-async def documents(session: Session, node: Transport, glob: str) -> AsyncIterator[bytes]:
-    """Yield the keys of the documents that `node` has and whose server-side names match `glob`."""
-    cursor: Any = b"0"
-    while True:
-        command = ("SCAN", cursor, "MATCH", glob, "COUNT", _PAGE, "TYPE", "ReJSON-RL")
-        cursor, page = await session.run(Plan([command], _first), node)
-        for key in page:
-            yield key
-        if cursor in (b"0", 0):
-            return
-
-
-def _first(replies: Sequence[Reply]) -> Any:
-    if isinstance(replies[0], Exception):
-        raise replies[0]
-    return replies[0]
+        cursor: Any = b"0"
+        while True:
+            cursor, page = await session.run(documents(glob, cursor), node)
+            for key in page:
+                name = key.decode(errors="replace")[len(session.namespace) :]
+                if name not in seen and _is_name(name):
+                    seen.add(name)
+                    yield name
+            if cursor in (b"0", 0):
+                break
 
 
 def _is_name(name: str) -> bool:

@@ -25,9 +25,20 @@ Errors that come from the server or from the connection stay `redis.exceptions.R
     redis.exceptions.RedisError
     +-- ConnectionLost           (ReemError, redis ConnectionError) broken before the reply: outcome unknown
     +-- NotConnected             (ReemError, redis ConnectionError) nobody listening: nothing was applied
-    +-- NoJsonSupport            (ReemError, redis ResponseError) the server lacks RedisJSON
     +-- WrongKind                (ReemError, redis ResponseError) a foreign Redis type is under that key
     +-- PartialWrite             (ReemError, redis ResponseError) the server refused a part; says which
+    +-- Refused                  (ReemError) the server turned the call down: nothing of it was applied
+        +-- LoginRefused         also redis AuthenticationError: wrong user or password, or none given
+        +-- NotAllowed           also redis NoPermissionError: the user lacks a right; says which
+        +-- ServerFull           also redis OutOfMemoryError: `maxmemory` is reached
+        +-- ServerReadOnly       also redis ReadOnlyError: a replica, or a server that cannot save
+        +-- ServerNotReady       also redis BusyLoadingError: still loading, busy, or without its primary
+        +-- ClusterNode          also redis ResponseError: one node of a Redis Cluster
+        +-- NoJsonSupport        also redis ResponseError: the server lacks RedisJSON
+
+`NotConnected` has a subclass `TlsRefused`: the server is there, but TLS found it, or it found us, wanting.
+
+One warning: `InsecureConnection`, a connection to another machine that others can listen to.
 """
 
 from __future__ import annotations
@@ -41,12 +52,16 @@ __all__ = [
     "BadKey",
     "BadType",
     "BadValue",
+    "ClusterNode",
     "Conflict",
     "ConnectionLost",
+    "InsecureConnection",
     "InterfaceClosed",
+    "LoginRefused",
     "MissingKey",
     "Misuse",
     "NoJsonSupport",
+    "NotAllowed",
     "NotConnected",
     "Overflow",
     "PartialWrite",
@@ -54,8 +69,13 @@ __all__ = [
     "QueueFull",
     "ReadOnly",
     "ReemError",
+    "Refused",
     "ServerFailed",
+    "ServerFull",
     "ServerMissing",
+    "ServerNotReady",
+    "ServerReadOnly",
+    "TlsRefused",
     "TooDeep",
     "WriteOnly",
     "WrongKind",
@@ -63,8 +83,20 @@ __all__ = [
 ]
 
 
+ClusterReply = (
+    redis.exceptions.AskError  # MovedError is one of them
+    | redis.exceptions.ClusterCrossSlotError
+    | redis.exceptions.ClusterDownError
+    | redis.exceptions.TryAgainError
+)
+"""What a node of a cluster answers: for the transport to a cluster to follow, else it becomes a `ClusterNode`."""
+
+
 class ReemError(Exception):
     """Root of everything REEM raises by itself."""
+
+    def __repr__(self) -> str:  # redis-py's errors leave the message out
+        return Exception.__repr__(self)
 
 
 class BadInput(ReemError):
@@ -153,8 +185,8 @@ class NotConnected(ReemError, redis.exceptions.ConnectionError):
     """No connection could be made; nothing was applied."""
 
 
-class NoJsonSupport(ReemError, redis.exceptions.ResponseError):
-    """The server answers, but has no RedisJSON."""
+class TlsRefused(NotConnected):
+    """TLS failed: the server's certificate, its name, the certificate shown to it, or no TLS there."""
 
 
 class WrongKind(ReemError, redis.exceptions.ResponseError):
@@ -176,3 +208,61 @@ class WrongKind(ReemError, redis.exceptions.ResponseError):
 
 class PartialWrite(ReemError, redis.exceptions.ResponseError):
     """The server refused a part of a transaction; the message names what was applied."""
+
+
+class Refused(ReemError):
+    """The server turned the call down for a reason that has nothing to do with the value; nothing was applied.
+
+    In a write with arrays, or through a `PublishSpace`, that goes for the whole transaction. Reads and
+    writes that come later on the same connection are not disturbed.
+    """
+
+    def at(self, place: str) -> Refused:
+        """Return this error with its message headed by where it happened."""
+        return type(self)(f"{place}: {self}")
+
+
+class LoginRefused(Refused, redis.exceptions.AuthenticationError):
+    """A wrong user or password, or none where one is needed. It is raised at once and never tried again."""
+
+
+class NotAllowed(Refused, redis.exceptions.NoPermissionError):
+    """The user may not run the command, or not on this key or channel; `deploy/users.acl` holds what REEM needs."""
+
+
+class ServerFull(Refused, redis.exceptions.OutOfMemoryError):
+    """The server has reached its `maxmemory`; nothing was written.
+
+    Plain values can still be read and deleted. What has arrays goes in a transaction: Valkey still takes it
+    if nothing in it needs memory, Redis takes none.
+    """
+
+
+class ServerReadOnly(Refused, redis.exceptions.ReadOnlyError):
+    """The server takes no writes: it is a replica, or it cannot save what it is sent."""
+
+
+class ServerNotReady(Refused, redis.exceptions.BusyLoadingError):
+    """The server is loading its data, is busy with a script, or is a replica that lost its primary."""
+
+
+class ClusterNode(Refused, redis.exceptions.ResponseError):
+    """The server is one node of a Redis Cluster, and the key lives on another."""
+
+
+class NoJsonSupport(Refused, redis.exceptions.ResponseError):
+    """The server answers, but has no RedisJSON."""
+
+
+class InsecureConnection(UserWarning):
+    """What goes over a connection can be read and changed on its way; said once for each address."""
+
+
+def turned_down(error: Exception) -> Refused:
+    """Return what an error reply about the server means to somebody who talks to that one server only."""
+    if isinstance(error, Refused):
+        return error
+    return ClusterNode(
+        "the server is a node of a Redis Cluster and does not hold this key now; connect with "
+        f"RedisInterface('redis+cluster://host:port,host:port') (it says: {error!s:.120})"
+    )

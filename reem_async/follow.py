@@ -21,12 +21,13 @@ from typing import Any
 from .background import in_background
 from .errors import MissingKey, RedisError
 from .hub import Topic
-from .plan import Plan, Reply, unwrap, wire_commands
+from .plan import Plan, Reply, wire_commands
 from .plan.keys import Keys
 from .plan.memory import Memory
 from .plan.notices import ANNOUNCED, Notice
 from .plan.paths import Path, show
 from .plan.reads import Sealed, interpret, read
+from .plan.replies import decoded
 from .plan.trees import MISSING, CannotApply, copied, get, removed, replaced
 from .policy import Mailbox
 from .sequences import Sequences
@@ -220,7 +221,7 @@ class Follower:
         try:
             if isinstance(outcome, Exception):
                 raise outcome
-            result = plan.decode(unwrap(plan, outcome))
+            result = decoded(plan, outcome)
         except MissingKey:
             self._divide(())
             self._settle(MISSING)

@@ -1,4 +1,9 @@
-"""The hub: the one subscription connection of an interface, kept alive for all that follow."""
+"""The hub: the subscription connections of an interface, kept alive for all that follow.
+
+One server needs one. In a cluster a channel belongs to a node, as its key does, so there is one for
+each node where somebody listens; when a slot moves, what is followed there begins anew on its new
+node, with a gap.
+"""
 
 from __future__ import annotations
 
@@ -6,19 +11,25 @@ import asyncio
 import logging
 import os
 import random
+import time
 import weakref
 from collections.abc import Iterable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 from .background import in_background
-from .errors import BadData, InterfaceClosed, RedisError
-from .plan import Reply
+from .errors import BadData, InterfaceClosed, NotConnected, RedisError
+from .plan import Reply, blamed
 from .plan.notices import Notice, decode
 from .policy import Mailbox
 from .ships.registry import Ships
-from .transport.aio import AsyncTransport
+from .transport import Transport
+from .transport.redirects import is_moved, is_unapplied
 from .transport.wire import Wire
+
+if TYPE_CHECKING:
+    from .discovery import Discovery
+    from .transport.aio import AsyncTransport
 
 __all__ = ["Hub", "Listener", "Topic"]
 
@@ -41,11 +52,6 @@ class Topic(NamedTuple):
 
     name: bytes
     pattern: bool = False
-
-    @property
-    def prefix(self) -> str:
-        """What the server's commands for this kind of topic begin with."""
-        return "P" if self.pattern else ""
 
 
 class Listener(Protocol):
@@ -105,29 +111,50 @@ _NOBODY = _Audience()
 
 
 class Hub:
-    """The one subscription connection of an interface in one event loop, and who listens, by topic.
+    """The subscription connections of an interface in one event loop, and who listens, by topic.
 
     Attributes:
         place: The process and the event loop it belongs to.
     """
 
-    def __init__(self, transport: AsyncTransport, ships: Ships) -> None:
-        self._transport = transport
+    def __init__(self, transport: Transport, ships: Ships) -> None:
+        self.transport = transport
         self._ships = ships
-        self._wire: Wire | None = None
+        self._wires: dict[Transport, Wire] = {}
         self._topics: dict[Topic, _Audience] = {}
-        self._subscribed: set[Topic] = set()
+        self._subscribed: dict[Topic, Wire] = {}
+        self._unsure: set[Topic] = set()  # their keys are on their way to another node
         self._lock = asyncio.Lock()
         self._reconnecting: asyncio.Task[Any] | None = None
-        self._beating: asyncio.Task[Any] | None = None
+        self._beating: dict[Wire, asyncio.Task[Any]] = {}
+        self._discovery: Discovery | None = None
         self._closed = False
         self._warned = False
         self.place = os.getpid(), asyncio.get_running_loop()
 
     async def follow(self, listener: Listener) -> None:
         """Subscribe, then let the listener begin; when this returns, no later update is missed."""
-        self._transport.check()
+        self.transport.check()
         await self._ships.ready()
+        if listener.topic.pattern and self.transport.sharded:
+            await self._discover().follow(listener)
+            return
+        deadline = time.monotonic() + self.transport.timeout
+        anew = False
+        while True:
+            try:
+                await self._follow(listener, anew=anew)
+                return
+            except RedisError as error:
+                unapplied = is_unapplied(error) or isinstance(error, NotConnected)
+                if not self.transport.sharded or not unapplied or self._closed:
+                    raise
+                if time.monotonic() > deadline:
+                    raise NotConnected(f"{error}; the cluster is being changed: nothing is followed yet") from error
+            anew = True
+            await self.transport.pause(0.02)
+
+    async def _follow(self, listener: Listener, *, anew: bool) -> None:
         ready = listener.ready = asyncio.get_running_loop().create_future()
         try:
             async with self._lock:
@@ -135,10 +162,11 @@ class Hub:
                     ready.result()
                 # Entered before the server confirms: a notice right behind the confirmation must find somebody.
                 self._topics.setdefault(listener.topic, _Audience()).add(listener)
-                wire = await self._connected()
-                if listener.topic not in self._subscribed:
-                    await _subscribe(wire, [listener.topic])
-                    self._subscribed.add(listener.topic)
+                wire = self._subscribed.get(listener.topic)
+                if wire is None or not wire.alive:
+                    node = await self.transport.owner(listener.topic.name, anew=anew)
+                    others = [topic for topic in self._missing() if await self.transport.owner(topic.name) is node]
+                    wire = await self._subscribe_at(node, others, listener)
                 listener.start(wire, "initial")
             await ready
         except BaseException as error:
@@ -151,30 +179,64 @@ class Hub:
             if ready.done() and not ready.cancelled():
                 ready.exception()  # it was raised, or is overtaken by a cancellation
 
-    async def _connected(self) -> Wire:
-        """Return a live connection, with all topics subscribed and all listeners started anew if it is new."""
+    def _discover(self) -> Discovery:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
-        if self._wire is not None and self._wire.alive:
-            return self._wire
-        wire = await self._transport.listen(self._on_push, self._on_lost)
-        try:
-            topics = [topic for topic, audience in self._topics.items() if audience.present()]
-            await _subscribe(wire, topics)
-        except BaseException:
-            await wire.close()
-            raise
-        self._wire, self._subscribed = wire, set(topics)
-        self._beating = in_background(self._beat(wire), "reem heartbeat")
-        for listener in self._listeners():
-            listener.start(wire, "gap")
+        if self._discovery is None:
+            from .discovery import Discovery
+
+            self._discovery = Discovery(self)
+        return self._discovery
+
+    async def _connected(self, node: Transport) -> Wire:
+        """Return a live connection to `node`."""
+        if self._closed:
+            raise InterfaceClosed("this RedisInterface is closed; make a new one")
+        wire = self._wires.get(node)
+        if wire is None or not wire.alive:
+            wire = self._wires[node] = await cast("AsyncTransport", node).listen(self._on_push, self._on_lost)
+            self._beating[wire] = in_background(self._beat(wire), "reem heartbeat")
         return wire
 
-    def _listeners(self) -> list[Listener]:
-        return [listener for audience in list(self._topics.values()) for listener in audience.present()]
+    async def _subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
+        """Subscribe and wait until the server has confirmed each topic; raise the first refusal."""
+        answers: list[asyncio.Future[None]] = []
+        for topic in topics:
+            answer = asyncio.get_running_loop().create_future()
+            answers.append(answer)
+            # Noted in order with what is pushed: the word that the slot has moved may come right behind.
+            wire.send([(f"{self._prefix(topic)}SUBSCRIBE", topic.name)], partial(self._confirmed, topic, wire, answer))
+        outcomes = await asyncio.gather(*answers, return_exceptions=True)
+        for outcome in outcomes:
+            if outcome is not None:
+                raise outcome
+
+    def _confirmed(
+        self, topic: Topic, wire: Wire, answer: asyncio.Future[None], replies: list[Reply] | Exception
+    ) -> None:
+        refusal = replies if isinstance(replies, Exception) else replies[0]
+        if not isinstance(refusal, Exception):
+            self._subscribed[topic] = wire
+        if answer.done():  # cancelled
+            return
+        if isinstance(refusal, Exception):
+            command = (f"{self._prefix(topic)}SUBSCRIBE", topic.name)
+            answer.set_exception(refusal if self.transport.sharded else blamed(refusal, command))
+        else:
+            answer.set_result(None)
+
+    def _prefix(self, topic: Topic) -> str:
+        """Return what the server's commands for this kind of topic begin with."""
+        return "P" if topic.pattern else "S" if self.transport.sharded else ""
+
+    def _listeners(self, topics: Iterable[Topic] | None = None) -> list[Listener]:
+        wanted = list(self._topics if topics is None else topics)
+        return [listener for topic in wanted for listener in self._topics.get(topic, _NOBODY).present()]
 
     async def unfollow(self, listener: Listener) -> None:
         """Stop following. Idempotent."""
+        if self._discovery is not None and listener.topic.pattern:
+            await self._discovery.unfollow(listener)
         self._drop(listener)
         for mailbox in listener.mailboxes:
             mailbox.close()
@@ -187,14 +249,26 @@ class Hub:
             self._forget_if_empty(listener.topic)
 
     def _forget_if_empty(self, topic: Topic) -> None:
-        if not self._topics.get(topic, _NOBODY).present():
-            self._topics.pop(topic, None)
-            self._subscribed.discard(topic)
-            if self._wire is not None and self._wire.alive:
-                self._wire.send([(f"{topic.prefix}UNSUBSCRIBE", topic.name)], lambda _: None)
+        if self._topics.get(topic, _NOBODY).present():
+            return
+        self._topics.pop(topic, None)
+        self._unsure.discard(topic)
+        wire = self._subscribed.pop(topic, None)
+        if wire is None or not wire.alive:
+            return
+        if self.transport.sharded:
+            wire.leave(topic.name)
+        else:
+            wire.send([(f"{self._prefix(topic)}UNSUBSCRIBE", topic.name)], lambda _: None)
 
     def _on_push(self, message: list[Any]) -> None:
+        if not _is_message(message):
+            self._warn_unreadable(b"?", BadData(f"the server pushed {message!r:.60}"))
+            return
         topic: Any = (message[1], message[0] == b"pmessage")  # equal to a Topic, and cheaper to make
+        if message[0] == b"sunsubscribe":
+            self._moved([Topic(*topic)], "its slot has moved to another node")
+            return
         channel, payload = message[-2:]
         listeners = self._topics.get(topic, _NOBODY).present()
         if not listeners:  # all were dropped without closing
@@ -214,47 +288,94 @@ class Hub:
         """Ask every second for the notes of the last updates: shows a dead connection, and a lost last notice."""
         while True:
             await asyncio.sleep(_HEARTBEAT)
-            if wire is not self._wire or not wire.alive:
+            if not wire.alive:
                 return
-            notes = sorted({listener.note for listener in self._listeners() if listener.note is not None})
-            wire.send([("GET", note) for note in notes] or [("PING",)], partial(self._on_notes, notes))
+            listeners = self._listeners([topic for topic, there in self._subscribed.items() if there is wire])
+            notes = sorted({listener.note for listener in listeners if listener.note is not None})
+            wire.send([("GET", note) for note in notes] or [("PING",)], partial(self._on_notes, wire, notes))
 
-    def _on_notes(self, names: list[str], notes: list[Reply] | Exception) -> None:
+    def _on_notes(self, wire: Wire, names: list[str], notes: list[Reply] | Exception) -> None:
         if isinstance(notes, Exception):
             return
-        found = {name: note for name, note in zip(names, notes, strict=False) if not isinstance(note, Exception)}
-        for listener in self._listeners():
+        found = dict(zip(names, notes, strict=False))
+        for listener in self._listeners([topic for topic, there in self._subscribed.items() if there is wire]):
             if listener.note in found:
-                listener.on_note(found[listener.note])
+                self._on_note(listener, found[listener.note])
+
+    def _on_note(self, listener: Listener, note: Reply) -> None:
+        if is_moved(note):  # this node is only a replica now
+            self._moved([listener.topic], str(note))
+        elif is_unapplied(note):
+            self._unsure.add(listener.topic)
+        elif not isinstance(note, Exception):
+            if listener.topic in self._unsure:  # they are back: what was published meanwhile went elsewhere
+                self._unsure.discard(listener.topic)
+                for each in self._listeners([listener.topic]):
+                    each.doubt()
+            listener.on_note(note)
 
     def _warn_unreadable(self, channel: bytes, error: Exception) -> None:
         if not self._warned:
             self._warned = True
             logger.warning("a message on %r could not be read: %s (said once)", channel, error)
 
+    def _moved(self, topics: list[Topic], reason: str) -> None:
+        """Have what is followed on these topics begin anew where they are now."""
+        for topic in topics:
+            wire = self._subscribed.pop(topic, None)
+            self._unsure.discard(topic)
+            if wire is None:  # we have left it ourselves
+                continue
+            if wire.alive:
+                wire.leave(topic.name)
+            for listener in self._listeners([topic]):
+                listener.lost(NotConnected(f"{topic.name.decode(errors='replace')}: {reason}"))
+            self._repair()
+
     def _on_lost(self, wire: Wire, reason: Exception) -> None:
-        if wire is not self._wire:
-            return
-        self._subscribed.clear()
-        for listener in self._listeners():
+        self._beating.pop(wire, None)
+        topics = [topic for topic, there in self._subscribed.items() if there is wire]
+        for topic in topics:
+            del self._subscribed[topic]
+            self._unsure.discard(topic)
+        for node, there in list(self._wires.items()):
+            if there is wire:
+                del self._wires[node]
+        listeners = self._listeners(topics)
+        for listener in listeners:
             listener.lost(reason)
-        if not self._closed and self._reconnecting is None:
+        if listeners and not self._closed:
             logger.warning("the subscription connection was lost and is made again: %s", reason)
-            self._transport.states.retrying()
+            self.transport.states.retrying()
+        self._repair()
+
+    def _repair(self) -> None:
+        """See to it that all that is followed is subscribed, in the background."""
+        if not self._closed and self._reconnecting is None and self._missing():
             self._reconnecting = in_background(self._reconnect(), "reem reconnect")
+
+    def _missing(self) -> list[Topic]:
+        """Return what is followed and not subscribed."""
+        if self._closed:
+            return []
+        return [
+            topic
+            for topic, audience in self._topics.items()
+            if ((wire := self._subscribed.get(topic)) is None or not wire.alive) and audience.present()
+        ]
 
     async def _reconnect(self) -> None:
         """Connect, subscribe, and have every listener begin anew; tries until it works."""
         pause = 0.05
         try:
-            while self._is_wanted():
+            while self._missing():
                 await asyncio.sleep(pause * random.uniform(0.5, 1.0))  # noqa: S311 - only spreads the load
                 pause = min(pause * 2, _LONGEST_PAUSE)
-                if not self._is_wanted():
+                if not self._missing():
                     return
                 try:
                     async with self._lock:
-                        await self._connected()
+                        await self._resubscribe()
                 except (RedisError, OSError) as error:
                     logger.debug("not connected yet: %s", error)
                 except InterfaceClosed:
@@ -262,26 +383,51 @@ class Hub:
         finally:
             self._reconnecting = None
 
-    def _is_wanted(self) -> bool:
-        """Return whether somebody follows and the connection is gone."""
-        followed = bool(self._listeners()) and not self._closed
-        return followed and (self._wire is None or not self._wire.alive)
+    async def _resubscribe(self) -> None:
+        """Subscribe what is missing, node by node; raise the last failure when all that could be done is done."""
+        missing: dict[Transport, list[Topic]] = {}
+        for place, topic in enumerate(self._missing()):
+            missing.setdefault(await self.transport.owner(topic.name, anew=place == 0), []).append(topic)
+        failure: Exception | None = None
+        for node, topics in missing.items():
+            try:
+                await self._subscribe_at(node, topics)
+            except (RedisError, OSError) as error:
+                failure = error
+        if failure is not None:
+            raise failure
+
+    async def _subscribe_at(self, node: Transport, topics: list[Topic], beginner: Listener | None = None) -> Wire:
+        """Subscribe topics at `node` and have who listens begin anew, but for a beginner."""
+        wire = await self._connected(node)
+        try:
+            await self._subscribe(wire, topics)
+        finally:
+            for topic in topics:
+                if self._subscribed.get(topic) is wire and wire.alive:
+                    for listener in self._listeners([topic]):
+                        if listener is not beginner:
+                            listener.start(wire, "gap")
+        return wire
 
     async def close(self) -> None:
-        """End all listeners and the connection. Idempotent."""
+        """End all listeners and the connections. Idempotent."""
         self._closed = True
-        for task in (self._reconnecting, self._beating):
+        if self._discovery is not None:
+            await self._discovery.close()
+        for task in (self._reconnecting, *self._beating.values()):
             if task is not None:
                 task.cancel()
         for listener in self._listeners():
             await self.unfollow(listener)
-        if self._wire is not None:
-            await self._wire.close()
+        for wire in list(self._wires.values()):
+            await wire.close()
 
 
-async def _subscribe(wire: Wire, topics: Iterable[Topic]) -> None:
-    """Subscribe and wait until the server has confirmed each topic."""
-    commands = [(f"{topic.prefix}SUBSCRIBE", topic.name) for topic in topics]
-    for reply in await wire.roundtrip(commands):
-        if isinstance(reply, Exception):
-            raise reply
+_LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
+
+
+def _is_message(message: list[Any]) -> bool:
+    """Return whether what was pushed is what a hub is told: its kind, the pattern if any, channel, and payload."""
+    length = _LENGTHS.get(message[0]) if message and type(message[0]) is bytes else None
+    return len(message) == length and all(type(part) is bytes for part in message[1:-1])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .connection import RedisInterface
-from .errors import InterfaceClosed
+from .errors import BadType, InterfaceClosed
 from .hub import Hub, Topic
 from .plan.notices import ANNOUNCED, Notice
 from .plan.paths import Path, show
@@ -38,6 +38,7 @@ class Event:
         sequence: Its number among this publisher's updates of the top-level key.
         missed: How many updates of this publisher and key were lost directly before.
         gap: Something was lost before: `missed` are known, or the connection broke, or a message was unreadable.
+        namespace: Where the top-level key is: the interface's namespace, or the one of many that it was found in.
     """
 
     path: Path
@@ -50,6 +51,7 @@ class Event:
     sequence: int
     missed: int = 0
     gap: bool = False
+    namespace: str = ""
 
     @property
     def name(self) -> str:
@@ -73,13 +75,31 @@ class Monitor(Stream[Event]):
         interface: The server.
         patterns: Globs such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
         policy: What to keep for a loop that is slower than the updates; `Every(10_000)` if not given.
+        namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
+            `event.namespace` says which it was: the shortest that fits.
+
+    In a cluster, whose servers know no patterns, the keys are looked for once a second. What is published
+    to a new key before it is found is lost, and the first event after it has `gap`, as the next event of
+    each other key may. A pattern without `*` and `?` needs no search, and nothing is lost.
+
+    Raises:
+        BadKey: Not a pattern.
+        BadType: Not a glob of namespaces.
     """
 
     def __init__(
-        self, interface: RedisInterface, patterns: Sequence[str] = ("*",), policy: Policy | None = None
+        self,
+        interface: RedisInterface,
+        patterns: Sequence[str] = ("*",),
+        policy: Policy | None = None,
+        *,
+        namespaces: str | None = None,
     ) -> None:
         super().__init__(policy or Every(10_000))
         self._session = interface.session
+        if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
+            raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
+        self._namespaces = None if namespaces is None else Pattern(namespaces)
         self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
         self._ears: list[_Ear] = []
         self._hub: Hub | None = None
@@ -99,7 +119,7 @@ class Monitor(Stream[Event]):
         hub = self._hub = self._session.hub
         try:
             for top in dict.fromkeys(pattern.top for pattern in self.patterns):
-                topic = channel_pattern(Pattern(top), self._session.namespace, self._session.options.database)
+                topic = self._topic(Pattern(top))
                 ear = _Ear(self, Topic(topic, pattern=True))
                 self._ears.append(ear)
                 await hub.follow(ear)
@@ -114,21 +134,44 @@ class Monitor(Stream[Event]):
             if self._hub is not None:
                 await self._hub.unfollow(ear)
 
+    def _topic(self, pattern: Pattern) -> bytes:
+        """Return the pattern of the channels of the keys that `pattern` names."""
+        namespace, database = self._session.namespace, self._session.options.database
+        if self._namespaces is None:
+            return channel_pattern(pattern, namespace, database)
+        return channel_pattern(Pattern(self._namespaces.top + pattern.top), "", database)
+
+    def _split(self, channel: bytes) -> tuple[str, str] | None:
+        """Return the namespace and the top-level key that a channel belongs to, None if it is not meant."""
+        if self._namespaces is None:
+            return self._session.namespace, name_of(channel, self._session.namespace)
+        whole = name_of(channel, "")
+        for end in range(len(whole)):
+            if self._namespaces.concerns((whole[:end],)) and any(
+                each.concerns((whole[end:],)) for each in self.patterns
+            ):
+                return whole[:end], whole[end:]
+        return None
+
     def _lost(self) -> None:
         self._gaps = set()
 
     def _heard(self, notice: Notice, channel: bytes) -> None:
-        name = name_of(channel, self._session.namespace)
-        last = self._sequences.get((notice.publisher, name), notice.sequence - 1)
+        place = self._split(channel)
+        if place is None:
+            return
+        namespace, name = place
+        whole = namespace + name
+        last = self._sequences.get((notice.publisher, whole), notice.sequence - 1)
         if notice.sequence == last:  # two of the patterns fit
             return
         if len(self._sequences) >= _MOST_PUBLISHERS:
             self._sequences.clear()
-        self._sequences[notice.publisher, name] = notice.sequence
+        self._sequences[notice.publisher, whole] = notice.sequence
         missed, path = max(notice.sequence - last - 1, 0), (name, *notice.path)
-        gap = missed > 0 or (self._gaps is not None and name not in self._gaps)
+        gap = missed > 0 or (self._gaps is not None and whole not in self._gaps)
         if self._gaps is not None:
-            self._gaps.add(name)
+            self._gaps.add(whole)
         if not any(pattern.concerns(path) for pattern in self.patterns):
             return
         self.mailbox.put(
@@ -143,6 +186,7 @@ class Monitor(Stream[Event]):
                 notice.sequence,
                 missed,
                 gap,
+                namespace,
             )
         )
 

@@ -7,14 +7,13 @@ import os
 import secrets
 from collections.abc import Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-from .errors import BadType, NoJsonSupport, WrongKind
+from .errors import BadType, ClusterReply, NotAllowed, Refused, WrongKind, turned_down
 from .plan import Plan
 from .plan.keys import Keys, keys_of
 from .plan.memory import Memory
 from .plan.paths import check_top_key
-from .plan.replies import no_json
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive
@@ -23,7 +22,6 @@ from .transport.recorder import CommandRecorder
 
 if TYPE_CHECKING:
     from .hub import Hub
-    from .transport.aio import AsyncTransport
 
 __all__ = ["Session"]
 
@@ -77,7 +75,7 @@ class Session:
         if self._hub is None or self._hub.place != place:
             from .hub import Hub
 
-            self._hub = Hub(cast("AsyncTransport", self.transport), self.ships)
+            self._hub = Hub(self.transport, self.ships)
         return self._hub
 
     def keys(self, name: object) -> Keys:
@@ -106,12 +104,10 @@ class Session:
         """Connect and check that the server has RedisJSON."""
         await self.ships.ready()
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
-        if not isinstance(reply, Exception):
-            return
-        if "unknown command" in str(reply).lower():
-            raise NoJsonSupport(f"{self.options.address}: {no_json()}")
-        if "run the" in str(reply):  # not allowed to use JSON; that the one key is out of bounds means nothing
-            raise reply
+        # Not allowed to use JSON is told at once; that this one key is out of bounds means nothing.
+        elsewhere = isinstance(reply, NotAllowed) and "run the" not in str(reply)
+        if isinstance(reply, Refused | ClusterReply) and not elsewhere:
+            raise turned_down(reply).at(self.options.address)
 
     async def release(self) -> None:
         """End all subscriptions and close all connections of this event loop; another one may go on."""

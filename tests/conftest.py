@@ -1,7 +1,8 @@
 """Fixtures and small tools shared by all tests.
 
-The server is `$REEM_TEST_URL` if set, else an `EmbeddedServer`, else a `redis:8` container. It is not
-flushed: every test names its keys through the `key` fixture, and what carries its prefix is unlinked.
+The server is `$REEM_TEST_URL` if set, else an `EmbeddedServer`, else a `redis:8` container; with
+`REEM_TEST_SERVER=cluster` it is an `EmbeddedCluster` of three primaries. It is not flushed: every test
+names its keys through the `key` fixture, and what carries its prefix is unlinked.
 """
 
 from __future__ import annotations
@@ -50,6 +51,12 @@ def server_url():
     if given:
         yield given
         return
+    if os.environ.get("REEM_TEST_SERVER") == "cluster":
+        from reem_async.cluster_server import EmbeddedCluster
+
+        with EmbeddedCluster(replicas=0) as cluster:
+            yield cluster.url
+        return
     from reem_async.errors import ServerMissing
     from reem_async.server import EmbeddedServer
 
@@ -61,9 +68,58 @@ def server_url():
         yield url
 
 
+ONE_SERVER = {
+    "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",
+    "test_all_subscribers_of_an_interface_share_one_connection": "counts connections: in a cluster, one for each node",
+}
+"""Tests of what only one server has, and why."""
+
+
+def pytest_collection_modifyitems(items):
+    """On a cluster, leave out what only one server has."""
+    if os.environ.get("REEM_TEST_SERVER") == "cluster":
+        for item in items:
+            if item.originalname in ONE_SERVER:
+                item.add_marker(pytest.mark.skip(reason=ONE_SERVER[item.originalname]))
+
+
+class RawCluster(redis.RedisCluster):
+    """A plain client of a cluster that answers for all primaries where one server answers for itself."""
+
+    def info(self, section=None):
+        answers = super().info(section, target_nodes=redis.RedisCluster.PRIMARIES)
+        if section != "commandstats":
+            return next(iter(answers.values()))
+        total = {}
+        for rows in answers.values():
+            for label, row in rows.items():
+                sums = total.setdefault(label, {})
+                for name, number in row.items():
+                    sums[name] = sums.get(name, 0) + number
+        return total
+
+    def client_list(self, **options):
+        answers = super().client_list(target_nodes=redis.RedisCluster.PRIMARIES, **options)
+        return [row | {"id": f"{node} {row['id']}"} for node, rows in answers.items() for row in rows]
+
+    def client_kill_filter(self, _id=None, **options):
+        if _id is None:
+            return super().client_kill_filter(target_nodes=redis.RedisCluster.PRIMARIES, **options)
+        node, number = _id.split(" ")
+        return super().client_kill_filter(_id=number, target_nodes=self.get_node(node_name=node), **options)
+
+    def publish(self, channel, message):
+        return self.spublish(channel, message)
+
+
 @pytest.fixture(scope="session")
 def raw(server_url):
     """A plain client, to look behind the scenes."""
+    if server_url.startswith("redis+cluster://"):
+        first = server_url.replace("redis+cluster://", "redis://").split(",")[0]
+        with contextlib.closing(RawCluster.from_url(first, decode_responses=True)) as client:
+            yield client
+        return
     with redis.Redis.from_url(server_url, decode_responses=True) as client:
         yield client
 

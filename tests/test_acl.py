@@ -1,27 +1,22 @@
-"""A user with only the commands REEM needs can do all of it: no scripting, no administration, no KEYS."""
+"""The sample files in deploy/: users with only the rights REEM needs can do all of it, and nothing else."""
 
 from __future__ import annotations
 
 import contextlib
-import urllib.parse
+import re
+import subprocess
 
 import numpy as np
 import pytest
 import redis
-from conftest import FRONTS, aeventually, assert_same, eventually
+import yaml
+from conftest import FRONTS, ROOT, aeventually, assert_same, eventually
+from own_servers import connect, own_server
 
 import reem
 import reem_async
-from reem_async.errors import ServerMissing
-from reem_async.server import EmbeddedServer
-
-COMMANDS = """
-json.set json.get json.del json.type json.numincrby json.nummultby json.arrappend json.arrlen json.objlen
-set get unlink type sadd srem smembers
-multi exec discard watch unwatch
-publish subscribe unsubscribe
-ping hello auth select info client|setinfo
-""".split()  # noqa: SIM905
+from reem_async.catalog import names
+from reem_async.monitor import Monitor
 
 FORBIDDEN = [
     ("EVAL", "return 1", "0"),
@@ -33,23 +28,50 @@ FORBIDDEN = [
     ("CONFIG", "SET", "maxmemory", "1gb"),
     ("ACL", "LIST"),
     ("MODULE", "LIST"),
+    ("CLIENT", "LIST"),
     ("SHUTDOWN",),
 ]
+ALWAYS = {"auth", "hello", "quit", "reset"}
+"""What a server lets everybody do."""
 
 
 @pytest.fixture(scope="module")
-def guarded():
-    """A private server with a user who may do little; yields its address and the administrator's client."""
-    with contextlib.ExitStack() as stack:
-        try:
-            url = stack.enter_context(EmbeddedServer()).url
-        except ServerMissing as missing:
-            pytest.skip(f"needs a server of its own: {missing}")
-        admin = stack.enter_context(redis.Redis.from_url(url, decode_responses=True))
-        rules = ["reset", "on", ">secret", "~reem:*", "~{reem:*", "&reem:*", "&{reem:*", "-@all"]
-        admin.execute_command("ACL", "SETUSER", "robot", *rules, *(f"+{name}" for name in COMMANDS))
-        parts = urllib.parse.urlsplit(url)
-        yield f"redis://robot:secret@{parts.hostname}:{parts.port}", admin
+def secrets(tmp_path_factory):
+    """The folder that deploy/prepare.sh fills."""
+    folder = tmp_path_factory.mktemp("deploy") / "secrets"
+    subprocess.run([ROOT / "deploy/prepare.sh", "-o", folder, "localhost", "127.0.0.1"], check=True, timeout=60)
+    return folder
+
+
+def password(secrets, user):
+    return (secrets / f"{user}.password").read_text()
+
+
+@pytest.fixture(scope="module")
+def server(secrets):
+    """A private server that starts with the prepared ACL file."""
+    with own_server(f"aclfile {secrets / 'users.acl'}", wait=False) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def admin(server, secrets):
+    options = {"unix_socket_path": server.socket_path, "decode_responses": True}
+    with redis.Redis(username="admin", password=password(secrets, "admin"), **options) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def urls(server, secrets):
+    """The addresses by which each user logs in."""
+    users = ("admin", "robot", "watcher")
+    return {user: server.url.replace("//", f"//{user}:{password(secrets, user)}@") for user in users}
+
+
+@pytest.fixture(scope="module")
+def guarded(urls, admin):
+    """The address for robots, and the administrator's client."""
+    return urls["robot"], admin
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +102,7 @@ def test_the_user_may_not_script_nor_administer(guarded):
 def test_the_store_needs_no_more(guarded, name):
     """Every operation of an accessor, in both fronts."""
     url, admin = guarded
-    with contextlib.closing(FRONTS[name](url, namespace="reem:")) as front:
+    with contextlib.closing(FRONTS[name](url, namespace="robot1:")) as front:
         document = {"n": 5, "x": 0.9374604873776271, "l": [1, np.arange(3)], "image": np.arange(6), "b": b"x"}
         front.write(["foo"], document)
         assert_same(front.read(["foo"]), document)
@@ -113,7 +135,7 @@ def test_the_store_needs_no_more(guarded, name):
 def test_editing_needs_no_more(guarded):
     """In the blocking front."""
     url, _ = guarded
-    with reem.RedisInterface(url, namespace="reem:") as interface:
+    with reem.RedisInterface(url, namespace="robot1:") as interface:
         kvs = reem.KeyValueStore(interface)
         kvs["foo"] = {"image": np.zeros(3)}
         with kvs["foo"] as value:
@@ -125,24 +147,24 @@ def test_editing_needs_no_more(guarded):
 def test_a_conflict_and_a_foreign_key_are_told_without_more(guarded):
     """The errors need no further rights either."""
     url, admin = guarded
-    with reem.RedisInterface(url, namespace="reem:") as interface:
+    with reem.RedisInterface(url, namespace="robot1:") as interface:
         kvs = reem.KeyValueStore(interface)
         kvs["foo"] = {"n": 1, "image": np.zeros(3)}
         with pytest.raises(reem.Conflict), kvs["foo"] as value:  # noqa: PT012
             value["n"] = 2
             kvs["foo"]["image"] = np.ones(3)
         del kvs["foo"]
-        admin.lpush("reem:foreign", "x")
+        admin.lpush("robot1:foreign", "x")
         for call in (lambda: kvs["foreign"].read(), lambda: kvs["foreign"].write(np.arange(2))):
             with pytest.raises(reem.WrongKind, match="list"):
                 call()
-        admin.unlink("reem:foreign")
+        admin.unlink("robot1:foreign")
 
 
 def test_subscribing_needs_no_more(guarded):
     """Mirrors, callbacks and loops of the blocking front, small values and large ones."""
     url, _ = guarded
-    with reem.RedisInterface(url, namespace="reem:") as interface:
+    with reem.RedisInterface(url, namespace="robot1:") as interface:
         space = reem.PublishSpace(interface)
         heard = []
         callback = reem.CallbackSubscriber("c", interface, lambda data, updated_path: heard.append(updated_path), {})
@@ -158,7 +180,7 @@ def test_subscribing_needs_no_more(guarded):
 async def test_the_async_front_needs_no_more(guarded):
     """Edit, subscribe and loop."""
     url, _ = guarded
-    async with reem_async.RedisInterface(url, namespace="reem:") as interface:
+    async with reem_async.RedisInterface(url, namespace="robot1:") as interface:
         space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
         await space["c"].write({"n": 1, "image": np.zeros(3)})
         async with kvs["c"].edit() as value:
@@ -169,3 +191,229 @@ async def test_the_async_front_needs_no_more(guarded):
             await aeventually(lambda: mirror["n"].read() == 3)
         assert (await anext(kvs["c"].watch())).data["n"] == 3
         await kvs["c"].delete()
+
+
+async def test_listing_and_monitoring_need_no_more(guarded):
+    """Keys of the namespace, and every update in it."""
+    url, _ = guarded
+    async with reem_async.RedisInterface(url, namespace="robot1:") as interface:
+        space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
+        async with Monitor(interface) as heard:
+            await space["c"].write({"n": 1, "image": np.zeros(3)})
+            assert (await anext(heard)).path == ("c",)
+        assert [name async for name in names(interface)] == ["c"]
+        await kvs["c"].delete()
+
+
+# --- those who only read -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def stored(urls):
+    """Something to read."""
+    with reem.RedisInterface(urls["robot"], namespace="robot1:") as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs["c"] = {"n": 1, "l": [1, 2], "image": np.arange(3), "b": b"x"}
+        yield reem.PublishSpace(interface)
+        del kvs["c"]
+
+
+@pytest.mark.parametrize("name", list(FRONTS))
+def test_a_watcher_reads_everything(urls, stored, name):
+    with contextlib.closing(FRONTS[name](urls["watcher"], namespace="robot1:")) as front:
+        for _ in range(2):
+            assert_same(front.read(["c"]), {"n": 1, "l": [1, 2], "image": np.arange(3), "b": b"x"})
+        assert (front.length(["c", "l"]), front.type(["c", "image"])) == (2, np.ndarray)
+        assert front.read(["c", "l", -1]) == 2
+        with pytest.raises(KeyError):
+            front.read(["absent"])
+
+
+def test_a_watcher_follows_everything(urls, stored):
+    interface = reem.RedisInterface(urls["watcher"], namespace="robot1:")
+    with interface, reem.SilentSubscriber("c", interface) as mirror:
+        stored["c"]["n"] = 2
+        stored["c"]["image"] = np.zeros(100_000)
+        eventually(lambda: mirror["n"].read() == 2 and mirror["image"].read().size == 100_000)
+
+
+async def test_a_watcher_lists_and_monitors(urls, stored):
+    async with reem_async.RedisInterface(urls["watcher"], namespace="robot1:") as interface:
+        assert [name async for name in names(interface)] == ["c"]
+        async with Monitor(interface) as heard:
+            stored["c"]["n"] = 3
+            assert (await anext(heard)).path == ("c", "n")
+
+
+@pytest.mark.parametrize("name", list(FRONTS))
+def test_a_watcher_changes_nothing(urls, stored, admin, name):
+    """Each refusal names the command; nothing is written and nobody is told."""
+    before = {key: admin.dump(key) for key in admin.scan_iter() if not key.endswith(":last")}
+    for space in ("KeyValueStore", "PublishSpace"):
+        with contextlib.closing(FRONTS[name](urls["watcher"], space, namespace="robot1:")) as front:
+            for call in (
+                lambda front=front: front.write(["c", "n"], 2),
+                lambda front=front: front.write(["c"], np.zeros(3)),
+                lambda front=front: front.increment(["c", "n"], 1),
+                lambda front=front: front.append(["c", "l"], 1),
+                lambda front=front: front.delete(["c"]),
+            ):
+                with pytest.raises(reem.NotAllowed, match=r"deploy/users\.acl"):
+                    call()
+    assert {key: admin.dump(key) for key in admin.scan_iter() if not key.endswith(":last")} == before
+    admin.execute_command("ACL", "LOG", "RESET")
+
+
+# --- everything else is refused ----------------------------------------------------------------------------
+
+
+def every_command(admin):
+    """All commands of the server and their subcommands, with as many words as they need at least."""
+    for name, about in admin.command().items():
+        below = about.get("subcommands") or []
+        if not below:
+            yield name, [name, *["robot1:x"] * (abs(about["arity"]) - 1)]
+        for each in below:
+            full, arity = each[0], each[1]
+            full = full.decode() if isinstance(full, bytes) else full
+            yield full, [*full.split("|"), *["robot1:x"] * (abs(arity) - 2)]
+
+
+@pytest.mark.parametrize("user", ["robot", "watcher"])
+def test_no_other_command_is_allowed(admin, user):
+    """Asked of the server itself, command by command."""
+    (line,) = re.findall(rf"^user {user} .*$", (ROOT / "deploy/users.acl").read_text(), re.M)
+    granted = set(re.findall(r" \+(\S+)", line))
+    allowed = set()
+    tried = 0
+    for name, words in every_command(admin):
+        tried += 1
+        answer = str(admin.execute_command("ACL", "DRYRUN", user, *words))
+        if "has no permissions to run" not in answer:
+            allowed.add(name)
+    assert tried > 300
+    assert allowed - ALWAYS == granted - ALWAYS
+
+
+@pytest.mark.parametrize("user", ["robot", "watcher"])
+def test_no_other_key_or_channel_is_allowed(urls, admin, user):
+    """Those of another namespace, of none, and of one that begins alike."""
+    with admin.pipeline(transaction=False) as pipe:
+        for name in ("foo", "robot2:foo", "robot11:foo", "xrobot1:foo", "{robot2:foo}.image"):
+            pipe.set(name, "1")
+        pipe.execute()
+    with redis.Redis.from_url(urls[user], decode_responses=True) as client:
+        for name in ("foo", "robot2:foo", "robot11:foo", "xrobot1:foo", "{robot2:foo}.image", "{xrobot1:foo}"):
+            with pytest.raises(redis.exceptions.NoPermissionError):
+                client.get(name)
+        for channel in ("{robot2:foo}:notices", "robot1:foo", "{robot1:foo}:other", "__redis__:invalidate"):
+            with pytest.raises(redis.exceptions.NoPermissionError):
+                client.execute_command("SUBSCRIBE", channel)
+            with pytest.raises(redis.exceptions.NoPermissionError):
+                client.publish(channel, "x")
+    for namespace in ("", "robot2:"):
+        with reem.RedisInterface(urls[user], namespace=namespace) as interface:
+            with pytest.raises(reem.NotAllowed, match="foo"):
+                reem.KeyValueStore(interface)["foo"].read()
+            with pytest.raises(reem.NotAllowed, match="foo"):
+                reem.SilentSubscriber("foo", interface).listen()
+    admin.flushall()
+    admin.execute_command("ACL", "LOG", "RESET")
+
+
+def test_nobody_gets_in_without_a_password(server, secrets, admin):
+    """Not by default, and not by the sample as it is: it has no passwords at all."""
+    others = {"username": "robot", "password": password(secrets, "watcher")}
+    for options in ({}, {"username": "robot"}, {"password": "x"}, others):
+        with pytest.raises(reem.LoginRefused):
+            connect("blocking", server.url, **options)
+    with own_server(f"aclfile {ROOT / 'deploy/users.acl'}", wait=False) as untouched:
+        for options in ({}, *({"username": user, "password": ""} for user in ("default", "admin", "robot", "watcher"))):
+            with pytest.raises(reem.LoginRefused):
+                connect("blocking", untouched.url, **options)
+    assert (secrets.stat().st_mode & 0o777, (secrets / "ca.key").stat().st_mode & 0o777) == (0o700, 0o600)
+    admin.execute_command("ACL", "LOG", "RESET")
+
+
+def test_preparing_twice_or_wrongly_changes_nothing(secrets):
+    """The files of a running robot are not replaced by accident."""
+    before = {file.name: file.read_bytes() for file in secrets.iterdir()}
+    for words in (["-o", secrets, "localhost"], ["-o", secrets], ["-n", "a b", "-o", secrets / "new", "localhost"]):
+        done = subprocess.run([ROOT / "deploy/prepare.sh", *words], capture_output=True, check=False, timeout=60)
+        assert done.returncode != 0
+        assert done.stderr
+    assert {file.name: file.read_bytes() for file in secrets.iterdir()} == before
+
+
+@pytest.mark.parametrize("namespace", ["", "arm_2."])
+def test_another_namespace(tmp_path, namespace):
+    """-n restricts to it; the empty one opens the server."""
+    folder = tmp_path / "s"
+    subprocess.run([ROOT / "deploy/prepare.sh", "-n", namespace, "-o", folder, "localhost"], check=True, timeout=60)
+    with own_server(f"aclfile {folder / 'users.acl'}", wait=False) as process:
+        options = {"username": "robot", "password": password(folder, "robot")}
+        with reem.RedisInterface(process.url, namespace=namespace, **options) as interface:
+            with reem.SilentSubscriber("foo", interface) as mirror:
+                reem.PublishSpace(interface)["foo"] = np.arange(3)
+                eventually(lambda: mirror.value() is not None)
+            assert reem.KeyValueStore(interface)["foo"].read().tolist() == [0, 1, 2]
+        with reem.RedisInterface(process.url, namespace="other:", **options) as interface:
+            if namespace:
+                with pytest.raises(reem.NotAllowed):
+                    reem.KeyValueStore(interface)["foo"].read()
+
+
+# --- the files around it ---------------------------------------------------------------------------------------
+
+
+def test_a_server_takes_the_sample_configuration(secrets):
+    """As it is, but for the folder and, where the server was built without TLS, the lines on that."""
+    text = (ROOT / "deploy/secured.conf").read_text().replace("/etc/reem", str(secrets))
+    plain = [line for line in text.splitlines() if line and not line.startswith(("#", "tls-", "port ", "bind "))]
+    with own_server(*plain, wait=False) as process:
+        login = {"username": "admin", "password": password(secrets, "admin")}
+        with redis.Redis(unix_socket_path=process.socket_path, decode_responses=True, **login) as client:
+            assert client.config_get("maxmemory-policy")["maxmemory-policy"] == "noeviction"
+            assert client.config_get("maxmemory")["maxmemory"] == str(1 << 30)
+            assert "pubsub 33554432 8388608 60" in client.config_get("client-output-buffer-limit").popitem()[1]
+        options = {"username": "robot", "password": password(secrets, "robot")}
+        with reem.RedisInterface(process.url, namespace="robot1:", **options) as interface:
+            reem.KeyValueStore(interface)["foo"] = np.arange(3)
+
+
+def test_compose_starts_the_server_with_these_files():
+    """What it mounts is there or made by prepare.sh; only loopback unless somebody says otherwise."""
+    composed = yaml.safe_load((ROOT / "compose.yaml").read_text())
+    service = composed["services"]["secured"]
+    assert service["profiles"] == ["secured"]
+    assert service["command"] == ["redis-server", "/etc/reem/secured.conf"]
+    assert service["ports"] == ["${REEM_BIND:-127.0.0.1}:${REEM_PORT:-6379}:6379"]
+    mounted = dict(volume.split(":")[:2] for volume in service["volumes"])
+    assert mounted.pop("secured") == "/data"
+    assert "secured" in composed["volumes"]
+    wanted = set(re.findall(r"/etc/reem/\S+", (ROOT / "deploy/secured.conf").read_text().partition("port 0")[2]))
+    assert set(mounted.values()) == wanted | {"/etc/reem/secured.conf"}
+    for source in mounted:
+        assert (ROOT / source).is_file() or source.startswith("./deploy/secrets/")
+    check = " ".join(service["healthcheck"]["test"])
+    assert set(re.findall(r"/etc/reem/\S+", check)) <= wanted
+
+
+def test_everything_security_md_says_to_type_works(secrets, server, admin, urls):
+    """Its lines for the administrator, and its program, with the files of this test in place of the robot's."""
+    text = (ROOT / "SECURITY.md").read_text()
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.S)
+    program = program.replace("deploy/secrets", str(secrets)).replace("rediss://robot.local:6379", server.url)
+    program = re.sub(r"\n *ssl_\w+=.*", "", program)  # TLS itself: tests/test_secured.py
+    exec(compile(program, "SECURITY.md", "exec"), {})
+    shell = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.S))
+    for command in re.findall(r"^redis-cli \$R (.+)$", shell, re.M):
+        words = [word.strip('"') for word in command.replace("$NEW", "0123456789").split()]
+        assert not isinstance(admin.execute_command(*words), Exception), command
+    assert len(re.findall(r"^redis-cli", shell, re.M)) >= 3
+    for script, options in re.findall(r"^(deploy/\S+)(.*)$", shell, re.M):
+        assert (ROOT / script).stat().st_mode & 0o100
+        assert re.fullmatch(r"( -n \S+)?( \S+)+", options), options
+    for command in re.findall(r"^openssl .*$", shell, re.M):
+        subprocess.run(command.replace("deploy/secrets", str(secrets)), shell=True, check=True, timeout=20)
+    admin.execute_command("ACL", "LOG", "RESET")

@@ -10,7 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-__all__ = ["Command", "Plan", "Reply", "unwrap", "wire_commands"]
+from ..errors import BadData, ClusterReply, Refused, turned_down
+
+__all__ = ["Command", "Plan", "Reply", "blamed", "unwrap", "wire_commands"]
 
 Command = tuple[Any, ...]
 """One server command: its words as str, bytes, int, float or a flat buffer."""
@@ -51,12 +53,25 @@ def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
 
     Raises:
         redis.exceptions.RedisError: The server refused the whole transaction; nothing was applied.
+        BadData: What came back is not the outcome of a transaction.
     """
     if not plan.atomic:
         return replies
     outcome = replies[-1]
     if isinstance(outcome, Exception):
         # EXECABORT only says that something was wrong; the reason was the reply to one of the commands.
-        raise next((reply for reply in replies if isinstance(reply, Exception)), outcome)
-    results: list[Reply] | None = outcome
-    return results
+        pairs = zip(replies, wire_commands(plan), strict=True)
+        raise next((blamed(reply, command) for reply, command in pairs if isinstance(reply, Exception)), outcome)
+    if outcome is None and plan.held:
+        return None
+    if type(outcome) is not list or len(outcome) != len(plan.commands):
+        raise BadData(f"the server answered a transaction of {len(plan.commands)} commands with {outcome!r:.60}")
+    return outcome
+
+
+def blamed(error: Exception, command: Command) -> Exception:
+    """Return `error` headed by the command that met it, if the server turned it down without naming a key."""
+    if not isinstance(error, Refused | ClusterReply):
+        return error
+    words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in command[:2]]
+    return turned_down(error).at(f"{' '.join(words):.120}")

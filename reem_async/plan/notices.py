@@ -26,6 +26,10 @@ VERSION = 1
 LARGEST_INLINE = 1 << 14
 """Bytes of value up to which it travels in the notice."""
 
+_DEEPEST = 128
+_LONGEST_PATH = 2048
+"""Characters; paths are kept for speed, and a stranger may publish any number of them."""
+
 ANNOUNCED = object()
 """In place of a value that is to be fetched."""
 
@@ -112,7 +116,9 @@ def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, ki
         and type(sequence) is int
         and type(time) in (int, float)
         and type(path) is list
+        and len(path) <= _DEEPEST
         and all(type(key) in (str, int) for key in path)
+        and sum([len(key) for key in path if type(key) is str]) <= _LONGEST_PATH
         and kind in ("set", "look", "delete")
         and type(size) is int
         and size >= 0

@@ -113,14 +113,13 @@ def _step(key: str | int) -> str:
     return f".{key}" if _PLAIN.fullmatch(key) else f"[{orjson.dumps(key).decode()}]"
 
 
-@lru_cache(maxsize=4096)
 def parse_suffix(text: str) -> Path:
     """Return the path that `suffix` turned into `text`; what follows a `~` only makes a name unique.
 
     Raises:
         BadKey: Not the text form of a path.
     """
-    return _split(text, _TOKEN)
+    return _parse_short(text) if len(text) <= _SHORT else _split(text, _TOKEN)
 
 
 def _split(text: str, tokens: re.Pattern[str]) -> Path:
@@ -132,6 +131,11 @@ def _split(text: str, tokens: re.Pattern[str]) -> Path:
         path.append(_element(token))
         position = token.end()
     return tuple(path)
+
+
+# Long texts are not kept: a stranger may have put any number of them on the server.
+_parse_short = lru_cache(maxsize=4096)(lambda text: _split(text, _TOKEN))
+_SHORT = 512
 
 
 def _element(token: re.Match[str]) -> str | int:

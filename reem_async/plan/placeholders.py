@@ -14,12 +14,13 @@ user's string that begins with the mark, `float` for a float no decimal text of 
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
 
 from ..errors import BadData
-from .paths import shorten, suffix
+from .paths import Path, shorten, suffix
 
 __all__ = ["INLINE_LABELS", "MARK", "Crate", "Placeholder", "find", "inline_float", "inline_text", "parse"]  # fmt: skip
 
@@ -75,13 +76,16 @@ def inline_float(value: float) -> str:
     return f"{MARK}float {value.hex()}"
 
 
-@lru_cache(maxsize=4096)
 def parse(text: str) -> Placeholder | str | float:
     """Return what the string `text`, which begins with the mark, stands for.
 
     Raises:
         BadData: Not what REEM writes.
     """
+    return _parse_short(text) if len(text) <= _SHORT else _parse(text)
+
+
+def _parse(text: str) -> Placeholder | str | float:
     label, _, rest = text[len(MARK) :].partition(" ")
     if label == "text":
         return rest
@@ -93,11 +97,19 @@ def parse(text: str) -> Placeholder | str | float:
     return Placeholder(unquote(label), unquote(words[0]), int(words[1]), words[2] if len(words) > 2 else "")
 
 
+# Long texts, of which a stranger may put any number there, are not kept.
+_parse_short = lru_cache(maxsize=4096)(_parse)
+_SHORT = 256
+
+
 def _parse_float(text: str) -> float:
     try:
-        return float.fromhex(text)
+        number = float.fromhex(text)
     except (ValueError, OverflowError):
-        raise BadData(f"the server holds the float {shorten(text)}, which is not hexadecimal") from None
+        number = math.nan
+    if not math.isfinite(number):
+        raise BadData(f"the server holds the float {shorten(text)}, which is not hexadecimal and finite")
+    return number
 
 
 def find(holder: list[Any], name: str) -> list[Crate]:
@@ -107,7 +119,8 @@ def find(holder: list[Any], name: str) -> list[Crate]:
     every node, so callers look for the mark in the text first.
 
     Raises:
-        BadData: A string has the mark but is no placeholder; says where, below the top-level key `name`.
+        BadData: A string has the mark but is no placeholder, or two stand for the same key: a document of a
+            few bytes could demand any number of copies. Says where, below the top-level key `name`.
     """
     crates: list[Crate] = []
     stack: list[Any] = [holder]
@@ -126,16 +139,18 @@ def find(holder: list[Any], name: str) -> list[Crate]:
                     crates.append(Crate(meaning, container, key))
                 else:
                     container[key] = meaning
+    if len(crates) > 1 and len({crate.placeholder.suffix for crate in crates}) < len(crates):
+        raise BadData(f"{name}: several placeholders name the same key, which REEM does not write; write it anew")
     return crates
 
 
 def _place(tree: Any, text: str) -> str:
-    """Return where in `tree` the string `text` is, as people write paths."""
-    pairs = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
-    for key, value in pairs:
-        if value == text:
-            return suffix((key,))
-        found = _place(value, text)
-        if found:
-            return suffix((key,)) + found
+    """Return where in `tree` the string `text` is, as people write paths; it may be nested deeper than calls may."""
+    stack: list[tuple[Path, Any]] = [((), tree)]
+    while stack:
+        path, node = stack.pop()
+        if isinstance(node, str) and node == text:
+            return suffix(path)
+        pairs = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+        stack.extend(((*path, key), child) for key, child in pairs)
     return ""

@@ -2,17 +2,96 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import orjson
 
-from ..errors import BadData, MissingKey, NoJsonSupport, PathRefused, WrongKind
-from . import Plan, Reply
+from ..errors import (
+    BadData,
+    ClusterReply,
+    LoginRefused,
+    MissingKey,
+    NoJsonSupport,
+    NotAllowed,
+    PathRefused,
+    RedisError,
+    ReemError,
+    Refused,
+    ServerFull,
+    ServerNotReady,
+    ServerReadOnly,
+    WrongKind,
+    turned_down,
+)
+from . import Plan, Reply, unwrap
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
 
-__all__ = ["checked", "diagnose", "explained", "full", "loads", "missing", "no_json", "type_name"]
+__all__ = [
+    "checked", "decoded", "diagnose", "explained", "full", "loads", "missing", "no_json", "refusal",
+    "registered", "type_name",
+]  # fmt: skip
+
+_REFUSALS: dict[str, tuple[type[Refused], str]] = {
+    "NOAUTH": (LoginRefused, "the server needs a password: RedisInterface(..., username=..., password=...)"),
+    "WRONGPASS": (LoginRefused, "the server does not take this user name and password; nothing was tried again"),
+    "NOPERM": (
+        NotAllowed,
+        "the user may not do this; deploy/users.acl lists the rights REEM needs, `ACL LOG` shows what was refused",
+    ),
+    "OOM": (
+        ServerFull,
+        "the server's memory is full (maxmemory), nothing was written; delete something, or raise maxmemory",
+    ),
+    "READONLY": (ServerReadOnly, "the server is a read-only replica, nothing was written; connect to its primary"),
+    "MISCONF": (
+        ServerReadOnly,
+        "the server cannot save to its disk and takes no writes, nothing was written; its log says why (disk full?)",
+    ),
+    "NOREPLICAS": (
+        ServerReadOnly,
+        "too few replicas follow the server (min-replicas-to-write), nothing was written; start them",
+    ),
+    "LOADING": (
+        ServerNotReady,
+        "the server is still loading its data from disk, nothing was applied; call again in a moment",
+    ),
+    "MASTERDOWN": (
+        ServerNotReady,
+        "the server is a replica that has lost its primary, nothing was applied; connect to the primary",
+    ),
+    "BUSY": (ServerNotReady, "the server is busy with somebody's script, nothing was applied; call again"),
+}
+_NO_JSON = re.compile(r"ERR unknown command [`'\"]?JSON\.", re.IGNORECASE)
+_LONGEST_QUOTE = 120
+
+
+def refusal(text: str) -> Refused | None:
+    """Return the error to raise for an error reply that is about the server, None for one about the command."""
+    if _NO_JSON.match(text):
+        return NoJsonSupport(no_json())
+    kind, remedy = _REFUSALS.get(text.partition(" ")[0], (None, ""))
+    return kind(f"{remedy} (it says: {text[:_LONGEST_QUOTE]})") if kind is not None else None
+
+
+def decoded(plan: Plan, replies: list[Reply]) -> Any:
+    """Return what `plan` makes of its replies: the result, or the next plan.
+
+    Raises:
+        BadData: The replies are of a shape that no server sends to these commands.
+    """
+    try:
+        return plan.decode(unwrap(plan, replies))
+    except (ReemError, RedisError):
+        raise
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        commands = ", ".join(str(command[0]) for command in plan.commands)
+        raise BadData(
+            f"the server's replies to {commands:.80} are not what a server with RedisJSON sends ({error!r:.120}); "
+            "is the address that of a Redis server?"
+        ) from error
 
 
 def full(keys: Keys, path: Path) -> Path:
@@ -46,10 +125,10 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
     """Return the error to raise for an error reply: one that says what to do, or the server's own."""
     text = str(error)
     where = show(full(keys, path))
+    if isinstance(error, Refused | ClusterReply):
+        return turned_down(error).at(where)
     if "wrong Redis type" in text or text.startswith("WRONGTYPE"):
         return WrongKind(keys.document, where)
-    if "unknown command" in text.lower() and "JSON." in text:
-        return NoJsonSupport(no_json())
     if "that doesn't exist" in text:
         return missing(keys, path)
     if "created at the root" in text:
@@ -57,6 +136,14 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
     if "index out of range" in text:
         return PathRefused(f"{where}: the list index is out of range; use append() to make a list longer")
     return error
+
+
+def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
+    """Return what the registry of ships' keys holds, from a reply to SMEMBERS; raises BadData if it is none."""
+    members = checked(reply, keys, ())
+    if not isinstance(members, list | set) or not all(type(member) is bytes for member in members):
+        raise BadData(f"{keys.name}: the server sent {members!r:.60} where the members of {keys.registry} were due")
+    return frozenset(members)
 
 
 def no_json() -> str:

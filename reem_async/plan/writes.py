@@ -12,14 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadType, Conflict, MissingKey, PartialWrite, WrongKind
+from ..errors import BadKey, BadType, Conflict, MissingKey, PartialWrite, WrongKind
 from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
 from .paths import Path, below, may_hold, parse_suffix, show, to_jsonpath
 from .placeholders import find
 from .reads import get_command
-from .replies import checked, diagnose, explained, full, loads
+from .replies import checked, diagnose, explained, full, loads, registered
 
 __all__ = [
     "Change",
@@ -150,7 +150,15 @@ def _stale(it: Change, memory: Memory) -> list[bytes]:
         return []
     written = {each.suffix.encode() for each in it.loaded}
     known = memory.members(it.keys.document)
-    return [member for member in known if member not in written and below(parse_suffix(member.decode()), it.path)]
+    return [member for member in known if member not in written and below(_place(member), it.path)]
+
+
+def _place(member: bytes) -> Path:
+    """Return where a member of the registry belongs; what REEM did not enter there belongs to no place."""
+    try:
+        return parse_suffix(member.decode())
+    except (BadKey, UnicodeDecodeError):
+        return ("\0",)
 
 
 def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
@@ -191,7 +199,7 @@ class _Outcome:
         if not self.it.looks:
             return frozenset()
         place = self.main + (2 if self.it.loaded else 1)
-        members = frozenset(checked(self.replies[place], self.it.keys, self.it.path))
+        members = registered(self.replies[place], self.it.keys)
         self.memory.saw_members(self.it.keys.document, members)
         return members
 
@@ -230,7 +238,7 @@ class _Outcome:
         if judged is REFUSED or isinstance(judged, Exception):
             return bool(written)
         return self.it.replaces and any(
-            member not in written and may_hold(self.it.path, parse_suffix(member.decode())) for member in members
+            member not in written and may_hold(self.it.path, _place(member)) for member in members
         )
 
     def _finish(self, judged: Any) -> Any:
@@ -265,7 +273,7 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
             if not isinstance(explained(text, keys, ()), WrongKind):  # nobody knows what the document refers to
                 return Plan([("UNWATCH",)], lambda _: then(), held=True)
             text = None  # a foreign type refers to nothing
-        members = frozenset(checked(replies[2], keys, ()))
+        members = registered(replies[2], keys)
         used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys), keys.name)} if text else set()
         orphans = sorted(members - used)
         memory.saw_members(keys.document, members)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ast
 import math
 import re
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -31,6 +32,14 @@ _MOST_DIMENSIONS = 64
 _LARGEST_ITEM = 1 << 20
 _LARGEST_HEADER = 1 << 16
 _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
+# All that a header is made of: strings, short integers, two words, brackets. No names, operators or f-strings
+# reach Python's parser, which may need very long over them.
+_HEADER = re.compile(
+    r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*"|\d{1,15}(?![\w'"])|True|False|[\[\](){},:]|[ ]|\n)++"""
+)
+_QUOTED = re.compile(r"""'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\"""")
+_DEEPEST = 64
+_SHORT = 1 << 9
 
 
 class NumpyShip(BlobShip):
@@ -70,7 +79,7 @@ class NumpyShip(BlobShip):
             raise BadData("the array's bytes are gone from the server (evicted, or removed by a program without REEM)")
         view = memoryview(blob)
         size = _header_size(view)
-        dtype, shape = _parse_header(bytes(view[:size]))
+        dtype, shape = _header_parser(size)(bytes(view[:size]))
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
         try:
@@ -154,17 +163,39 @@ def _header_size(view: memoryview) -> int:
     return size
 
 
-@lru_cache(maxsize=1024)
 def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
     """Return dtype and shape from the header of an .npy file, checked; raises BadData."""
     try:
         text = header[10 if header[6] == 1 else 12 :].decode("utf-8" if header[6] == 3 else "latin-1")
+        if not _HEADER.fullmatch(text) or _depth(text) > _DEEPEST:
+            raise ValueError(text)
         fields = ast.literal_eval(text)
         if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
             raise ValueError(fields)
         return _dtype(fields["descr"]), _check_shape(fields["shape"])
     except (SyntaxError, TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
         raise BadData(f"an array has the header {header[10:100]!r}, which is not that of plain data") from None
+
+
+# A structured dtype may take 60 KB to describe: few of these are kept, or a stranger could fill the memory.
+_parse_short, _parse_long = lru_cache(maxsize=1024)(_parse_header), lru_cache(maxsize=16)(_parse_header)
+
+
+def _header_parser(size: int) -> Callable[[bytes], tuple[np.dtype[Any], tuple[int, ...]]]:
+    """Return what parses a header of `size` bytes and remembers the outcome."""
+    return _parse_short if size <= _SHORT else _parse_long
+
+
+def _depth(text: str) -> int:
+    """Return how deep brackets are nested, text in quotes left aside."""
+    depth = deepest = 0
+    for character in _QUOTED.sub("", text):
+        if character in "([{":
+            depth += 1
+            deepest = max(deepest, depth)
+        elif character in ")]}":
+            depth -= 1
+    return deepest
 
 
 def _dtype(descr: Any) -> np.dtype[Any]:

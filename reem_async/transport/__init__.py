@@ -10,7 +10,8 @@ from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from ..plan import Command, Plan, Reply, unwrap, wire_commands
+from ..plan import Command, Plan, Reply, wire_commands
+from ..plan.replies import decoded
 from ..state import States
 
 __all__ = ["Held", "Transport", "drive"]
@@ -39,6 +40,11 @@ class Transport(Held, Protocol):
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
+        ...
+
+    @property
+    def timeout(self) -> float:
+        """Seconds without a byte moving after which a call made now is given up."""
         ...
 
     async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
@@ -85,7 +91,7 @@ async def drive(transport: Transport, plan: Plan) -> Any:
                 outcome = await _drive_held(held, plan)
         else:
             replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
-            outcome = plan.decode(unwrap(plan, replies))
+            outcome = decoded(plan, replies)
         if type(outcome) is not Plan:
             return outcome
         plan = outcome
@@ -95,5 +101,5 @@ async def _drive_held(held: Held, plan: Plan) -> Any:
     outcome: Any = plan
     while type(outcome) is Plan and outcome.held:
         replies = await held.roundtrip(wire_commands(outcome))
-        outcome = outcome.decode(unwrap(outcome, replies))
+        outcome = decoded(outcome, replies)
     return outcome

@@ -17,6 +17,7 @@ from ..state import States
 from .identity import WHO, who
 from .options import Options
 from .packing import size_of_largest
+from .patience import patience
 from .wire import Wire, open_wire
 
 __all__ = ["AsyncTransport"]
@@ -138,6 +139,11 @@ class AsyncTransport:
             self._spare.append(wire)
         else:
             await wire.close()
+
+    @property
+    def timeout(self) -> float:
+        """Seconds without a byte moving after which a call made now is given up."""
+        return patience(self._options.timeout)
 
     async def owner(self, key: bytes, *, anew: bool = False) -> AsyncTransport:
         """Return this: there is one server."""

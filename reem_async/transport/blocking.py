@@ -15,9 +15,8 @@ import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import partial
 from typing import Any
-
-import redis.exceptions
 
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
@@ -25,11 +24,13 @@ from ..state import States
 from .identity import WHO, who
 from .options import Options
 from .packing import Piece, pack
-from .parsing import MORE, LargeReader, Reader, SmallReader
+from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import patience, unsent
 
 __all__ = ["BlockingTransport"]
 
+_RECORD = 1 << 14
+"""Bytes in one record of TLS, at most."""
 _LOOKS = 20
 """How many times per time limit to look whether a large value is moving."""
 
@@ -42,11 +43,15 @@ class _Line:
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
-        except (redis.exceptions.RedisError, OSError) as error:
+        except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
+            self._connection.disconnect()
             raise options.refused(error) from error
         self._socket: socket.socket = self._connection._sock
+        self._tls = hasattr(self._socket, "context")
         self._timeout = options.timeout
         self._limit = 0.0
+        self._moved = 0.0  # when a byte of a large value, or of the reply to it, was last seen to move
+        self._left = 0  # how many of its bytes were on their way up when last looked at
         self._set_limit(self._timeout)
         self._poll = select.poll() if hasattr(select, "poll") else None
         if self._poll is not None:
@@ -59,7 +64,7 @@ class _Line:
     def _set_limit(self, limit: float) -> None:
         """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
         self._limit = limit
-        if hasattr(self._socket, "context"):  # TLS: its reads need Python's timeout
+        if self._tls:  # its reads need Python's timeout
             self._socket.settimeout(limit)
             return
         self._socket.settimeout(None)
@@ -74,19 +79,21 @@ class _Line:
 
     def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies."""
+        pieces = pack(commands)
         self.broken = True  # until all is read: a Ctrl-C anywhere must not leave a reply for the next caller
         limit = patience(self._timeout)
         if limit != self._limit:
             self._set_limit(limit)
         try:
-            pieces = pack(commands)
+            receive = self._socket.recv_into
             if len(pieces) == 1:
                 self._socket.sendall(pieces[0])
             else:
                 self._send_large(pieces, limit)
+                receive = partial(self._receive_patiently, limit)
             if bulk and self._large is None:
                 self._large = LargeReader()
-            replies = self._replies((bulk and self._large) or self._small, len(commands))
+            replies = self._replies((bulk and self._large) or self._small, len(commands), receive)
             self.broken = False
             return replies
         except (BlockingIOError, TimeoutError):
@@ -97,20 +104,20 @@ class _Line:
             raise self.lost(
                 f"the connection broke before the reply came ({error}); the call was applied once or not at all"
             ) from error
-        except redis.exceptions.InvalidResponse as error:
-            raise self.lost(f"the server sent something that is not its protocol: {error}") from error
+        except NOT_THE_PROTOCOL as error:
+            raise self.lost(f"the server sent something that is not its protocol: {error!s:.200}") from error
         except BaseException:  # Ctrl-C: the reply is still on its way and must not meet the next caller
             self.close()
             raise
 
-    def _replies(self, reader: Reader, count: int) -> list[Reply]:
+    def _replies(self, reader: Reader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
         """Read `count` replies. Nothing is left over: nothing else was asked."""
         replies: list[Reply] = []
         gets = reader.gets
         while True:
             reply = gets()
             if reply is MORE:
-                received = self._socket.recv_into(reader.target())
+                received = receive(reader.target())
                 if not received:
                     raise ConnectionResetError("closed by the server")
                 reader.received(received)
@@ -120,32 +127,36 @@ class _Line:
                 return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
-        """Send large values and wait for the first byte of the reply; bytes that move begin the limit anew."""
-        self._set_limit(limit / _LOOKS)
-        moved = time.monotonic()
-        try:
-            for piece in pieces:
-                view, sent = memoryview(piece), 0
-                while sent < len(view):
-                    try:
-                        sent += self._socket.send(view[sent:])
-                        moved = time.monotonic()
-                    except (BlockingIOError, TimeoutError):
-                        _check_moved(moved, limit)
-            self._await_reply(moved, limit)
-        finally:
-            self._set_limit(limit)
+        """Send large values; bytes that move begin the limit anew."""
+        self._set_limit(limit / _LOOKS)  # until the next call
+        self._moved, self._left = time.monotonic(), 0
+        for piece in pieces:
+            view, sent = memoryview(piece), 0
+            step = _RECORD if self._tls else len(view)  # over TLS, nothing is said of a part that was sent
+            while sent < len(view):
+                try:
+                    sent += self._socket.send(view[sent : sent + step])
+                    self._moved = time.monotonic()
+                except (BlockingIOError, TimeoutError):
+                    self._check_moved(limit)
 
-    def _await_reply(self, moved: float, limit: float) -> None:
-        """Wait until something can be received, as long as what was sent goes on arriving."""
-        if self._poll is None:
-            return
-        left = unsent(self._socket)
-        while not self._poll.poll(limit / _LOOKS * 1000):
-            before, left = left, unsent(self._socket)
-            if left < before:
-                moved = time.monotonic()
-            _check_moved(moved, limit)
+    def _receive_patiently(self, limit: float, target: memoryview) -> int:
+        """Receive after a large value was sent: it may go on arriving long after the first replies are here."""
+        while True:
+            try:
+                received = self._socket.recv_into(target)
+                self._moved = time.monotonic()
+                return received
+            except (BlockingIOError, TimeoutError):
+                self._check_moved(limit)
+
+    def _check_moved(self, limit: float) -> None:
+        """Raise TimeoutError if nothing has moved for the whole limit, neither here nor on its way up."""
+        before, self._left = self._left, unsent(self._socket)
+        if self._left < before:
+            self._moved = time.monotonic()
+        if time.monotonic() - self._moved >= limit:
+            raise TimeoutError
 
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
@@ -170,11 +181,6 @@ class _Line:
         """Close the connection."""
         self.broken = True
         self._connection.disconnect()
-
-
-def _check_moved(moved: float, limit: float) -> None:
-    if time.monotonic() - moved >= limit:
-        raise TimeoutError
 
 
 class BlockingTransport:
@@ -247,6 +253,11 @@ class BlockingTransport:
             line.close()
             raise
         self._give(line)
+
+    @property
+    def timeout(self) -> float:
+        """Seconds without a byte moving after which a call made now is given up."""
+        return patience(self._options.timeout)
 
     async def owner(self, key: bytes, *, anew: bool = False) -> BlockingTransport:
         """Return this: there is one server."""

@@ -6,7 +6,11 @@ transports of this package take the socket over, since its reading and writing a
 
 from __future__ import annotations
 
+import ipaddress
 import os
+import ssl
+import sys
+import warnings
 from typing import Any
 
 import redis
@@ -14,11 +18,13 @@ import redis.asyncio
 import redis.exceptions
 from redis.asyncio.connection import parse_url
 
-from ..errors import BadType, BadValue, NotConnected, ReemError
+from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
+from ..plan.replies import refusal
 
 __all__ = ["Options"]
 
 _SCHEMES = ("redis://", "rediss://", "unix://")
+_TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
 
 
 class Options:
@@ -30,8 +36,11 @@ class Options:
         options: redis-py's connection options (`port`, `db`, `username`, `password`, `ssl`, ...).
 
     Raises:
-        BadValue: A URL that cannot be parsed.
+        BadValue: A URL that cannot be parsed, or an option that cannot be meant.
         BadType: An option that redis-py does not know.
+
+    Warns:
+        InsecureConnection: Others can listen; once for each address.
     """
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
@@ -46,11 +55,51 @@ class Options:
         if self.socket_path is not None:
             self.settings.pop("host", None)
             self.settings.pop("port", None)
+        if self.tls:
+            self._check_tls()
         try:
             self.asynchronous_connection()
             self.blocking_connection()
         except TypeError as error:
-            raise BadType(f"RedisInterface: {error}; see redis-py's connection options") from None
+            hint = "; TLS is asked for by rediss:// or ssl=True" if "ssl_" in str(error) and not self.tls else ""
+            raise BadType(f"RedisInterface: {error}; see redis-py's connection options{hint}") from None
+        except (ValueError, redis.exceptions.RedisError) as error:
+            raise BadValue(f"RedisInterface: {error}; see redis-py's connection options") from None
+        self._warn_of_listeners()
+
+    def _check_tls(self) -> None:
+        """Refuse what would only show, in other words, when connecting."""
+        if self.socket_path is not None:
+            raise BadValue("TLS over a unix socket makes no sense; leave ssl= out")
+        lowest = self.settings.setdefault("ssl_min_version", ssl.TLSVersion.TLSv1_2)
+        if lowest < ssl.TLSVersion.TLSv1_2:
+            raise BadValue(f"ssl_min_version={lowest!r}: TLS before 1.2 is broken; leave it out")
+        for name in _TLS_FILES:
+            path = self.settings.get(name)
+            if path is not None and not os.path.isfile(path):
+                raise BadValue(f"{name}={os.fspath(path)!r} is not a file; give the path of one in PEM format")
+
+    def _warn_of_listeners(self) -> None:
+        """Say once for each address if what is sent there is open to others; looks nothing up, connects to nothing."""
+        if self.socket_path is not None or _is_this_machine(str(self.settings.get("host", "localhost"))):
+            return
+        if not self.tls:
+            danger, remedy = (
+                "is not encrypted: whoever is on its way can read and change data and password",
+                "rediss://",
+            )
+        elif self.settings.get("ssl_cert_reqs", "required") in ("none", ssl.CERT_NONE):
+            danger, remedy = "does not check who the server is", "ssl_ca_certs='ca.crt' instead of ssl_cert_reqs='none'"
+        else:
+            return
+        message = (
+            f"the connection to {self.address} {danger}; use {remedy} (SECURITY.md says how), or, on a network that "
+            "is the robot's own, silence this: "
+            "warnings.filterwarnings('ignore', category=reem.InsecureConnection)"
+        )
+        if message not in _said:
+            _said.add(message)
+            warnings.warn(message, InsecureConnection, stacklevel=_levels_to_caller())
 
     @property
     def database(self) -> int:
@@ -61,6 +110,9 @@ class Options:
     def address(self) -> str:
         """Where the server is, for messages: never a password."""
         return self.socket_path or f"{self.settings.get('host', 'localhost')}:{self.settings.get('port', 6379)}"
+
+    def __repr__(self) -> str:
+        return f"<Options for {self.address}>"
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
@@ -80,26 +132,109 @@ class Options:
         return (module.SSLConnection if self.tls else module.Connection)(**settings)
 
     def refused(self, error: Exception) -> Exception:
-        """Return the error to raise when connecting failed with `error`."""
-        if "HELLO must be called" in str(error) or "NOAUTH" in str(error):
-            return redis.exceptions.AuthenticationError(
-                f"the server at {self.address} needs a password: RedisInterface(..., username=..., password=...)"
-            )
-        if isinstance(error, redis.exceptions.AuthenticationError | ReemError):
+        """Return the error to raise when connecting failed with `error`; it never shows what was sent."""
+        if isinstance(error, ReemError):
             return error
-        reason = error.__cause__ if isinstance(error.__cause__, OSError) else error
+        reason = _reason(error)
+        if isinstance(reason, ssl.SSLError):
+            return TlsRefused(f"no TLS connection to {self.address}: {_tls_remedy(reason)}")
+        if self.tls and (isinstance(reason, ConnectionResetError) or "closed by server" in str(error)):
+            return TlsRefused(f"no TLS connection to {self.address}: it was closed at once; {_CERTIFICATE}")
+        text = self._without_password(str(error))
+        code = "NOAUTH" if "HELLO must be called" in text else getattr(error, "status_code", None)
+        told = refusal(f"{code} {text}") if code else refusal(text)
+        if told is None and isinstance(error, redis.exceptions.AuthenticationError):
+            told = LoginRefused(f"the login was refused: {text}")
+        if told is not None:
+            return told.at(self.address)
         if isinstance(error, redis.exceptions.ResponseError):
-            return error
+            return NotConnected(
+                f"the server at {self.address} does not take the greeting ({text:.200}); "
+                "REEM needs Redis 7 or Valkey with RedisJSON, or newer"
+            )
         return NotConnected(
-            f"no server answers at {self.address} ({_shown(reason)}); start one with `reem up` or with "
-            "compose.yaml, or pass the right address: RedisInterface('redis://host:port')"
+            f"no server answers at {self.address} ({_shown(reason, text)}); start one with `reem up` or with "
+            f"compose.yaml, or pass the right address: RedisInterface('redis://host:port'){self._hint(reason)}"
         )
 
+    def _hint(self, reason: BaseException) -> str:
+        """Return what may be the matter besides, given that the address is right."""
+        if self.tls:
+            silent = isinstance(reason, TimeoutError | redis.exceptions.TimeoutError)
+            return "; if what listens there does not speak TLS, use redis:// or its port for TLS" if silent else ""
+        refused = isinstance(reason, OSError) and not isinstance(reason, ConnectionResetError)
+        return "" if refused else "; if it speaks TLS only, use rediss://"
 
-def _shown(error: BaseException) -> str:
-    if isinstance(error, OSError) and error.errno is not None:
-        return os.strerror(error.errno) if error.errno > 0 else str(error)
-    return str(error) or type(error).__name__
+    def _without_password(self, text: str) -> str:
+        """Return an error's text, or a word in its place if the server quotes the login in it."""
+        text = text.partition("with args beginning")[0]
+        secret = self.settings.get("password")
+        return "its answer quotes the password" if secret and str(secret) in text else text
+
+
+_CERTIFICATE = (
+    "if it asks clients for certificates, pass ssl_certfile=... and ssl_keyfile=..., issued by an authority it trusts"
+)
+
+_said: set[str] = set()
+
+
+def _levels_to_caller() -> int:
+    """Return the stack level, for warnings.warn, of the first caller outside of REEM."""
+    frame, level = sys._getframe(1), 1
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in ("reem", "reem_async"):
+        frame, level = frame.f_back, level + 1
+    return level
+
+
+def _is_this_machine(host: str) -> bool:
+    """Return whether a name stands for this very machine, as far as can be told without looking it up."""
+    if host in ("", "localhost") or host.endswith(".localhost"):
+        return True
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    address = getattr(address, "ipv4_mapped", None) or address
+    return address.is_loopback or address.is_unspecified
+
+
+def _reason(error: BaseException) -> BaseException:
+    """Return what is behind an error of redis-py: the TLS error or the operating system's, else itself."""
+    chain, link = [error], error.__cause__ or error.__context__
+    while link is not None and link not in chain:
+        chain.append(link)
+        link = link.__cause__ or link.__context__
+    for kind in (ssl.SSLError, OSError):
+        for each in chain:
+            if isinstance(each, kind):
+                return each
+    return error
+
+
+def _tls_remedy(reason: ssl.SSLError) -> str:
+    """Return what went wrong in a TLS handshake, and what to do."""
+    if isinstance(reason, ssl.SSLCertVerificationError):
+        said = reason.verify_message
+        if "ostname mismatch" in said or "IP address mismatch" in said:
+            return f"{said.rstrip('.')}; connect by a name that is in the certificate, or issue one with this name"
+        if "expired" in said or "not yet valid" in said:
+            return f"the server's {said}; renew it, or set the clock right"
+        return f"the server's certificate is not trusted ({said}); pass ssl_ca_certs='ca.crt', its authority's"
+    name = reason.reason or str(reason)
+    if "WRONG_VERSION_NUMBER" in name or "PACKET_LENGTH" in name:
+        return f"what answers there does not speak TLS ({name}); use redis:// or the TLS port"
+    if "EOF" in name:
+        return f"the server closed it at once ({name}); {_CERTIFICATE}"
+    if "ALERT" in name and "PROTOCOL" not in name:
+        return f"the server refuses this client ({name}); {_CERTIFICATE}"
+    return f"{name}; server and client need TLS 1.2 or newer and certificates in PEM format"
+
+
+def _shown(reason: BaseException, text: str) -> str:
+    if isinstance(reason, OSError) and reason.errno is not None:
+        return os.strerror(reason.errno) if reason.errno > 0 else str(reason)
+    return f"{text:.200}" or type(reason).__name__
 
 
 def _address(host: Any) -> dict[str, Any]:
@@ -111,6 +246,8 @@ def _address(host: Any) -> dict[str, Any]:
     if not isinstance(host, str):
         raise BadType(f"host is a name, a URL or an EmbeddedServer, not {type(host).__name__}")
     if "://" not in host:
+        if "@" in host:
+            raise BadValue("host is a name alone; user and password go in username=, password= or in a URL, redis://")
         return {"host": host}
     if not host.startswith(_SCHEMES):
         raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")

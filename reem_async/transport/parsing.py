@@ -14,16 +14,32 @@ import redis.exceptions
 from redis._parsers import BaseParser
 
 from ..plan import Reply
+from ..plan.replies import refusal
 
-_parse_error: Any = BaseParser.parse_error
+__all__ = ["MORE", "NOT_THE_PROTOCOL", "LargeReader", "Reader", "SmallReader"]
 
-__all__ = ["MORE", "LargeReader", "Reader", "SmallReader"]
+NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError, TypeError, ValueError)
+"""What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
 
 MORE: Any = object()
 """What a parser says when it needs more bytes; False and None are replies."""
 
 _BUFFER = 1 << 17
 _LARGE = 1 << 15
+_STEP = 1 << 24
+"""How much more memory a string may be given than has arrived of it: its length is only a claim."""
+_DEEPEST = 128
+
+
+def _error(text: str) -> Exception:
+    """Return the exception that an error reply stands for."""
+    try:
+        return refusal(text) or _parse_error(text)
+    except Exception:  # redis-py takes some texts apart and trusts them to be whole
+        return redis.exceptions.ResponseError(text)
+
+
+_parse_error: Any = BaseParser.parse_error
 
 
 class Reader(Protocol):
@@ -51,7 +67,7 @@ class SmallReader:
 
     def __init__(self) -> None:
         self._parser = hiredis.Reader(
-            protocolError=redis.exceptions.InvalidResponse, replyError=_parse_error, notEnoughData=MORE
+            protocolError=redis.exceptions.InvalidResponse, replyError=_error, notEnoughData=MORE
         )
         self._buffer = bytearray(_BUFFER)
         self._view = memoryview(self._buffer)
@@ -87,11 +103,14 @@ class LargeReader:
         self._start = self._end = 0
         self._open: list[_Open] = []
         self._large: bytearray | None = None
+        self._size = 0
         self._filled = 0
 
     def target(self) -> memoryview:
         """Return where to put received bytes."""
-        if self._large is not None and self._filled < len(self._large):
+        if self._large is not None and self._filled < self._size:
+            if self._filled == len(self._large):
+                self._large.extend(bytes(min(self._size - self._filled, max(_STEP, self._filled))))
             return memoryview(self._large)[self._filled :]
         if self._start == self._end:
             self._start = self._end = 0
@@ -103,7 +122,7 @@ class LargeReader:
 
     def received(self, count: int) -> None:
         """Take note of `count` bytes put where `target` said."""
-        if self._large is not None and self._filled < len(self._large):
+        if self._large is not None and self._filled < self._size:
             self._filled += count
         else:
             self._end += count
@@ -117,6 +136,8 @@ class LargeReader:
                     return MORE
                 if value.left:
                     self._open.append(value)
+                    if len(self._open) > _DEEPEST:
+                        raise redis.exceptions.InvalidResponse("lists in lists in lists")
                     continue
                 value = _closed(value)
             while self._open:
@@ -141,16 +162,16 @@ class LargeReader:
         kind, text, after = self._buffer[self._start], bytes(self._view[self._start + 1 : stop]), stop + 2
         try:
             if kind in b"$=":
-                return self._string(int(text), after)
+                return self._string(None if text == b"-1" else _count(text), after)
             self._start = after
             if kind in b"*%~>":
-                return _Open(kind, int(text) * (2 if kind == 0x25 else 1)) if text != b"-1" else None
+                return None if text == b"-1" else _Open(kind, _count(text) * (2 if kind == 0x25 else 1))
             return _SCALARS[kind](text)
         except (KeyError, ValueError) as error:
             raise redis.exceptions.InvalidResponse(f"{bytes([kind])!r}{text[:40]!r}: {error}") from None
 
-    def _string(self, size: int, after: int) -> Any:
-        if size < 0:
+    def _string(self, size: int | None, after: int) -> Any:
+        if size is None:
             self._start = after
             return None
         here = self._end - after
@@ -159,7 +180,7 @@ class LargeReader:
             return bytes(self._view[after : after + size])
         if size < _LARGE:
             return MORE  # the line is parsed again when all of it is there
-        self._large, self._filled = bytearray(size), min(here, size)
+        self._large, self._size, self._filled = bytearray(min(size, _STEP)), size, min(here, size)
         self._large[: self._filled] = self._view[after : after + self._filled]
         self._start = after + self._filled
         return self._end_of_large()
@@ -167,11 +188,18 @@ class LargeReader:
     def _end_of_large(self) -> Any:
         """Return the large string if it and the line end after it are here."""
         assert self._large is not None
-        if self._filled < len(self._large) or self._end - self._start < 2:
+        if self._filled < self._size or self._end - self._start < 2:
             return MORE
         self._start += 2
         value, self._large = self._large, None
         return value
+
+
+def _count(text: bytes) -> int:
+    count = int(text)
+    if count < 0:
+        raise ValueError("a negative length")
+    return count
 
 
 def _closed(it: _Open) -> Any:
@@ -183,7 +211,7 @@ def _closed(it: _Open) -> Any:
 
 _SCALARS: dict[int, Any] = {
     ord("+"): bytes,
-    ord("-"): lambda text: _parse_error(text.decode(errors="replace")),
+    ord("-"): lambda text: _error(text.decode(errors="replace")),
     ord(":"): int,
     ord("_"): lambda _: None,
     ord("#"): lambda text: text == b"t",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import array
 import socket
+import struct
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -16,7 +18,11 @@ try:
 except ImportError:  # Windows: what the kernel still holds cannot be asked there
     fcntl = termios = None  # type: ignore[assignment]
 
-__all__ = ["check_timeout", "forget", "patience", "timeout", "unsent"]
+__all__ = ["check_timeout", "confirmed", "forget", "patience", "timeout", "unsent"]
+
+_TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
+_BYTES_ACKED = 120
+"""Where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits."""
 
 _given: ContextVar[float | None] = ContextVar("reem timeout", default=None)
 
@@ -69,3 +75,17 @@ def unsent(connected: socket.socket | None) -> int:
     except (OSError, ValueError):
         return 0
     return count[0]
+
+
+def confirmed(connected: socket.socket | None) -> int:
+    """Return how many bytes the other side has confirmed since it was connected, 0 where the kernel does not say.
+
+    For TLS, where what waits to be sent is spread over layers that cannot be asked.
+    """
+    if connected is None or _TCP_INFO is None:
+        return 0
+    try:
+        info = connected.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, _BYTES_ACKED + 8)
+    except OSError:
+        return 0
+    return int(struct.unpack_from("=Q", info, _BYTES_ACKED)[0]) if len(info) == _BYTES_ACKED + 8 else 0

@@ -14,14 +14,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import hiredis
-import redis.exceptions
 
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
 from .packing import LARGE, Piece, pack
-from .parsing import MORE, LargeReader, Reader, SmallReader
-from .patience import patience, unsent
+from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
+from .patience import confirmed, patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
@@ -83,6 +82,8 @@ class Wire(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport | None = None
         self._keep: Any = None
         self._socket: Any = None
+        self._tls = False
+        self._goal = 0  # over TLS: how many bytes the other side has confirmed when it has all of what was written
         self._watch: asyncio.TimerHandle | None = None
         self._last_byte = 0.0
         self._unsent = 0  # bytes of large values that were on their way up when last looked at
@@ -99,6 +100,7 @@ class Wire(asyncio.BufferedProtocol):
         connection._reader = connection._writer = None
         transport: asyncio.Transport = writer.transport
         self._transport, self._socket = transport, transport.get_extra_info("socket")
+        self._tls = transport.get_extra_info("ssl_object") is not None
         transport.set_protocol(self)
 
     @property
@@ -138,15 +140,26 @@ class Wire(asyncio.BufferedProtocol):
         """
         if not self.alive:
             return
-        self.send([("PING",)], lambda _: None, before=[("SUNSUBSCRIBE", channel)])
+        limit, now = patience(self._timeout), self._loop.time()
+        due = _Due(1, lambda _: None, limit, now)
+        due.lenient = True
+        self._due.append(due)
+        self._watch_until(now + limit)
+        if not self._outbox:
+            self._loop.call_soon(self._flush)
+        self._outbox.extend(pack([("SUNSUBSCRIBE", channel), ("PING",)]))
 
     def _flush(self) -> None:
         pieces, self._outbox = self._outbox, []
         if self._reason is None:
             self._write(pieces)
+            if sum(map(len, pieces)) >= LARGE:
+                self._unsent = self._bytes_unsent()
 
     def _write(self, pieces: list[Piece]) -> None:
         assert self._transport is not None
+        if self._tls:
+            self._goal = max(self._goal, confirmed(self._socket)) + sum(map(len, pieces))
         start = 0
         for place, piece in enumerate(pieces):
             if type(piece) is memoryview or len(piece) >= LARGE:
@@ -201,8 +214,8 @@ class Wire(asyncio.BufferedProtocol):
             self._reader.received(nbytes)
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
-        except redis.exceptions.InvalidResponse as error:
-            self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error}"))
+        except NOT_THE_PROTOCOL as error:
+            self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
 
     def eof_received(self) -> None:
         """Close: the server will not answer any more."""
@@ -221,7 +234,7 @@ class Wire(asyncio.BufferedProtocol):
 
     def _take(self, reply: Reply) -> None:
         # The confirmation of a SUBSCRIBE is pushed too, but it is the only reply there is to the command.
-        if type(reply) is hiredis.PushNotification and reply[0] not in _CONFIRMATIONS:
+        if type(reply) is hiredis.PushNotification and not (reply and reply[0] in _CONFIRMATIONS):
             if self._on_push is not None:
                 self._on_push(cast("list[Any]", reply))
             return
@@ -270,6 +283,8 @@ class Wire(asyncio.BufferedProtocol):
             self.abort(ConnectionLost(f"the server moved no byte for {waiting[-1].limit:g} s"))
 
     def _bytes_unsent(self) -> int:
+        if self._tls:
+            return max(self._goal - confirmed(self._socket), 0)
         buffered = self._transport.get_write_buffer_size() if self._transport is not None else 0
         return buffered + unsent(self._socket)
 
@@ -299,16 +314,14 @@ async def open_wire(
 
     Raises:
         NotConnected: Nobody listens there.
-        redis.exceptions.RedisError: The server refused the login.
+        Refused: The server refused the login.
     """
     connection = options.asynchronous_connection()
     try:
         async with asyncio.timeout(options.handshake_timeout):
             await connection.connect()
-    except TimeoutError as error:
+    except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
         await connection.disconnect(nowait=True)
-        raise options.refused(error) from error
-    except (redis.exceptions.RedisError, OSError) as error:
         raise options.refused(error) from error
     wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
     wire.take_over(connection)

@@ -1,0 +1,169 @@
+"""Patterns of channels in a cluster, where servers have none: the keys are looked for, and each is followed."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import weakref
+from typing import TYPE_CHECKING, Any
+
+from .background import in_background
+from .errors import RedisError
+from .plan.keys import keys_of
+from .plan.notices import Notice
+from .plan.scan import documents
+from .policy import Mailbox
+from .transport import drive
+from .transport.wire import Wire
+
+if TYPE_CHECKING:
+    from .hub import Hub, Listener, Topic
+
+__all__ = ["Discovery"]
+
+logger = logging.getLogger("reem.subscribe")
+
+_PAUSE = 1.0
+"""Seconds between looks for new keys."""
+
+_TAIL = "}:notices"
+_ESCAPED = re.compile(r"\\(.)", re.DOTALL)
+
+
+class Discovery:
+    """Follows, for each listener to a pattern, all keys that there are, and those that come to be.
+
+    Args:
+        hub: Who follows a key.
+    """
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._branches: weakref.WeakKeyDictionary[Listener, dict[bytes, _Branch]] = weakref.WeakKeyDictionary()
+        self._looking: asyncio.Task[Any] | None = None
+
+    async def follow(self, listener: Listener) -> None:
+        """Follow all keys that there are now; those that come to be are found within a second."""
+        self._branches[listener] = {}
+        try:
+            name = literal(_glob(listener))
+            if name is not None:  # it need not be there yet
+                await self._found(listener, name.encode(), late=False)
+                return
+            await self._look(listener, late=False)
+        except BaseException:
+            await self.unfollow(listener)
+            raise
+        if self._looking is None or self._looking.done():
+            self._looking = in_background(self._go_on_looking(), "reem discovery")
+
+    async def unfollow(self, listener: Listener) -> None:
+        """Stop following. Idempotent."""
+        for branch in self._branches.pop(listener, {}).values():
+            await self._hub.unfollow(branch)
+
+    async def close(self) -> None:
+        """Stop looking."""
+        if self._looking is not None:
+            self._looking.cancel()
+
+    async def _go_on_looking(self) -> None:
+        while True:
+            await asyncio.sleep(_PAUSE)
+            for listener in [each for each in self._branches if literal(_glob(each)) is None]:
+                try:
+                    await self._look(listener, late=True)
+                except (RedisError, OSError) as error:
+                    logger.debug("new keys could not be looked for: %s", error)
+            del listener
+            if not self._branches:
+                return
+
+    async def _look(self, listener: Listener, *, late: bool) -> None:
+        """Follow the keys that are not followed yet."""
+        glob = _glob(listener)
+        for node in await self._hub.transport.nodes():
+            cursor: Any = b"0"
+            while True:
+                cursor, page = await drive(node, documents(glob, cursor))
+                for document in page:
+                    await self._found(listener, document, late=late)
+                if cursor in (b"0", 0):
+                    break
+
+    async def _found(self, listener: Listener, document: bytes, *, late: bool) -> None:
+        branches = self._branches.get(listener)
+        if branches is None or document in branches or b"{" in document:
+            return
+        branch = branches[document] = _Branch(listener, document, late=late)
+        try:
+            await self._hub.follow(branch)
+        except BaseException:
+            branches.pop(document, None)
+            raise
+
+
+def _glob(listener: Listener) -> str:
+    """Return the pattern of the documents whose channels a listener's pattern names."""
+    return listener.topic.name.decode().removeprefix("{").removesuffix(_TAIL)
+
+
+def literal(glob: str) -> str | None:
+    """Return the only name that a pattern of the server names, None if there may be others."""
+    plain = _ESCAPED.sub("", glob)
+    return None if any(sign in plain for sign in "*?[") else _ESCAPED.sub(r"\1", glob)
+
+
+class _Branch:
+    """One key of a pattern: a listener of the hub that hands everything on."""
+
+    def __init__(self, listener: Listener, document: bytes, *, late: bool) -> None:
+        from .hub import Topic
+
+        self._listener = weakref.ref(listener)
+        self._late = late
+        self.topic: Topic = Topic(
+            keys_of(document.decode(errors="surrogateescape")).channel.encode(errors="surrogateescape")
+        )
+        self.note: str | None = None
+        self.ready: asyncio.Future[None] | None = None
+        self.mailboxes: list[Mailbox] = []
+
+    def start(self, wire: Wire, kind: str) -> None:
+        """Begin, and let the listener begin."""
+        listener = self._listener()
+        if listener is not None:
+            listener.start(wire, kind)
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_result(None)
+
+    def lost(self, reason: Exception) -> None:
+        """Hand it on, if this had begun."""
+        if self.ready is not None:
+            if not self.ready.done():
+                self.ready.set_exception(reason)
+            return
+        listener = self._listener()
+        if listener is not None:
+            listener.lost(reason)
+
+    def doubt(self) -> None:
+        """Hand it on."""
+        listener = self._listener()
+        if listener is not None:
+            listener.doubt()
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Hand it on. Of a key that was found late, the first updates may be lost."""
+        listener = self._listener()
+        if listener is None:
+            return
+        if self._late:
+            self._late = False
+            if notice.sequence > 1:
+                listener.doubt()
+        listener.on_notice(notice, channel)
+
+    def on_note(self, note: bytes | None) -> None:
+        """Nothing to compare."""

@@ -1,0 +1,372 @@
+"""The port over a cluster: each plan goes to the node that has the slot of its key.
+
+All keys of a plan carry one hash tag, so one node has them all. A node that has not, or not yet,
+applies nothing and says so; then, and only then, the commands are sent again, to another node or a
+little later, within the call's time limit. A connection that breaks after sending is never a reason.
+
+One transaction is guarded besides: one that publishes. Servers look at a transaction's keys before
+they run it, but not if it holds a PUBLISH of any kind: while a slot is moving they would then write
+to a key that has left already. So its keys are watched first, which takes one more round trip.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from typing import Any
+
+import redis.exceptions
+
+from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotConnected
+from ..plan import Command, Reply
+from ..state import States
+from . import Held, Transport
+from .endpoints import NewTransport, listed
+from .options import Options
+from .patience import patience
+from .redirects import Moved, key_of, key_slot, keys_in, publishes, refusal, slot_of
+from .route import HeldAcross, Route, asked_of, places_refused, watched
+
+__all__ = ["ClusterOptions", "ClusterTransport"]
+
+SLOTS = 16384
+
+Address = tuple[str, int]
+
+_EXAMPLE = "redis+cluster://user:password@host:7000,host:7001"
+_LOOK_PAUSE = 0.03
+"""Seconds for which a look at the cluster's layout is not repeated."""
+_PUBLISHING = 64
+"""How many publish at the same time, each over a connection of its own."""
+
+
+class ClusterOptions(Options):
+    """How to reach the nodes of a cluster.
+
+    Args:
+        url: `redis+cluster://user:password@host:port,host:port`, or `rediss+cluster://`; some of the nodes.
+        timeout: Seconds without a byte moving after which a call is given up.
+        options: redis-py's connection options, the same for all nodes.
+
+    Attributes:
+        seeds: The nodes that the URL names.
+    """
+
+    def __init__(self, url: str, timeout: float, options: dict[str, Any]) -> None:
+        urls = listed(url, _EXAMPLE)
+        super().__init__(urls[0], timeout, options)
+        if self.database:
+            raise BadValue(f"db={self.database}: a cluster has only database 0; use namespace= to keep programs apart")
+        self.seeds: list[Address] = [
+            (str(each.settings.get("host", "localhost")), int(each.settings.get("port", 6379)))
+            for each in (Options(one, timeout, options) for one in urls)
+        ]
+
+    @property
+    def address(self) -> str:
+        """Where the nodes are that were named, for messages."""
+        return ",".join(f"{host}:{port}" for host, port in self.seeds)
+
+    def node(self, address: Address) -> Options:
+        """Return how to reach one node."""
+        host, port = address
+        return Options(host, self.timeout, {**self.settings, "host": host, "port": port, "ssl": self.tls})
+
+
+class ClusterTransport:
+    """Connections to the nodes of a cluster, made when first needed.
+
+    Attributes:
+        sharded: Notices go through the node that has the key's slot.
+        states: What the interface's user gets to know of the connections.
+    """
+
+    sharded = True
+
+    def __init__(self, options: ClusterOptions, new_transport: NewTransport) -> None:
+        self._options = options
+        self._new_transport = new_transport
+        self._nodes: dict[Address, Transport] = {}
+        self._owners: list[Transport | None] = [None] * SLOTS
+        self._primaries: tuple[Address, ...] = ()
+        self._failed: dict[Address, float] = {}
+        self._gone: set[Address] = set()
+        self._looked = 0.0
+        self.states = States()
+        self._root = self._node(options.seeds[0])
+
+    def _node(self, address: Address) -> Transport:
+        """Return the transport to one node, connected or not."""
+        node = self._nodes.get(address)
+        if node is None:
+            node = self._new_transport(self._options.node(address))
+            node.states = _NodeStates(self, address)
+            node = self._nodes.setdefault(address, node)  # another thread may have made it meanwhile
+        return node
+
+    # The port.
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` to the node that has their slot, and return the replies."""
+        self._root.check()
+        if len(commands) > 1:
+            if commands[-1][0] == "EXEC":
+                return await (self._publish(commands, bulk) if publishes(commands) else self._apply(commands, bulk))
+            slots = [None if (key := key_of(command)) is None else key_slot(key) for command in commands]
+            if len(set(slots)) > 1:
+                return await self._scattered(commands, slots, bulk)
+        slot = slot_of(commands)
+        owner = None if slot is None else self._owners[slot]
+        if owner is None:
+            return await self._apply(commands, bulk)
+        try:
+            replies = await owner.roundtrip(commands, bulk=bulk)
+        except NotConnected as error:
+            return await self._apply(commands, bulk, error, None, owner)
+        problem = refusal(replies)
+        return replies if problem is None else await self._apply(commands, bulk, problem, replies, owner)
+
+    def hold(self, key: str | bytes | None = None) -> AbstractAsyncContextManager[Held]:
+        """Return a connection of the caller's own to the node that has `key`, wherever that moves."""
+        return self._hold()
+
+    @asynccontextmanager
+    async def _hold(self) -> AsyncIterator[Held]:
+        held = HeldAcross(self)
+        try:
+            yield held
+        except BaseException as error:
+            await held.leave(error)
+            raise
+        await held.leave()
+
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled."""
+        return await self._root.whole(call)
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        """Return the lock of `key`."""
+        return self._root.ordered(key)
+
+    async def pause(self, seconds: float) -> None:
+        """Wait."""
+        await self._root.pause(seconds)
+
+    def check(self) -> None:
+        """Raise if this cannot be used here."""
+        self._root.check()
+
+    @property
+    def at_end(self) -> Callable[[], Awaitable[None]]:
+        """What ends subscriptions and connections when the event loop in use ends."""
+        return self._root.at_end
+
+    @at_end.setter
+    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
+        self._root.at_end = action
+
+    async def release(self) -> None:
+        """Close the connections that are not in use; new ones are made when needed."""
+        for node in list(self._nodes.values()):
+            await node.release()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        self.states.closed()
+        for node in list(self._nodes.values()):
+            await node.close()
+
+    async def nodes(self) -> Sequence[Transport]:
+        """Return the primaries, which together hold all keys."""
+        await self.look()
+        return [self._node(address) for address in self._primaries]
+
+    async def owner(self, key: str | bytes, *, anew: bool = False) -> Transport:
+        """Return the node that has `key`; `anew` if what is known of the cluster is in doubt.
+
+        Raises:
+            NotConnected: No node answers, or none has it.
+        """
+        return await self.owner_of(key_slot(key if isinstance(key, bytes) else key.encode()), anew=anew)
+
+    async def owner_of(self, slot: int, *, anew: bool = False) -> Transport:
+        """Return the node that has `slot`; `anew` if what is known of the cluster is in doubt."""
+        if anew or self._owners[slot] is None:
+            await self.look()
+        found = self._owners[slot]
+        if found is None:
+            raise NotConnected(f"no node of the cluster at {self._options.address} has slot {slot} at the moment")
+        return found
+
+    # The layout.
+
+    async def look(self) -> None:
+        """Ask a node who has which slots, unless that was just done.
+
+        Raises:
+            NotConnected: No node answers.
+            redis.exceptions.RedisError: It is no cluster, or this user may not ask.
+        """
+        self.check()
+        asked = time.monotonic()
+        async with self._root.ordered("the layout of the cluster"):
+            if self._looked > asked - _LOOK_PAUSE:
+                return
+            known = {*self._primaries, *self._nodes, *self._options.seeds}
+            reason: Exception | None = None
+            for address in sorted(known, key=lambda each: (self._failed.get(each, 0.0), random.random())):  # noqa: S311
+                try:
+                    (reply,) = await self._node(address).roundtrip([("CLUSTER", "SLOTS")])
+                except (NotConnected, ConnectionLost) as error:
+                    self._failed[address], reason = time.monotonic(), error
+                    continue
+                if isinstance(reply, Exception):
+                    raise self._no_layout(address, reply)
+                self._failed.pop(address, None)
+                self._learn(reply, address[0])
+                self._looked = time.monotonic()
+                return
+        raise NotConnected(f"no node of the cluster answers; the last one tried: {reason}") from reason
+
+    def _no_layout(self, address: Address, reply: Exception) -> Exception:
+        where = f"{address[0]}:{address[1]}"
+        if "cluster support disabled" in str(reply):
+            return BadValue(f"the server at {where} is no cluster: connect with redis://{where}")
+        if isinstance(reply, redis.exceptions.NoPermissionError):
+            return redis.exceptions.NoPermissionError(
+                f"{where}: {reply}; a user of a cluster needs +cluster|slots (and +asking, which needs no permission)"
+            )
+        return reply
+
+    def _learn(self, ranges: Sequence[Any], asked: str) -> None:
+        owners: list[Transport | None] = [None] * SLOTS
+        primaries: dict[Address, None] = {}
+        for first, last, (host, port, *_), *_ in ranges:
+            name = host.decode() if isinstance(host, bytes) else (host or "")
+            address = (asked if name in ("", "?") else name, int(port))
+            primaries[address] = None
+            owners[first : last + 1] = [self._node(address)] * (last + 1 - first)
+        self._owners, self._primaries = owners, tuple(primaries)
+        if self._gone and not self._gone.intersection(primaries):  # whoever was lost is not needed any more
+            self._gone.clear()
+            self.states.opened(self._options.address, None)
+
+    def moved(self, problem: Any, asked: Transport) -> Transport:
+        """Note what a redirection says, and return the node it names."""
+        host, port = problem.host, problem.port
+        if not host:  # the same host, another port
+            host = next(
+                (address[0] for address, node in self._nodes.items() if node is asked), self._options.seeds[0][0]
+            )
+        node = self._node((host, port))
+        if isinstance(problem, Moved):
+            self._owners[problem.slot_id] = node
+        return node
+
+    # Sending.
+
+    async def _apply(
+        self,
+        commands: Sequence[Command],
+        bulk: bool,
+        problem: Exception | None = None,
+        replies: list[Reply] | None = None,
+        asked: Transport | None = None,
+    ) -> list[Reply]:
+        """Send `commands` until a node has applied them all, each once.
+
+        Args:
+            commands: What to send.
+            bulk: Many bytes are expected back.
+            problem: Why they, or some of them, were not applied by
+            asked: the node that was asked already, and
+            replies: what it replied.
+        """
+        route = Route(self, slot_of(commands), asked)
+        whole = commands[-1][0] == "EXEC"
+        answers: list[Reply] = list(replies or commands)
+        left = places_refused(answers) if replies is not None and not whole else list(range(len(commands)))
+        if problem is not None:
+            await route.refused(problem)
+        while True:
+            try:
+                node = await route.node()
+                got = await asked_of(node, [commands[place] for place in left], route.asking, bulk)
+            except NotConnected as error:
+                await route.refused(error)
+                continue
+            problem = refusal(got)
+            for place, reply in zip(left, got, strict=True):
+                answers[place] = reply
+            if problem is None:
+                return answers
+            if not whole:
+                left = places_refused(answers)
+            await route.refused(problem)
+
+    async def _scattered(self, commands: Sequence[Command], slots: Sequence[int | None], bulk: bool) -> list[Reply]:
+        """Send commands that belong to several slots, slot by slot."""
+        answers: list[Reply] = list(commands)
+        for slot in dict.fromkeys(slots):
+            places = [place for place, each in enumerate(slots) if each == slot]
+            got = await self.roundtrip([commands[place] for place in places], bulk=bulk)
+            for place, reply in zip(places, got, strict=True):
+                answers[place] = reply
+        return answers
+
+    async def _publish(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+        """Send a transaction that publishes, over a connection that watches its keys."""
+        slot = slot_of(commands)
+        assert slot is not None  # there is a notice, so there is a key
+        route = Route(self, slot)
+        async with self._root.ordered(f"publishing {slot % _PUBLISHING}"):
+            while True:
+                problem: Exception | None = None
+                try:
+                    node = await route.node()
+                    async with node.hold() as held:
+                        problem = await watched(held, keys_in(commands), route.asking)
+                        if problem is None:
+                            replies = await asked_of(held, commands, route.asking, bulk)
+                            problem = refusal(replies)
+                            if problem is None and replies[-1] is not None:
+                                return replies
+                except NotConnected as error:
+                    problem = error
+                await (route.contended() if problem is None else route.refused(problem))
+
+    @property
+    def timeout(self) -> float:
+        """Seconds for which a call made now is tried."""
+        return patience(self._options.timeout)
+
+    def lost(self, address: Address, reason: Exception) -> None:
+        """Note that a connection to a node broke."""
+        if not isinstance(reason, InterfaceClosed):
+            self._gone.add(address)
+        self.states.lost(reason)
+
+    def opened(self, address: Address, server: str | None) -> None:
+        """Note a connection to a node; all is well when no node is missed any more."""
+        self._gone.discard(address)
+        if not self._gone:
+            self.states.opened(f"{address[0]}:{address[1]}", server)
+
+
+class _NodeStates(States):
+    """What one node's connections report, on its way to the cluster's states."""
+
+    def __init__(self, cluster: ClusterTransport, address: Address) -> None:
+        super().__init__()
+        self._cluster = cluster
+        self._node = address
+
+    def opened(self, address: str, server: str | None) -> None:
+        """Pass it on."""
+        self._cluster.opened(self._node, server)
+
+    def lost(self, reason: Exception) -> None:
+        """Pass it on."""
+        self._cluster.lost(self._node, reason)

@@ -1,0 +1,256 @@
+"""The port over a primary that sentinels watch: each new connection asks them where it is.
+
+After a failover the connections to the old primary break, or its replies say that it takes no writes
+any more. The next connection goes where the sentinels say then, and only a server that calls itself
+a primary is taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import AbstractAsyncContextManager, suppress
+from typing import Any
+
+import redis
+import redis.asyncio
+import redis.asyncio.sentinel
+import redis.exceptions
+import redis.sentinel
+
+from ..errors import BadValue, NotConnected
+from ..plan import Command, Reply
+from ..state import States
+from . import Held, Transport
+from .endpoints import NewTransport, listed
+from .options import Options
+
+__all__ = ["SentinelOptions", "SentinelTransport"]
+
+_EXAMPLE = "redis+sentinel://user:password@host:26379,host2:26379/mymaster"
+
+
+class SentinelOptions(Options):
+    """How to reach the primary that sentinels watch.
+
+    Args:
+        url: `redis+sentinel://user:password@host:port,host:port/service`; user and password are the servers'.
+        timeout: Seconds without a byte moving after which a call is given up.
+        options: redis-py's connection options for the servers; besides, `sentinel_username` and
+            `sentinel_password` for the sentinels.
+
+    Raises:
+        BadValue: The URL names no service.
+    """
+
+    def __init__(self, url: str, timeout: float, options: dict[str, Any]) -> None:
+        options = dict(options)
+        login = {name: options.pop(f"sentinel_{name}", None) for name in ("username", "password")}
+        urls = [each.partition("?") for each in listed(url, _EXAMPLE)]
+        heads = [head.split("/") for head, _, _ in urls]  # scheme:, nothing, host, service, database
+        self.service = heads[0][3] if len(heads[0]) > 3 else ""
+        if not self.service:
+            raise BadValue(f"the URL names no service; write it like {_EXAMPLE}")
+        plain = [
+            f"{'/'.join([*parts[:3], *parts[4:]])}{mark}{query}"
+            for parts, (_, mark, query) in zip(heads, urls, strict=True)
+        ]
+        super().__init__(plain[0], timeout, options)
+        self._sentinels = [
+            (str(each.settings.get("host", "localhost")), int(each.settings.get("port", 26379)))
+            for each in (Options(one, timeout, options) for one in plain)
+        ]
+        tls = {"ssl": True, **{name: value for name, value in self.settings.items() if name.startswith("ssl_")}}
+        self._asking = {
+            "socket_connect_timeout": self.handshake_timeout / 2,
+            "socket_timeout": self.handshake_timeout / 2,
+            **{name: value for name, value in login.items() if value is not None},
+            **(tls if self.tls else {}),
+        }
+
+    @property
+    def address(self) -> str:
+        """What is watched and by whom, for messages."""
+        return f"{self.service} (sentinels {','.join(f'{host}:{port}' for host, port in self._sentinels)})"
+
+    def asynchronous_connection(self) -> Any:
+        """Return a fresh connection that will look for the primary when it connects."""
+        return _follow(super().asynchronous_connection(), self._connect_asynchronously)
+
+    def blocking_connection(self) -> Any:
+        """Return a fresh connection that will look for the primary when it connects."""
+        return _follow(super().blocking_connection(), self._connect)
+
+    async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
+        asked: Any = redis.asyncio.sentinel.Sentinel(self._sentinels, sentinel_kwargs=self._asking)  # type: ignore[no-untyped-call]
+        try:
+            connection.host, connection.port = await asked.discover_master(self.service)
+        finally:
+            for each in asked.sentinels:
+                with suppress(redis.exceptions.RedisError, OSError):
+                    await each.aclose()
+        await connect()
+        try:
+            await connection.send_command("ROLE")
+            _check_role(await connection.read_response(), connection)
+        except BaseException:
+            await connection.disconnect(nowait=True)
+            raise
+
+    def _connect(self, connection: Any, connect: Callable[[], None]) -> None:
+        asked: Any = redis.sentinel.Sentinel(self._sentinels, sentinel_kwargs=self._asking)  # type: ignore[no-untyped-call]
+        try:
+            connection.host, connection.port = asked.discover_master(self.service)
+        finally:
+            for each in asked.sentinels:
+                each.close()
+        connect()
+        try:
+            connection.send_command("ROLE")
+            _check_role(connection.read_response(), connection)
+        except BaseException:
+            connection.disconnect()
+            raise
+
+
+def _follow(connection: Any, way: Callable[..., Any]) -> Any:
+    """Have `connection` connect by `way`."""
+    connect = connection.connect
+    connection.connect = lambda: way(connection, connect)
+    return connection
+
+
+def _check_role(role: Any, connection: Any) -> None:
+    if not isinstance(role, list) or role[0] not in (b"master", "master"):
+        raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
+
+
+class SentinelTransport:
+    """Connections to the primary of the moment.
+
+    Attributes:
+        sharded: One server has all keys.
+        states: What the interface's user gets to know of the connections.
+    """
+
+    sharded = False
+
+    def __init__(self, options: SentinelOptions, new_transport: NewTransport) -> None:
+        self._options = options
+        self._new_transport = new_transport
+        self._root = new_transport(options)  # for what must outlive a failover: locks and the event loop
+        self._now = self._root
+        self._demoted: list[Transport] = []
+
+    @property
+    def states(self) -> States:
+        """What the interface's user gets to know of the connections."""
+        return self._root.states
+
+    @states.setter
+    def states(self, states: States) -> None:
+        self._root.states = states
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` to the primary and return their replies.
+
+        Raises:
+            NotConnected: It is no primary any more; nothing was applied.
+        """
+        now = self._now
+        return self._checked(now, await now.roundtrip(commands, bulk=bulk))
+
+    def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:
+        for reply in replies:
+            if isinstance(reply, redis.exceptions.ReadOnlyError):
+                self._leave(asked)
+                raise NotConnected(
+                    f"the server that was the primary of {self._options.address} is a replica now ({reply}); "
+                    "nothing was applied: call again, the next connection asks the sentinels"
+                )
+        return replies
+
+    def _leave(self, demoted: Transport) -> None:
+        """Use new connections from now on. The old ones are left to whoever waits for a reply on them."""
+        if demoted is self._now:
+            self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
+            self._demoted.append(demoted)
+            self._now = self._new_transport(self._options)
+            self._now.states = self.states
+
+    def hold(self) -> AbstractAsyncContextManager[Held]:
+        """Return a connection of the caller's own, given back on exit."""
+        return _Checking(self, self._now)
+
+    @property
+    def timeout(self) -> float:
+        """Seconds without a byte moving after which a call made now is given up."""
+        return self._root.timeout
+
+    async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
+        """Return the way to the primary."""
+        self._root.check()
+        return self._now
+
+    async def nodes(self) -> Sequence[Transport]:
+        """Return the way to the primary alone."""
+        return (self._now,)
+
+    async def pause(self, seconds: float) -> None:
+        """Wait."""
+        await self._root.pause(seconds)
+
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled; return its result."""
+        return await self._root.whole(call)
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        """Return the lock of `key`."""
+        return self._root.ordered(key)
+
+    def check(self) -> None:
+        """Raise if this cannot be used here."""
+        self._root.check()
+
+    @property
+    def at_end(self) -> Callable[[], Awaitable[None]]:
+        """What ends subscriptions and connections when the event loop in use ends."""
+        return self._root.at_end
+
+    @at_end.setter
+    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
+        self._root.at_end = action
+
+    async def release(self) -> None:
+        """Close the connections that are not in use; new ones are made when needed."""
+        for each in self._all():
+            await each.release()
+
+    async def close(self) -> None:
+        """Close all connections."""
+        for each in self._all():
+            await each.close()
+
+    def _all(self) -> list[Transport]:
+        return list({id(each): each for each in (self._root, *self._demoted, self._now)}.values())
+
+
+class _Checking:
+    """A held connection whose replies are looked at, too."""
+
+    def __init__(self, transport: SentinelTransport, node: Transport) -> None:
+        self._transport = transport
+        self._node = node
+        self._lent = node.hold()
+        self._held: Held | None = None
+
+    async def __aenter__(self) -> Held:
+        self._held = await self._lent.__aenter__()
+        return self
+
+    async def __aexit__(self, *error: Any) -> bool | None:
+        return await self._lent.__aexit__(*error)
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` and return their replies."""
+        assert self._held is not None
+        return self._transport._checked(self._node, await self._held.roundtrip(commands, bulk=bulk))

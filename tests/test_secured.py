@@ -1,0 +1,374 @@
+"""TLS with certificates on one side or both, and what is refused; in both fronts."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import datetime
+import functools
+import socket
+import ssl
+import threading
+import time
+
+import numpy as np
+import pytest
+import redis
+import trustme
+from conftest import FRONTS, PATIENCE, assert_same, eventually
+from own_servers import connect, free_port, own_server
+
+import reem
+import reem_async
+from reem_async._server_process import HOST
+from reem_async.errors import ServerFailed
+
+both = pytest.mark.parametrize("name", list(FRONTS))
+LARGE = 1 << 20
+"""Items of a float64 array of 8 MB."""
+
+
+# --- a server behind TLS ---------------------------------------------------------------------------
+
+
+class Certificates:
+    """An authority of one's own and what it has issued, as files."""
+
+    def __init__(self, folder):
+        self._folder = folder
+        self._authority = trustme.CA()
+        self.ca = str(folder / "ca.crt")
+        self._authority.cert_pem.write_to_path(self.ca)
+        self.server = self.issue("server", "localhost", HOST)
+        self.robot = self.issue("robot", "robot@reem.example")
+        self.elsewhere = self.issue("elsewhere", "elsewhere.example")
+        yesterday = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=1)
+        self.expired = self.issue("expired", "localhost", HOST, not_after=yesterday)
+
+    def issue(self, title, *names, **limits):
+        """Certificate and key, two files."""
+        issued = self._authority.issue_cert(*names, **limits)
+        paths = str(self._folder / f"{title}.crt"), str(self._folder / f"{title}.key")
+        issued.cert_chain_pems[0].write_to_path(paths[0])
+        issued.private_key_pem.write_to_path(paths[1])
+        return paths
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory):
+    return Certificates(tmp_path_factory.mktemp("certificates"))
+
+
+@pytest.fixture(scope="module")
+def other_authority(tmp_path_factory):
+    return Certificates(tmp_path_factory.mktemp("others"))
+
+
+def context_for(certificate, ca=None):
+    """A server's TLS settings; with `ca`, clients have to show a certificate of that authority."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(*certificate)
+    if ca is not None:
+        context.load_verify_locations(ca)
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+class Relay:
+    """Ends TLS in front of a server that was built without; `pause` slows down what goes up.
+
+    Attributes:
+        port: Where it listens.
+        connections: How many there were.
+    """
+
+    def __init__(self, socket_path, context, pause=0.0):
+        self.connections = 0
+        self._path = socket_path
+        self._pause = pause
+        self._loop = asyncio.new_event_loop()
+        self._tasks = {}
+        listener = socket.create_server((HOST, 0))
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)  # or the kernel takes it all, however slow
+        starting = asyncio.start_server(self._serve, sock=listener, ssl=context, limit=1 << 16)
+        self._server = self._loop.run_until_complete(starting)
+        self.port = self._server.sockets[0].getsockname()[1]
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+
+    async def _serve(self, reader, writer):
+        self.connections += 1
+        self._tasks[asyncio.current_task()] = writer.transport
+        up_reader, up_writer = await asyncio.open_unix_connection(self._path)
+        pumps = [self._pump(reader, up_writer, self._pause), self._pump(up_reader, writer, 0.0)]
+        tasks = [asyncio.ensure_future(pump) for pump in pumps]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for each in (*tasks, writer.transport, up_writer.transport):
+                each.abort() if isinstance(each, asyncio.BaseTransport) else each.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _pump(self, reader, writer, pause):
+        with contextlib.suppress(OSError):
+            while data := await reader.read(1 << 17):
+                writer.write(data)
+                await writer.drain()
+                if pause and len(data) > 1000:
+                    await asyncio.sleep(pause)
+
+    def close(self):
+        async def end():
+            self._server.close()
+            for transport in self._tasks.values():
+                transport.abort()  # which ends its task
+            await asyncio.gather(*self._tasks, return_exceptions=True)
+            await asyncio.sleep(0.01)  # for the transports to close their sockets
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(PATIENCE)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(PATIENCE)
+        self._loop.close()
+
+
+def tls_lines(certificate, ca, ask):
+    return (
+        f"tls-port {free_port()}",
+        f"tls-cert-file {certificate[0]}",
+        f"tls-key-file {certificate[1]}",
+        f"tls-ca-cert-file {ca}",
+        f"tls-auth-clients {'yes' if ask else 'no'}",
+    )
+
+
+@functools.cache
+def speaks_tls(certificate, ca):
+    """Whether the server program was built with TLS (the one in the extra `server` was not)."""
+    with contextlib.suppress(ServerFailed), own_server(*tls_lines(certificate, ca, False)):
+        return True
+    return False
+
+
+@pytest.fixture(scope="module")
+def behind_tls(certificates):
+    """Starts a real server that speaks TLS itself if it can, else behind a relay; yields its port."""
+
+    @contextlib.contextmanager
+    def start(certificate=certificates.server, ask=False):
+        if speaks_tls(certificates.server, certificates.ca):
+            lines = tls_lines(certificate, certificates.ca, ask)
+            with own_server(*lines):
+                yield int(lines[0].split()[1])
+            return
+        context = context_for(certificate, certificates.ca if ask else None)
+        with own_server() as process, contextlib.closing(Relay(process.socket_path, context)) as relay:
+            yield relay.port
+
+    return start
+
+
+@pytest.fixture(scope="module")
+def guarded(behind_tls):
+    """A server that asks for certificates; yields its port."""
+    with behind_tls(ask=True) as port:
+        yield port
+
+
+@pytest.fixture(scope="module")
+def shielded(behind_tls):
+    """A server that does not ask for certificates; yields its port."""
+    with behind_tls() as port:
+        yield port
+
+
+def url_of(port, host="localhost"):
+    return f"rediss://{host}:{port}"
+
+
+def full_options(certificates):
+    certfile, keyfile = certificates.robot
+    return {"ssl_ca_certs": certificates.ca, "ssl_certfile": certfile, "ssl_keyfile": keyfile}
+
+
+# --- it works ------------------------------------------------------------------------------------------
+
+
+@both
+def test_everything_works_over_tls_with_certificates_on_both_sides(guarded, certificates, name):
+    """Values, arrays of 8 MB and small ones, arithmetic, deleting."""
+    with contextlib.closing(FRONTS[name](url_of(guarded), **full_options(certificates))) as front:
+        image = np.random.default_rng(1).random(LARGE)
+        document = {"n": 1, "l": [1, np.arange(3)], "b": b"x" * 100_000, "image": image}
+        front.write(["foo"], document)
+        for _ in range(2):
+            assert_same(front.read(["foo"]), document)
+        front.increment(["foo", "n"], 2)
+        front.append(["foo", "l"], np.arange(4.0))
+        assert (front.read(["foo", "n"]), front.length(["foo", "l"])) == (3, 3)
+        front.delete(["foo"])
+        assert front.get("foo", None) is None
+
+
+@both
+def test_the_name_is_checked_against_the_address_too(shielded, certificates, name):
+    """localhost and 127.0.0.1 are both in the certificate; options instead of a URL."""
+    for host in ("localhost", HOST):
+        options = {"port": shielded, "ssl": True, "ssl_ca_certs": certificates.ca}
+        with contextlib.closing(FRONTS[name](host, **options)) as front:
+            front.write(["foo"], 1)
+            assert front.read(["foo"]) == 1
+
+
+def test_publishing_and_subscribing_over_tls(guarded, certificates):
+    """In the blocking front, whose subscriptions run on an event loop of its own, with small and large updates."""
+    with reem.RedisInterface(url_of(guarded), **full_options(certificates)) as interface:
+        space = reem.PublishSpace(interface)
+        with reem.SilentSubscriber("c", interface) as mirror:
+            space["c"] = {"n": 0, "image": np.zeros(LARGE)}
+            for number in range(1, 4):
+                space["c"]["image"] = np.full(LARGE, number)
+                space["c"]["n"] = number
+            eventually(lambda: mirror.value() and mirror["n"].read() == 3 and mirror["image"].read()[-1] == 3)
+        del reem.KeyValueStore(interface)["c"]
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
+def test_publishing_and_subscribing_over_tls_on_event_loops(guarded, certificates, loop):
+    """The wire takes redis-py's TLS connection over, on either loop."""
+    new_loop = asyncio.new_event_loop if loop == "asyncio" else pytest.importorskip("uvloop").new_event_loop
+
+    async def follow():
+        async with reem_async.RedisInterface(url_of(guarded), **full_options(certificates)) as interface:
+            space = reem_async.PublishSpace(interface)
+            await space["c"].write({"n": 0, "image": np.zeros(LARGE)})
+            changed = np.random.default_rng(2).random(LARGE)
+
+            async def publish():
+                await space["c"]["image"].write(changed)
+                await space["c"]["n"].write(1)
+
+            async with asyncio.timeout(PATIENCE):
+                updates = reem_async.KeyValueStore(interface)["c"].watch(policy=reem_async.Every(10))
+                assert (await anext(updates)).initial
+                publishing = asyncio.create_task(publish())
+                async for update in updates:
+                    if update.data["n"] == 1:
+                        break
+                await publishing
+            assert_same(update.data["image"], changed)
+            await reem_async.KeyValueStore(interface)["c"].delete()
+
+    with asyncio.Runner(loop_factory=new_loop) as runner:
+        runner.run(follow())
+
+
+@both
+def test_one_tls_connection_serves_many_calls(certificates, name):
+    """A handshake costs more than a call; also after a pause, in which the blocking front looks at the socket."""
+    with own_server() as process:
+        relay = Relay(process.socket_path, context_for(certificates.server))
+        with contextlib.closing(relay):
+            with contextlib.closing(FRONTS[name](url_of(relay.port), ssl_ca_certs=certificates.ca)) as front:
+                for number in range(5):
+                    front.write(["foo"], number)
+                time.sleep(1.1)
+                assert front.read(["foo"]) == 4
+            assert relay.connections == 1
+
+
+@both
+def test_a_slow_link_is_no_broken_one(certificates, name):
+    """8 MB that take several times the time limit arrive, since bytes move all the while."""
+    with own_server() as process:
+        relay = Relay(process.socket_path, context_for(certificates.server), pause=0.02)
+        with contextlib.closing(relay):
+            options = {"ssl_ca_certs": certificates.ca, "timeout": 0.25}
+            with contextlib.closing(FRONTS[name](url_of(relay.port), **options)) as front:
+                begun = time.monotonic()
+                front.write(["foo"], np.arange(LARGE))
+                assert time.monotonic() - begun > 0.6, "or this shows nothing"
+                assert front.read(["foo"])[-1] == LARGE - 1
+
+
+# --- what is refused ----------------------------------------------------------------------------------------
+
+
+def assert_refused(name, url, *words, **options):
+    """At no call is anything sent; told within a second or so, in words that help."""
+    begun = time.monotonic()
+    with pytest.raises(reem.TlsRefused) as caught:
+        connect(name, url, **options)
+    assert time.monotonic() - begun < 2
+    assert isinstance(caught.value, redis.exceptions.ConnectionError)
+    for word in words:
+        assert word in str(caught.value)
+
+
+@both
+def test_a_certificate_with_another_name_is_refused(behind_tls, certificates, name):
+    """Somebody else's server in its place is not talked to; nor is the right one under a wrong name."""
+    with behind_tls(certificates.elsewhere) as port:
+        for host in ("localhost", HOST):
+            assert_refused(name, url_of(port, host), "mismatch", "name", ssl_ca_certs=certificates.ca)
+        unchecked = {"ssl_ca_certs": certificates.ca, "ssl_check_hostname": False}
+        connect(name, url_of(port), **unchecked)  # it was the name, and nothing else
+
+
+@both
+def test_an_expired_certificate_is_refused(behind_tls, certificates, name):
+    with behind_tls(certificates.expired) as port:
+        assert_refused(name, url_of(port), "expired", "renew", ssl_ca_certs=certificates.ca)
+
+
+@both
+def test_an_authority_that_is_not_known_is_refused(shielded, other_authority, name):
+    """The system's authorities, and another one than the server's."""
+    for options in ({}, {"ssl_ca_certs": other_authority.ca}):
+        assert_refused(name, url_of(shielded), "ssl_ca_certs=", **options)
+
+
+@both
+def test_a_client_without_the_right_certificate_is_refused(guarded, certificates, other_authority, name):
+    """None, and one of another authority."""
+    certfile, keyfile = other_authority.robot
+    strange = {"ssl_certfile": certfile, "ssl_keyfile": keyfile}
+    for options in ({}, strange):
+        assert_refused(name, url_of(guarded), "ssl_certfile=", ssl_ca_certs=certificates.ca, **options)
+
+
+@both
+def test_a_server_that_does_not_speak_tls_is_told(certificates, name):
+    with own_server() as process, pytest.raises(reem.NotConnected, match="does not speak TLS"):
+        connect(name, url_of(process.port), ssl_ca_certs=certificates.ca)
+
+
+@both
+def test_a_server_that_speaks_tls_only_is_told(shielded, name):
+    """The remedy is in the text; the password is not sent to a port that cannot read it."""
+    with pytest.raises(reem.NotConnected, match="rediss://"):
+        connect(name, f"redis://localhost:{shielded}")
+
+
+def test_tls_is_1_2_or_newer(certificates):
+    """Older versions cannot even be asked for."""
+    for version in (ssl.TLSVersion.TLSv1_1, ssl.TLSVersion.TLSv1, ssl.TLSVersion.MINIMUM_SUPPORTED, 769):
+        with pytest.raises(reem.BadValue, match=r"TLS before 1\.2"):
+            reem.RedisInterface("rediss://localhost", ssl_min_version=version)
+    plain = reem_async.RedisInterface("rediss://localhost", ssl_ca_certs=certificates.ca).session.options
+    lowest = plain.asynchronous_connection().ssl_context.get().minimum_version
+    assert lowest == plain.blocking_connection().ssl_min_version == ssl.TLSVersion.TLSv1_2
+
+
+def test_options_that_would_only_fail_later_are_refused_at_once(certificates, tmp_path):
+    """Missing files, options of TLS without TLS, TLS where it makes no sense."""
+    for option in ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile"):
+        with pytest.raises(reem.BadValue, match=option):
+            reem.RedisInterface("rediss://localhost", **{option: str(tmp_path / "missing")})
+    with pytest.raises(reem.BadType, match="rediss://"):
+        reem.RedisInterface("redis://localhost", ssl_ca_certs=certificates.ca)
+    with pytest.raises(reem.BadValue, match="unix"):
+        reem.RedisInterface("unix:///tmp/x", ssl=True)
+    with pytest.raises(reem.BadValue, match="never"):
+        reem.RedisInterface("rediss://localhost", ssl_cert_reqs="never")
+    with pytest.raises(reem.BadValue, match="options"):
+        reem.RedisInterface("localhost", port="abc")
