@@ -57,6 +57,7 @@ class _Times:
         for place, pieces in found.items():
             times = np.sort(np.concatenate(pieces)).astype(np.float64) / 1e9
             self._keys.setdefault(str(place[0]), []).append((place, times))
+        self._start = min([float(times[0]) for times in self.concerning(()) if len(times)], default=0.0)
 
     def concerning(self, path: Path) -> list[np.ndarray[Any, Any]]:
         """Return the times of all that concerns `path`, all there are for the root."""
@@ -71,9 +72,10 @@ class _Times:
 
     def rate(self, name: str, at: float) -> float | None:
         """Return updates per second of a key in the seconds before `at`."""
-        pairs = [np.searchsorted(times, (at - _RATE_SECONDS, at), "right") for times in self.concerning((name,))]
+        over = min(_RATE_SECONDS, max(at - self._start, 1.0))
+        pairs = [np.searchsorted(times, (at - over, at), "right") for times in self.concerning((name,))]
         count = sum([int(last - first) for first, last in pairs])
-        return count / _RATE_SECONDS if count else None
+        return count / over if count else None
 
 
 class LogSource:
