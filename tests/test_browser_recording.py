@@ -119,4 +119,5 @@ def test_the_rate_near_the_start_is_of_the_time_there_was(run, steps):
     """Not of five seconds, four of which were before the recording."""
     source = LogSource(run)
     count = sum(int(np.searchsorted(times, steps[-1], "right")) for times in source._times.concerning(("cam",)))
+    source.log.close()
     assert source._times.rate("cam", steps[-1]) == pytest.approx(count / 1.0, rel=0.01)

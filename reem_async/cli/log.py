@@ -1,0 +1,172 @@
+"""`reem log`: what is in a recording, and out of it into other formats."""
+
+from __future__ import annotations
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.cli.options import AsJson
+from reem_async.cli.output import clean, columns, emit, emit_json, note, size_text, styled
+from reem_async.cli.record import tools
+from reem_async.cli.running import guarded
+
+if TYPE_CHECKING:
+    from reem_async.recording import ChannelSummary, Log
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Look into recordings, and export them.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+_File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
+
+
+@app.command()
+def info(
+    file: _File,
+    verify: Annotated[bool, typer.Option("--verify", help="Read all of the file and count what is damaged.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Show what a recording holds: when, what, how often, how much, and what is missing."""
+
+    def work() -> int:
+        with tools("open_log")(file) as log:
+            if verify:
+                log.verify()
+            if as_json:
+                emit_json(_summary(log))
+            else:
+                _print(log)
+            return 1 if verify and log.damaged else 0
+
+    _guard("log info", work)
+
+
+def _guard(name: str, work: Any) -> None:
+    code = guarded(name, work)
+    if code:
+        raise typer.Exit(code)
+
+
+def _summary(log: Log) -> dict[str, Any]:
+    return {
+        "file": str(log.path),
+        "bytes": log.path.stat().st_size,
+        "start": log.start,
+        "end": log.end,
+        "duration": log.duration,
+        "complete": log.indexed,
+        "damaged": log.damaged,
+        "gaps": [{"time": time, "path": path, "missed": missed} for time, path, missed in log.gaps()],
+        "metadata": log.metadata,
+        "channels": [_channel(each) for each in log.channels()],
+    }
+
+
+def _channel(each: ChannelSummary) -> dict[str, Any]:
+    names = ("topic", "path", "role", "kind", "schema", "messages", "bytes", "first", "last", "rate")
+    return {name: getattr(each, name) for name in names}
+
+
+def _print(log: Log) -> None:
+    metadata, channels = log.metadata, log.channels()
+    damage = f"; {log.damaged} damaged records are skipped" if log.damaged else ""
+    complete = "complete" if log.indexed else "not ended properly: the last second may be missing"
+    lines = [
+        ("file", f"{log.path}, {size_text(log.path.stat().st_size)}, {complete}{damage}"),
+        ("time", f"{_when(log.start)} to {_when(log.end)}, {log.duration:.1f} s"),
+        ("messages", f"{sum(each.messages for each in channels)} in {len(channels)} channels"),
+        (
+            "recorded",
+            f"{metadata.get('patterns') or 'samples'} by {metadata.get('user', '')}@{metadata.get('host', '')}",
+        ),
+        ("server", metadata.get("server", "")),
+        ("missing", _missing(log)),
+    ]
+    for label, text in lines:
+        emit(styled(f"{label:9}", "cyan") + clean(text))
+    emit("")
+    rows = [
+        (
+            clean(each.topic),
+            clean(f"{each.role} {each.path}".strip() if each.topic.startswith("/_reem") else each.role),
+            clean(each.schema),
+            str(each.messages),
+            f"{each.rate:.1f} Hz",
+            size_text(each.bytes),
+        )
+        for each in channels
+    ]
+    columns(rows, ("bold", "", "cyan", "", "yellow", "green"), right=frozenset({3, 4, 5}), shrink=(0, 2, 1))
+
+
+def _missing(log: Log) -> str:
+    counts = log.metadata
+    if "messages" not in counts:
+        counts = dict.fromkeys(("dropped", "skipped"), "?")
+    gaps = list(log.gaps())
+    text = f"{counts.get('dropped')} dropped, {counts.get('skipped')} skipped, {len(gaps)} gaps"
+    worst = [
+        f"{key.removeprefix('not recorded: ')} {value}" for key, value in counts.items() if key.startswith("not rec")
+    ]
+    return text + (f" ({', '.join(worst[:5])})" if worst else "")
+
+
+def _when(instant: float) -> str:
+    return datetime.datetime.fromtimestamp(instant).astimezone().isoformat(sep=" ", timespec="milliseconds")
+
+
+@app.command()
+def export(
+    file: _File,
+    patterns: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
+    ] = None,
+    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="csv, npz or parquet.")] = "csv",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="The file; the recording's name with another end if not given."
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write a recording as CSV, npz or Parquet.
+
+    CSV and Parquet have a row for each update and a column for each number or text; npz has an array of
+    all values for each path, pictures too, and their times.
+    """
+
+    def work() -> int:
+        from reem_async.cli.running import USAGE, Refused
+
+        target = output or file.with_suffix(f".{to}")
+        with tools("open_log")(file) as log:
+            from reem_async.recording.export import export as write
+
+            result = write(log, to, target, patterns or ["*"])
+        for path, why in result.left_out.items():
+            note(f"left out: {path}: {why}")
+        if not result.columns:
+            raise Refused("nothing was exported", USAGE)
+        if as_json:
+            emit_json(
+                {"file": str(target), "rows": result.rows, "columns": result.columns, "left_out": result.left_out}
+            )
+        else:
+            emit(
+                clean(
+                    f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(target.stat().st_size)}"
+                )
+            )
+        return 0
+
+    _guard("log export", work)

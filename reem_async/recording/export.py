@@ -1,0 +1,234 @@
+"""Recordings as CSV, npz or Parquet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadValue
+from ..plan.paths import Path, suffix
+from .log import Log
+from .stored import Stored, is_inline
+
+__all__ = ["FORMATS", "Export", "export"]
+
+_ROWS = 10_000
+
+
+class Export:
+    """What became of an export.
+
+    Attributes:
+        rows: Rows written, or instants of all paths together.
+        columns: What was written, by name.
+        left_out: What this format cannot hold, by path, and why.
+    """
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.columns: list[str] = []
+        self.left_out: dict[str, str] = {}
+
+
+def export(log: Log, kind: str, target: str | FilePath, patterns: Sequence[str] = ("*",)) -> Export:
+    """Write what was recorded into a file that other programs read.
+
+    Args:
+        log: The recording.
+        kind: "csv" or "parquet": a row for each update, a column for each number or text, empty where it
+            was not updated; arrays of more than 64 numbers are left out. "npz": for each path an array of all
+            its values, time first, and `path.time`.
+        target: The file; it must not exist.
+        patterns: Which paths.
+
+    Raises:
+        BadValue: Another kind, the file exists, or there is nothing to write.
+    """
+    if kind not in FORMATS:
+        raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
+    if FilePath(target).exists():
+        raise BadValue(f"{target} is there already; choose another name")
+    result = Export()
+    FORMATS[kind](log, FilePath(target), patterns, result)
+    return result
+
+
+def _rows(log: Log, patterns: Sequence[str], result: Export) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield the time of each update and its numbers and texts by name."""
+    for time, path, value in log.outlines_of(patterns):
+        cells = dict(_leaves(path, value, result))
+        if cells:
+            yield time, cells
+
+
+def _leaves(path: Path, value: Any, result: Export) -> Iterator[tuple[str, Any]]:
+    """Yield everything that fits into a cell, by the text of its path."""
+    if isinstance(value, np.ndarray) and is_inline(value):
+        value = value.tolist()
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves((*path, key), item, result)
+    elif value is None or isinstance(value, bool | int | float | str):
+        yield _name(path), value
+    else:
+        result.left_out.setdefault(_name(path), "an array, a long list, or bytes; npz has arrays")
+
+
+def _name(path: Path) -> str:
+    return suffix(path).removeprefix(".")
+
+
+def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    """Write rows; the columns must be known first, so it is read twice."""
+    columns: dict[str, None] = {}
+    for _, cells in _rows(log, patterns, result):
+        columns.update(dict.fromkeys(cells))
+    result.columns = _found(list(columns))
+    with target.open("x", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", *result.columns])
+        for time, cells in _rows(log, patterns, Export()):
+            result.rows += 1
+            writer.writerow([f"{time:.6f}", *[cells.get(name) for name in result.columns]])
+
+
+def _found(columns: list[str]) -> list[str]:
+    if not columns:
+        raise BadValue("nothing of this can be exported so: no number or text was recorded under these patterns")
+    return columns
+
+
+def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    try:
+        pyarrow: Any = import_module("pyarrow")
+        parquet: Any = import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
+    kinds: dict[str, set[type]] = {}
+    for _, cells in _rows(log, patterns, result):
+        for name, value in cells.items():
+            kinds.setdefault(name, set()).add(_kind(value))
+    result.columns = _found(list(kinds))
+    forms = {name: _form(found - {type(None)}) for name, found in kinds.items()}
+    arrow = {
+        bool: pyarrow.bool_(),
+        int: pyarrow.int64(),
+        float: pyarrow.float64(),
+        str: pyarrow.string(),
+    }
+    fields = [("time", pyarrow.timestamp("us", "UTC")), *[(name, arrow[forms[name]]) for name in result.columns]]
+    schema = pyarrow.schema(fields)
+    rows = _rows(log, patterns, Export())
+    with parquet.ParquetWriter(target, schema) as writer:
+        while batch := list(itertools.islice(rows, _ROWS)):
+            data = {"time": [round(time * 1e6) for time, _ in batch]}
+            for name in result.columns:
+                data[name] = [_cell(cells.get(name), forms[name]) for _, cells in batch]
+            writer.write_table(pyarrow.table(data, schema=schema))
+            result.rows += len(batch)
+
+
+def _kind(value: Any) -> type:
+    """Return the type of a cell; ints that no column of integers holds are text."""
+    return str if type(value) is int and not -(2**63) <= value < 2**63 else type(value)
+
+
+def _form(kinds: set[type]) -> type:
+    """Return the one type that holds values of all these."""
+    if len(kinds) == 1:
+        return next(iter(kinds))
+    return float if kinds == {int, float} else str
+
+
+def _cell(value: Any, form: type) -> Any:
+    if value is None:
+        return None
+    return value if type(value) is form else form(value)
+
+
+def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    """Write each path as it is read, array by array: a recording may be larger than memory."""
+    with zipfile.ZipFile(target, "x", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for path in _array_paths(log, patterns, result):
+            times, form, count = _shape(log, path)
+            if form is None:
+                result.left_out[_name(path)] = "its type or shape changes, or it cannot be read"
+                continue
+            result.rows += count
+            result.columns.append(_name(path))
+            _write(archive, f"{_name(path)}.time", times)
+            dtype, shape = form
+            with archive.open(f"{_name(path)}.npy", "w", force_zip64=True) as file:
+                header = {
+                    "descr": np.lib.format.dtype_to_descr(dtype),
+                    "fortran_order": False,
+                    "shape": (count, *shape),
+                }
+                np.lib.format.write_array_header_2_0(file, header)
+                for _, value in itertools.islice(log[path].values(), count):
+                    file.write(np.ascontiguousarray(np.asarray(value, dtype)).tobytes())
+    if not result.columns:
+        target.unlink()
+        _found([])
+
+
+def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, allow_pickle=False)
+    archive.writestr(f"{name}.npy", buffer.getvalue())
+
+
+def _array_paths(log: Log, patterns: Sequence[str], result: Export) -> list[Path]:
+    """Return the paths of everything in any update that may be stacked."""
+    found: dict[Path, None] = {}
+    for _, path, tree in log.outlines_of(patterns):
+        found.update(dict.fromkeys(_places(path, tree, result)))
+    return sorted(found, key=_name)
+
+
+def _places(path: Path, value: Any, result: Export) -> Iterator[Path]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _places((*path, key), item, result)
+    elif isinstance(value, list) and not all(isinstance(item, bool | int | float) for item in value):
+        for index, item in enumerate(value):
+            yield from _places((*path, index), item, result)
+    elif isinstance(value, Stored) and value.label not in ("numpy", "list"):
+        result.left_out[_name(path)] = f"{value.label}, not an array"
+    elif value is not None:
+        yield path
+
+
+Form = tuple[np.dtype[Any], tuple[int, ...]]
+
+
+def _shape(log: Log, path: Path) -> tuple[np.ndarray[Any, Any], Form | None, int]:
+    """Return the times of a path's values, the dtype and shape that fit all (None if none does), and how many."""
+    times: list[float] = []
+    forms: set[Form] = set()
+    for time, value in log[path].values():
+        times.append(time)
+        array = np.asarray(value) if isinstance(value, bool | int | float | str | list | np.ndarray) else None
+        if array is None or array.dtype.hasobject:
+            return np.array(times), None, 0
+        forms.add((array.dtype, array.shape))
+    kinds = {dtype.kind for dtype, _ in forms}
+    if len({shape for _, shape in forms}) != 1 or not (len(forms) == 1 or kinds <= set("iuf") or kinds == {"U"}):
+        return np.array(times), None, 0
+    dtype = np.result_type(*[dtype for dtype, _ in forms])
+    return np.array(times), (dtype, next(iter(forms))[1]), len(times)
+
+
+FORMATS: dict[str, Callable[[Log, FilePath, Sequence[str], Export], None]] = {
+    "csv": _csv,
+    "npz": _npz,
+    "parquet": _parquet,
+}

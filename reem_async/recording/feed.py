@@ -1,0 +1,232 @@
+"""One top-level key while it is recorded: its updates in order, those that are only announced fetched.
+
+While a value is on its way the updates behind it wait, so that what is written is in the order in which it
+was published. Each fetch brings the note of the last notice that it includes: so it is known which update
+the value belongs to, and which ones before it will never be seen.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import collections
+import dataclasses
+import logging
+import time
+from typing import Any, Protocol
+
+from ..background import in_background
+from ..errors import BadData, RedisError
+from ..monitor import ANNOUNCED, Event
+from ..plan.paths import Path, below, show
+from ..plan.patterns import Pattern
+from ..plan.trees import MISSING
+from ..session import Session
+from .fetch import fetch
+from .scribe import Operation, Scribe
+from .state import pruned
+from .times import AFTER, Clock
+
+__all__ = ["Collector", "Feed", "Item"]
+
+logger = logging.getLogger("reem.recording")
+
+_PAUSE = 0.1
+"""Seconds after a read that failed."""
+_READ_RATE = 8e6
+"""Bytes a second that are read of keys of which nothing is published."""
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Item:
+    """One piece of news that waits for its turn.
+
+    Attributes:
+        role: "update", "delete", "state" or "keyframe".
+        path: The full path.
+        value: What is there; ANNOUNCED if it must be fetched.
+        stamp: Log time, publish time and number.
+        size: Its bytes.
+        kind: "pub", or "kvs" if it was sampled or read.
+    """
+
+    role: str
+    path: Path
+    value: Any
+    stamp: tuple[int, int, int]
+    size: int = 0
+    kind: str = "pub"
+
+
+class Collector(Protocol):
+    """What a feed needs of the recorder."""
+
+    session: Session
+    scribe: Scribe
+    clock: Clock
+    patterns: list[Pattern]
+    fetching: asyncio.Semaphore
+
+    async def fence(self) -> None:
+        """Wait until everything published before now has been handed to the feeds."""
+
+    def failed(self, error: Exception) -> None:
+        """End the recording: something went wrong that should not."""
+
+
+class Feed:
+    """The updates of one top-level key.
+
+    Args:
+        collector: The recorder.
+        name: The key.
+
+    Attributes:
+        busy: The task that fetches, None if there is nothing to fetch.
+        news: Something was published since the last keyframe.
+        next_read: When it may be read again for nothing, on the monotonic clock.
+    """
+
+    def __init__(self, collector: Collector, name: str) -> None:
+        self._collector = collector
+        self._name = name
+        self._keys = collector.session.keys(name)
+        self._items: collections.deque[Item] = collections.deque()
+        self._heard: dict[str, int] = {}
+        self._since: list[tuple[str, int, int]] = []  # notices that arrived while a fetch was on its way
+        self._known = False
+        self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
+        self.busy: asyncio.Task[None] | None = None
+        self.news = False
+        self.next_read = 0.0
+
+    def on_event(self, event: Event) -> None:
+        """Take one update."""
+        stamp = self._collector.clock.stamp(event.received), round(event.time * 1e6) * 1000, event.sequence
+        self._heard[event.publisher] = event.sequence
+        if len(self._heard) > 1000:
+            del self._heard[next(iter(self._heard))]
+        if self.busy is not None:
+            self._since.append((event.publisher, event.sequence, stamp[0]))
+        self.news = True
+        if event.missed:  # a broken connection is noticed by the recorder, for all keys
+            self.lost(event.missed)
+        elif not self._known and len(event.path) > 1:
+            self.read()
+        self._known = self._known or len(event.path) == 1
+        if self._whole or any(pattern.concerns(event.path) for pattern in self._collector.patterns):
+            self._add(Item("delete" if event.deleted else "update", event.path, event.value, stamp, event.size))
+
+    def lost(self, missed: int | None) -> None:
+        """Note that updates were lost, and read the key anew."""
+        stamp = self._collector.clock.stamp(), 0, 0
+        self._collector.scribe.put(Operation("gap", (self._name,), missed, stamp), 0)
+        self.read()
+
+    def read(self) -> None:
+        """Read the whole key from the server, if that is not about to happen anyway."""
+        self._known = True
+        if not any(item.role == "state" for item in self._items):
+            self._add(Item("state", (self._name,), ANNOUNCED, (self._collector.clock.stamp(), 0, 0), kind="kvs"))
+
+    def gone(self) -> None:
+        """Note that the server does not have the key any more."""
+        self._add(Item("state", (self._name,), MISSING, (self._collector.clock.stamp(), 0, 0), kind="kvs"))
+
+    def keyframe(self, number: int) -> None:
+        """Write the whole key as the recording has it."""
+        self._add(Item("keyframe", (self._name,), None, (self._collector.clock.stamp(), 0, number)))
+
+    def sampled(self, path: Path, value: Any, size: int) -> None:
+        """Take what was read at a path: MISSING if there was nothing."""
+        now = self._collector.clock.stamp()
+        self._add(Item("delete" if value is MISSING else "update", path, value, (now, now, 0), size, "kvs"))
+
+    def _add(self, item: Item) -> None:
+        if not self._items and item.value is not ANNOUNCED:
+            self._emit(item)
+            return
+        self._items.append(item)
+        if self.busy is None:
+            self.busy = in_background(self._drain(), f"reem record {self._name}")
+
+    def _emit(self, item: Item) -> None:
+        """Hand an item to the writing thread."""
+        role, value = item.role, item.value
+        if not self._whole and (role == "state" or (role == "update" and item.kind == "pub")):
+            value = value if value is MISSING else pruned(value, item.path, self._collector.patterns)
+            role = "delete" if role == "update" and value is MISSING else role
+        self._collector.scribe.put(Operation(role, item.path, value, item.stamp, item.kind), item.size)
+
+    async def _drain(self) -> None:
+        """Emit what waits, in order, fetching what has to be."""
+        try:
+            while self._items:
+                head = self._items[0]
+                if head.value is not ANNOUNCED:
+                    self._emit(self._items.popleft())
+                elif not await self._fetched(head):
+                    await asyncio.sleep(_PAUSE)
+        except Exception as error:  # nobody waits for this task: the recording must not go on as if nothing were
+            self._collector.failed(error)
+        finally:
+            self.busy = None
+
+    async def _fetched(self, head: Item) -> bool:
+        """Fetch what the first item announces and put it where it belongs; return whether that worked."""
+        collector = self._collector
+        try:
+            async with collector.fetching:
+                self._since.clear()
+                last = self._items[-1].stamp[0]  # what has been announced until now is older than the reply
+                value, size, publisher, number = await fetch(collector.session, self._keys, head.path[1:])
+            if number and self._heard.get(publisher, 0) < number:
+                await collector.fence()
+        except (RedisError, OSError, BadData) as error:
+            self._give_up(head, error)
+            return False
+        known = [log for who, count, log in self._since if who == publisher and count == number]
+        self.next_read = time.monotonic() + size / _READ_RATE
+        self._place(head, value, size, max([last, *known]))
+        return True
+
+    def _give_up(self, head: Item, error: Exception) -> None:
+        """Leave out what cannot be fetched; the key is read anew later."""
+        logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
+        self._items.popleft()
+        if head.role == "update":
+            self._collector.scribe.counts.skip(head.path)
+        self._collector.scribe.behind.add(self._name)
+
+    def _place(self, head: Item, value: Any, size: int, covered: int) -> None:
+        """Emit a fetched value as that of the newest update it includes; the older ones of its path are skipped."""
+        items = [self._items.popleft() for _ in range(self._newest(head, covered) + 1)]
+        announced = [item for item in items if item.path == head.path and item.value is ANNOUNCED]
+        target = head if head.role == "state" else announced[-1]
+        stamp = target.stamp
+        if target is not items[-1] or target.role == "state":  # it goes behind all that it includes
+            stamp = items[-1].stamp[0] + AFTER, *target.stamp[1:]
+        kept = []
+        for item in items:
+            if item is target:
+                continue
+            if item.role != "keyframe" and not below(item.path, head.path):
+                kept.append(item)
+            elif item.value is not ANNOUNCED:
+                self._emit(item)
+            elif item.role == "update":
+                self._collector.scribe.counts.skip(item.path)
+        role = "delete" if value is MISSING and target.role == "update" else target.role
+        self._emit(dataclasses.replace(target, role=role, value=value, size=size, stamp=stamp))
+        self._items.extendleft(reversed(kept))
+
+    def _newest(self, head: Item, covered: int) -> int:
+        """Return the place of the last item that a fetched value includes."""
+        newest = 0
+        for place, item in enumerate(self._items):
+            if item.stamp[0] > covered:
+                break
+            if head.role == "state" or (item.role != "keyframe" and below(item.path, head.path)):
+                newest = place
+            elif item.role != "keyframe" and below(head.path, item.path):
+                break  # what holds it was written as a whole
+        return newest

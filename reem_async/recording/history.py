@@ -1,0 +1,47 @@
+"""Values over time as one array, where they have one shape."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+__all__ = ["stacked"]
+
+
+def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
+    """Return values as one array if they are all numbers, arrays of one kind, or lists of as many numbers; else as is.
+
+    Numbers become bool, int64, uint64 or float64, whichever holds them all exactly.
+    """
+    if not values:
+        return np.empty(0)
+    kinds = set(map(type, values))
+    if kinds == {np.ndarray}:
+        forms = {(value.dtype, value.shape) for value in values}
+        return np.stack(values) if len(forms) == 1 else values
+    if kinds == {list}:
+        lengths = {len(value) for value in values}
+        numbers = (
+            _numbers([item for value in values for item in value]) if len(lengths) == 1 and lengths != {0} else None
+        )
+        return values if numbers is None else numbers.reshape(len(values), -1)
+    numbers = _numbers(values)
+    return values if numbers is None else numbers
+
+
+def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
+    """Return numbers as an array that holds them all exactly, None if there is none."""
+    kinds = set(map(type, values))
+    if kinds == {bool}:
+        return np.array(values, bool)
+    if kinds == {int}:
+        low, high = min(values), max(values)
+        if low >= -(2**63) and high < 2**63:
+            return np.array(values, np.int64)
+        return np.array(values, np.uint64) if low >= 0 else None
+    if kinds == {float}:
+        return np.array(values, np.float64)
+    if kinds == {int, float} and all(type(value) is float or abs(value) <= 2**53 for value in values):
+        return np.array(values, np.float64)
+    return None

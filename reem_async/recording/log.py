@@ -1,0 +1,370 @@
+"""Recordings, read: what was anywhere at any instant."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ..catalog import Outline
+from ..errors import MissingKey
+from ..plan.paths import Path, parse, show
+from ..plan.patterns import parse_pattern
+from ..plan.trees import MISSING
+from ..ships.base import SpecialDatatypeShip
+from ..ships.registry import Ships, default_ships
+from ..transport.recorder import CommandRecorder
+from .container import Container
+from .history import stacked
+from .outlines import outlined
+from .past import Past, Stream
+from .state import pruned
+from .stored import Stored, resolve, same
+from .timeline import Ref
+from .times import Instant, nanoseconds, seconds
+
+__all__ = ["ArrayHandle", "ChannelSummary", "Log", "LogPath", "LogUpdate", "open_log"]
+
+_CACHED_TREES = 256
+_END = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class LogUpdate:
+    """One recorded update.
+
+    Attributes:
+        time: When it was received, in seconds since 1970 on the recorder's clock.
+        path: What was updated, top-level key first.
+        value: What is there now; None if it was deleted.
+        deleted: What was there is gone.
+        published: When it was published, in seconds since 1970 on the publisher's clock.
+        sequence: Its number among its publisher's updates of the top-level key.
+        kind: "pub" if it was published; "kvs" if it was sampled, or found when the key was read.
+    """
+
+    time: float
+    path: Path
+    value: Any
+    deleted: bool
+    published: float
+    sequence: int
+    kind: str
+
+    @property
+    def shown(self) -> str:
+        """The path as people write it."""
+        return show(self.path)
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayHandle:
+    """An array (or bytes, a long list, a custom value) of a past tree, not yet read.
+
+    Attributes:
+        label: "numpy", "bytes", "list", or the label of a custom ship.
+        dtype: The dtype of an array as text, else "".
+        shape: The shape of an array, else None.
+        size: Its bytes.
+        summary: What it is, such as "uint8[480,640,3]".
+    """
+
+    label: str
+    dtype: str
+    shape: tuple[int, ...] | None
+    size: int
+    summary: str
+    _stored: Stored
+    _past: Past
+
+    def read(self) -> Any:
+        """Return the value, read-only; raises DamagedRecording if it is."""
+        return self._past.value(self._stored)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSummary:
+    """What a channel of the file holds.
+
+    Attributes:
+        topic: What viewers call it.
+        path: The path it is about; "" if it is about the recording itself.
+        role: "update", "part", "delete", "state", "keyframe", "gap", or "".
+        kind: "pub", "kvs" or "".
+        schema: The name of its schema.
+        messages: How many.
+        bytes: Their size, before compression.
+        first: The instant of the first, 0 if there is none.
+        last: The instant of the last.
+    """
+
+    topic: str
+    path: str
+    role: str
+    kind: str
+    schema: str
+    messages: int
+    bytes: int
+    first: float
+    last: float
+
+    @property
+    def rate(self) -> float:
+        """Messages a second, from the first to the last."""
+        return (self.messages - 1) / (self.last - self.first) if self.last > self.first else 0.0
+
+
+def open_log(path: str | FilePath, ships: Sequence[SpecialDatatypeShip] | None = None) -> Log:
+    """Open a recording; one whose recorder was killed, or that was damaged, opens too.
+
+    Args:
+        path: The file.
+        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
+
+    Raises:
+        DamagedRecording: Not a recording of REEM.
+        OSError: The file cannot be read.
+    """
+    return Log(path, ships)
+
+
+class Log:
+    """A recording. `log["foo.bar"].at(t)` is what was at foo.bar at the instant t.
+
+    Instants are seconds since 1970 as float, on the clock of the recorder, or numpy datetime64.
+    Any thread may use it; nothing here waits for a server.
+
+    Args:
+        path: The file.
+        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
+    """
+
+    def __init__(self, path: str | FilePath, ships: Sequence[SpecialDatatypeShip] | None = None) -> None:
+        self.path = FilePath(path)
+        self._container = Container(self.path)
+        try:
+            self._past = Past(self._container, Ships(default_ships() if ships is None else ships, CommandRecorder))
+        except BaseException:
+            self._container.close()
+            raise
+        self._trees: OrderedDict[tuple[str, int], Any] = OrderedDict()
+        self._lock = threading.RLock()
+
+    @property
+    def start(self) -> float:
+        """The instant of the first message; 0 if there is none."""
+        return seconds(min((info.start for info in self._container.chunks), default=0))
+
+    @property
+    def end(self) -> float:
+        """The instant of the last message; 0 if there is none."""
+        return seconds(max((info.end for info in self._container.chunks), default=0))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first message to the last."""
+        return self.end - self.start
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the recording was ended properly; if not, its end may be missing."""
+        return self._container.indexed
+
+    @property
+    def damaged(self) -> int:
+        """How many records of the file were found to be damaged until now; they are skipped."""
+        return self._container.damaged
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the recorder says of itself: who, when, versions, patterns, and at the end its counts."""
+        said: dict[str, str] = {}
+        for record in self._container.metadata:
+            if record.name == "reem":
+                said.update(record.metadata)
+        return said
+
+    def names(self) -> list[str]:
+        """Return the top-level keys of which anything was recorded, sorted."""
+        return sorted(self._past.names)
+
+    def paths(self) -> list[Path]:
+        """Return the paths that were updated while it was recorded, sorted as text."""
+        return sorted({stream.path for stream in self._past.streams if stream.role == "update"}, key=show)
+
+    def __getitem__(self, path: str | Path) -> LogPath:
+        return LogPath(self, parse(path) if isinstance(path, str) else tuple(path))
+
+    def value_at(self, path: str | Path, instant: Instant) -> Any:
+        """Return what was at a path at an instant, arrays included; the root path "" is the whole tree.
+
+        Raises:
+            MissingKey: Nothing was there.
+            DamagedRecording: What was there cannot be read any more.
+        """
+        place = parse(path) if isinstance(path, str) else tuple(path)
+        if not place:
+            trees = self._trees_at(nanoseconds(instant))
+            return {name: resolve(tree, self._past.value) for name, tree in trees.items()}
+        found = self._at(place, nanoseconds(instant))
+        if found is MISSING:
+            raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
+        return resolve(found, self._past.value)
+
+    def tree_at(self, instant: Instant) -> dict[str, Any]:
+        """Return all that there was at an instant: a dict by top-level key; longer arrays as `ArrayHandle`."""
+        trees = self._trees_at(nanoseconds(instant))
+        return {name: resolve(tree, self._handle) for name, tree in trees.items()}
+
+    def _handle(self, it: Stored) -> ArrayHandle:
+        return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._past)
+
+    def outline_at(self, instant: Instant) -> dict[str, Outline]:
+        """Return what there was at an instant by top-level key: types and sizes; arrays are not read."""
+        return {name: outlined(tree, (name,)) for name, tree in self._trees_at(nanoseconds(instant)).items()}
+
+    def _trees_at(self, ns: int) -> dict[str, Any]:
+        found = [(name, self._tree(name, ns)) for name in self.names()]
+        return {name: tree for name, tree in found if tree is not MISSING}
+
+    def _tree(self, name: str, ns: int) -> Any:
+        """Return a whole key; the last few hundred are kept, as neighbours in time share them."""
+        with self._lock:
+            changed = self._past.changed(name, ns)
+            tree = self._trees.pop((name, changed), None)
+            tree = self._past.tree((name,), ns) if tree is None else tree
+            self._trees[name, changed] = tree
+            while len(self._trees) > max(_CACHED_TREES, 2 * len(self._past.names)):
+                self._trees.popitem(last=False)
+            return tree
+
+    def _at(self, path: Path, ns: int) -> Any:
+        with self._lock:
+            return self._past.tree(path, ns)
+
+    def changes(self, after: Instant, until: Instant) -> set[Path]:
+        """Return the paths that were updated after one instant and not after another."""
+        return self._past.changes(nanoseconds(after), nanoseconds(until))
+
+    def gaps(self) -> list[tuple[float, str, int | None]]:
+        """Return where updates were lost: when this was noticed, of which path, and how many (None: unknown)."""
+        return [(seconds(ref.time), show(stream.path), missed) for ref, stream, missed in self._past.gaps()]
+
+    def updates(
+        self, start: Instant | None = None, end: Instant | None = None, patterns: Sequence[str] = ("*",)
+    ) -> Iterator[LogUpdate]:
+        """Yield what was recorded in order, from `start` to `end`, both included.
+
+        Of an update of a whole dict, only what the patterns name is in the value.
+        """
+        after = -1 if start is None else nanoseconds(start) - 1
+        until = _END if end is None else nanoseconds(end)
+        for ref, stream, value in self._news(after, until, patterns):
+            try:
+                whole = resolve(value, self._past.value)
+            except ValueError:  # damaged, or never recorded
+                self._past.unreadable += 1
+            else:
+                yield self._update(ref, stream, None if whole is MISSING else whole, whole is MISSING)
+
+    def outlines_of(self, patterns: Sequence[str] = ("*",)) -> Iterator[tuple[float, Path, Any]]:
+        """Yield time, path and value of each update, arrays that are not short as `Stored`: nothing large is read."""
+        for ref, stream, value in self._news(-1, _END, patterns):
+            if value is not MISSING:
+                yield seconds(ref.time), stream.path, value
+
+    def _news(self, after: int, until: int, patterns: Sequence[str]) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield the updates that patterns name, with what they name of the value; MISSING for a deletion."""
+        wanted = [parse_pattern(text) for text in patterns]
+        for ref, stream, value in self._past.updates(after, until):
+            if any(pattern.concerns(stream.path) for pattern in wanted):
+                left = value if value is MISSING else pruned(value, stream.path, wanted)
+                if left is not MISSING or value is MISSING:
+                    yield ref, stream, left
+
+    def _update(self, ref: Ref, stream: Stream, value: Any, deleted: bool) -> LogUpdate:
+        published, sequence = self._past.stamp(ref)
+        return LogUpdate(seconds(ref.time), stream.path, value, deleted, seconds(published), sequence, stream.kind)
+
+    def channels(self) -> list[ChannelSummary]:
+        """Return what each channel of the file holds, by topic. Reads the index, not the messages."""
+        found = []
+        for channel, stream, schema in self._past.channels():
+            messages, first, last, size = self._past.count(channel.id)
+            path, role, kind = (show(stream.path), stream.role, stream.kind) if stream else ("", "", "")
+            times = seconds(first), seconds(last)
+            found.append(ChannelSummary(channel.topic, path, role, kind, schema, messages, size, *times))
+        return sorted(found, key=lambda it: (it.topic, it.role, it.path))
+
+    def verify(self) -> int:
+        """Read all of the file; return how many records are damaged."""
+        return self._container.verify()
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        self._container.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<reem recording {self.path}, {self.duration:.1f} s>"
+
+
+class LogPath:
+    """One path of a recording."""
+
+    def __init__(self, log: Log, path: Path) -> None:
+        self._log = log
+        self.path = path
+
+    def __getitem__(self, key: str | int) -> LogPath:
+        return LogPath(self._log, (*self.path, key))
+
+    def at(self, instant: Instant) -> Any:
+        """Return the value at an instant; raises MissingKey, DamagedRecording. See `Log.value_at`."""
+        return self._log.value_at(self.path, instant)
+
+    def history(
+        self, start: Instant | None = None, end: Instant | None = None
+    ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any] | list[Any]]:
+        """Return when the value was updated and what it was then.
+
+        Args:
+            start: The first instant; the beginning of the recording if not given.
+            end: The last instant; the end of the recording if not given.
+
+        Returns:
+            The times, in seconds since 1970: float64, (N,). The values: one array, the first axis being
+            time, if they are all numbers, all arrays of one shape and dtype, or all lists of as many
+            numbers; else a list. Instants at which nothing was there are left out.
+        """
+        pairs = list(self.values(start, end))
+        times = np.array([time for time, _ in pairs], np.float64)
+        return times, stacked([value for _, value in pairs])
+
+    def values(self, start: Instant | None = None, end: Instant | None = None) -> Iterator[tuple[float, Any]]:
+        """Yield what `history` returns one by one, for what is larger than memory."""
+        after = -1 if start is None else nanoseconds(start) - 1
+        until = _END if end is None else nanoseconds(end)
+        last: Any = MISSING
+        for ref, stream, value in self._log._past.following(self.path, after, until):
+            if value is MISSING or (stream.role == "state" and last is not MISSING and same(value, last)):
+                last = value
+                continue
+            last = value
+            yield seconds(ref.time), resolve(value, self._log._past.value)
+
+    def __repr__(self) -> str:
+        return f"<{show(self.path)} of {self._log!r}>"

@@ -1,0 +1,264 @@
+"""What was recorded of each key, and what it held at an instant, arrays left where they are."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import orjson
+from mcap.records import Channel
+
+from ..errors import BadData
+from ..plan.paths import Path, below
+from ..plan.trees import MISSING, get
+from ..ships.numpy import NumpyShip
+from ..ships.registry import Ships
+from .container import Container
+from .errors import DamagedRecording
+from .layout import from_json
+from .messages import decode
+from .state import applied
+from .stored import LOST, Stored
+from .timeline import Ref, Timeline
+
+__all__ = ["Past", "Stream"]
+
+_NEWS = ("update", "delete", "state")
+"""The roles that say something new; a keyframe only repeats."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What was recorded of one path in one role; several channels if its type changed.
+
+    Attributes:
+        path: The full path.
+        role: "update", "delete", "state", "keyframe", "part" or "gap".
+        kind: "pub" or "kvs".
+        channels: The channels, by number.
+    """
+
+    path: Path
+    role: str
+    kind: str
+    channels: list[int] = field(compare=False)
+
+
+class Past:
+    """The contents of a recording.
+
+    Args:
+        container: The file.
+        ships: What makes values of what is not JSON.
+
+    Attributes:
+        streams: All streams, by no order.
+        names: The streams of each top-level key.
+        unreadable: How many updates were skipped since a part of them is damaged.
+
+    Raises:
+        DamagedRecording: Not a recording of REEM.
+    """
+
+    def __init__(self, container: Container, ships: Ships) -> None:
+        self._container = container
+        self._ships = ships
+        self._timeline = Timeline(container)
+        self.unreadable = 0
+        by_place: dict[tuple[Path, str, str], Stream] = {}
+        self._of_channel: dict[int, Stream] = {}
+        for channel in container.channels.values():
+            place = _place(channel)
+            if place is not None:
+                stream = by_place.setdefault(place, Stream(*place, []))
+                stream.channels.append(channel.id)
+                self._of_channel[channel.id] = stream
+        if not by_place and not any(record.name == "reem" for record in container.metadata):
+            raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
+        self.streams = list(by_place.values())
+        self.names: dict[str, list[Stream]] = {}
+        self._parts: dict[Path, list[int]] = {}
+        for stream in self.streams:
+            if stream.role != "gap":
+                self.names.setdefault(str(stream.path[0]), []).append(stream)
+            if stream.role in ("part", "update"):
+                self._parts.setdefault(stream.path, []).extend(stream.channels)
+
+    def tree(self, path: Path, until: int) -> Any:
+        """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
+        streams = self.names.get(str(path[0]), [])
+        anchor = _anchor(path, streams)
+        while True:
+            found = self._rebuilt(anchor, streams, until)
+            if found is not None:
+                return get(found[0], path[len(anchor) :])
+
+    def _rebuilt(self, path: Path, streams: list[Stream], until: int) -> list[Any] | None:
+        """Return a list of what was at `path`; None if something turned out to be damaged: try again."""
+        base, tree = -1, MISSING
+        bases = [it for it in streams if it.role in (*_NEWS, "keyframe") and below(path, it.path)]
+        newest = self._newest(bases, until, -1)
+        if newest is not None:
+            ref, stream = newest
+            loaded = self._load(ref, stream)
+            if loaded is None:
+                return None
+            base = ref.time
+            tree = get(loaded[0], path[len(stream.path) :])
+        inner = [it for it in streams if it.role in _NEWS and len(it.path) > len(path) and below(it.path, path)]
+        for ref, stream in self._later(inner, base, until):
+            loaded = self._load(ref, stream)
+            if loaded is None:
+                return None
+            tree = applied(tree, stream.path[len(path) :], stream.role, stream.kind, loaded[0])
+        return [tree]
+
+    def _newest(self, streams: Iterable[Stream], until: int, after: int) -> tuple[Ref, Stream] | None:
+        best: tuple[Ref, Stream] | None = None
+        for stream in streams:
+            for channel in stream.channels:
+                ref = self._timeline.latest(channel, until, best[0].time if best else after)
+                if ref is not None:
+                    best = ref, stream
+        return best
+
+    def _later(self, streams: list[Stream], after: int, until: int) -> Iterable[tuple[Ref, Stream]]:
+        """Return the updates that matter between two instants, in order.
+
+        That is the last one of each path, since it covers those before it, unless an item was deleted from
+        a list: then other paths moved, and all are needed.
+        """
+        if any(it.role == "delete" and isinstance(it.path[-1], int) for it in streams):
+            channels = [channel for stream in streams for channel in stream.channels]
+            found = self._timeline.between(channels, after, until)
+            return [(ref, self._of_channel[ref.channel]) for ref in found]
+        lasts = [self._newest([stream], until, after) for stream in streams]
+        return sorted([it for it in lasts if it is not None], key=lambda it: it[0].time)
+
+    def _load(self, ref: Ref, stream: Stream) -> list[Any] | None:
+        """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
+        if stream.role == "delete":
+            return [MISSING]
+        message = self._timeline.message(ref)
+        if message is None:
+            return None
+        channel = self._container.channels[ref.channel]
+        if channel.message_encoding == "json":
+            return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
+        return [self._stored(channel, ref.time, stream.path, message.data)]
+
+    def _readable(self, ref: Ref, stream: Stream) -> list[Any] | None:
+        """Return a list of the value of a message; None, and it is counted, if it is damaged."""
+        with contextlib.suppress(BadData):
+            loaded = self._load(ref, stream)
+            if loaded is not None:
+                return loaded
+        self.unreadable += 1
+        return None
+
+    def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Stored:
+        """Return what stands for a value that is a message of its own and not a part of another."""
+        label = channel.metadata.get("reem.ship", "")
+        value = self._decoded(channel, data)
+        if label == "numpy":
+            size, summary = NumpyShip().describe(value)
+            return Stored(label, path, at, size, summary, summary.partition("[")[0], value.shape)
+        return Stored(label, path, at, len(value) if isinstance(value, bytes) else len(data), label)
+
+    def _decoded(self, channel: Channel, data: bytes) -> Any:
+        schema = self._container.schemas.get(channel.schema_id)
+        label, channels = channel.metadata.get("reem.ship", ""), channel.metadata.get("reem.channels", "")
+        return decode(schema.name if schema else "", channels, label, data, self._ships)
+
+    def value(self, it: Stored) -> Any:
+        """Return the value that something stands for; raises DamagedRecording."""
+        if it.label == LOST:
+            raise DamagedRecording(f"{it.shown}: {it.summary}")
+        for channel in self._parts.get(it.path, ()):
+            while (ref := self._timeline.exactly(channel, it.at)) is not None:
+                message = self._timeline.message(ref)
+                if message is not None and self._container.channels[channel].message_encoding == "protobuf":
+                    return self._decoded(self._container.channels[channel], message.data)
+                if message is not None:
+                    break
+        raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
+
+    def changed(self, name: str, until: int) -> int:
+        """Return the log time of the last message on a key until an instant, -1 if there is none."""
+        newest = self._newest(self.names.get(name, []), until, -1)
+        return -1 if newest is None else newest[0].time
+
+    def changes(self, after: int, until: int) -> set[Path]:
+        """Return the paths with news between two instants."""
+        found = self._timeline.channels_between(after, until)
+        streams = [self._of_channel[channel] for channel in found if channel in self._of_channel]
+        return {stream.path for stream in streams if stream.role in _NEWS}
+
+    def updates(self, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield all news between two instants; what is damaged is skipped."""
+        channels = [channel for channel, stream in self._of_channel.items() if stream.role in _NEWS]
+        for ref in self._timeline.between(channels, after, until):
+            stream = self._of_channel[ref.channel]
+            loaded = self._readable(ref, stream)
+            if loaded is not None:
+                yield ref, stream, loaded[0]
+
+    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield what was at a full path after each piece of news on it between two instants."""
+        streams = self.names.get(str(path[0]), []) if path else []
+        anchor = _anchor(path, streams)
+        related = [it for it in streams if it.role in _NEWS and (below(it.path, anchor) or below(anchor, it.path))]
+        tree = self.tree(anchor, after) if related and after >= 0 else MISSING
+        for ref in self._timeline.between([each for it in related for each in it.channels], after, until):
+            stream = self._of_channel[ref.channel]
+            loaded = self._readable(ref, stream)
+            if loaded is None:
+                continue
+            if len(stream.path) <= len(anchor):
+                tree = get(loaded[0], anchor[len(stream.path) :])
+            else:
+                tree = applied(tree, stream.path[len(anchor) :], stream.role, stream.kind, loaded[0])
+            yield ref, stream, get(tree, path[len(anchor) :])
+
+    def gaps(self) -> Iterator[tuple[Ref, Stream, int | None]]:
+        """Yield where updates were lost, and how many."""
+        channels = [channel for channel, stream in self._of_channel.items() if stream.role == "gap"]
+        for ref in self._timeline.between(channels, -1, 2**63 - 1):
+            message = self._timeline.message(ref)
+            said = orjson.loads(message.data) if message is not None else {}
+            yield ref, self._of_channel[ref.channel], said.get("missed") if type(said) is dict else None
+
+    def stamp(self, ref: Ref) -> tuple[int, int]:
+        """Return when a message was published (ns), and its number."""
+        message = self._timeline.message(ref)
+        return (message.publish_time, message.sequence) if message is not None else (0, 0)
+
+    def count(self, channel: int) -> tuple[int, int, int, int]:
+        """Return how many messages a channel has, the first and last log time, and their bytes."""
+        return self._timeline.count(channel)
+
+    def channels(self) -> Iterator[tuple[Channel, Stream | None, str]]:
+        """Yield the channels, what they are for (None for none of REEM's), and the names of their schemas."""
+        for channel in self._container.channels.values():
+            schema = self._container.schemas.get(channel.schema_id)
+            yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
+
+
+def _place(channel: Channel) -> tuple[Path, str, str] | None:
+    """Return path, role and kind of a channel; None if it is none of REEM's."""
+    try:
+        path = orjson.loads(channel.metadata["reem.path"])
+        role, kind = channel.metadata["reem.role"], channel.metadata["reem.kind"]
+    except (KeyError, orjson.JSONDecodeError):
+        return None
+    if type(path) is not list or not path or not all(type(key) in (str, int) for key in path):
+        return None
+    return tuple(path), role, kind
+
+
+def _anchor(path: Path, streams: Iterable[Stream]) -> Path:
+    """Return the part of `path` that never moves: up to the first list from which an item was deleted."""
+    lists = [it.path[:-1] for it in streams if it.role == "delete" and isinstance(it.path[-1], int)]
+    return min([place for place in lists if len(place) < len(path) and below(path, place)], key=len, default=path)

@@ -1,0 +1,301 @@
+"""The thread that writes: takes what was received from a bounded queue, and keeps the tree as it was recorded.
+
+Nothing waits for it. What does not fit into the queue is dropped and counted, and the key is read anew.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import hashlib
+import os
+import threading
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..plan.paths import Path, show
+from ..plan.trees import MISSING, CannotApply, get, removed, replaced
+from ..ships.numpy import NumpyShip
+from ..ships.registry import Ships
+from .layout import WRAPPER, Document, to_json
+from .messages import encode
+from .sink import FullError, Sink
+from .state import planted
+from .stored import LOST, Stored, extract, same
+
+__all__ = ["Counts", "Operation", "Scribe"]
+
+_BATCH_SECONDS = 0.04
+_NICER = 10
+_LARGE = ("update", "delete", "state")
+"""Roles that are dropped if the queue is full; the others hold nothing."""
+_HURRY = 1 << 20
+"""Bytes in the queue from which the thread is woken at once."""
+
+_NUMPY = NumpyShip()
+
+
+class Operation(NamedTuple):
+    """One thing to write.
+
+    Attributes:
+        role: "update", "delete", "state" (the whole key, read from the server; MISSING if it is gone),
+            "keyframe" (the whole key, as it is known here), "gap" or "statistics".
+        path: The full path.
+        value: What is there now; for a gap, how many updates were lost, None if nobody knows.
+        stamp: Log time and publish time in ns, and a number.
+        kind: "pub", or "kvs" if it was sampled or read.
+    """
+
+    role: str
+    path: Path
+    value: Any
+    stamp: tuple[int, int, int]
+    kind: str = "pub"
+
+
+class Counts:
+    """What was written, and what was not."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self.bytes = 0
+        self.dropped = 0
+        self.skipped = 0
+        self.gaps = 0
+        self.lost = 0
+        self.by_path: collections.Counter[str] = collections.Counter()
+
+    def drop(self, path: Path, number: int = 1) -> None:
+        """Count updates that did not fit into the queue."""
+        self.dropped += number
+        self._by_path(path, number)
+
+    def skip(self, path: Path, number: int = 1) -> None:
+        """Count updates that were announced, and overtaken by a newer one before they could be fetched."""
+        self.skipped += number
+        self._by_path(path, number)
+
+    def lose(self, path: Path) -> None:
+        """Count a value that cannot be recorded."""
+        self.lost += 1
+        self._by_path(path, 1)
+
+    def _by_path(self, path: Path, number: int) -> None:
+        if len(self.by_path) < 1000 or show(path) in self.by_path:
+            self.by_path[show(path)] += number
+
+
+class Scribe:
+    """Writes operations to a file on a thread of its own.
+
+    Args:
+        sink: The file.
+        ships: What makes bytes of custom types.
+        limit: Bytes that may wait.
+
+    Attributes:
+        counts: What was written and what was not.
+        failure: Why writing ended, None while it goes on.
+        behind: Keys of which the tree kept here is not what the server has.
+    """
+
+    def __init__(self, sink: Sink, ships: Ships, limit: int) -> None:
+        self.counts = Counts()
+        self.failure: Exception | None = None
+        self.behind: set[str] = set()
+        self._sink = sink
+        self._ships = ships
+        self._limit = limit
+        self._queue: collections.deque[tuple[Operation, int]] = collections.deque()
+        self._size = 0
+        self._changed = threading.Condition()
+        self._ending = False
+        self._trees: dict[str, Any] = {}
+        self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait to be written."""
+        return self._size
+
+    def put(self, operation: Operation, size: int) -> bool:
+        """Hand over an operation of about `size` bytes; returns whether there was room. Never waits for the disk."""
+        size += 200
+        with self._changed:
+            if self.failure is not None or self._ending:
+                return False
+            if operation.role in _LARGE and self._size and self._size + size > self._limit:
+                self.counts.drop(operation.path)
+                self.behind.add(str(operation.path[0]))
+                return False
+            self._queue.append((operation, size))
+            self._size += size
+            if self._size >= _HURRY:
+                self._changed.notify()
+        return True
+
+    def stop(self, metadata: Mapping[str, str]) -> None:
+        """Write what waits and the index, and end the thread. Blocks; idempotent."""
+        with self._changed:
+            self._metadata = metadata
+            self._ending = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # it must never keep the recorded programs waiting
+            mine = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, mine, min(os.getpriority(os.PRIO_PROCESS, mine) + _NICER, 19))
+        try:
+            while not self._take():
+                self._sink.tick()
+            self._sink.finish({**self._metadata, **self._summary()})
+        except Exception as error:
+            with self._changed:
+                self.failure = error
+                self._queue.clear()
+                self._size = 0
+        finally:
+            self._sink.output.close()
+
+    def _summary(self) -> dict[str, str]:
+        counts = self.counts
+        names = ("messages", "bytes", "dropped", "skipped", "gaps", "lost")
+        figures = {name: str(getattr(counts, name)) for name in names}
+        return figures | {f"not recorded: {path}": str(number) for path, number in counts.by_path.most_common(100)}
+
+    def _take(self) -> bool:
+        """Write what waits; return whether that was the end."""
+        with self._changed:
+            if not self._ending and self._size < _HURRY:
+                self._changed.wait(_BATCH_SECONDS)
+            ending = self._ending
+        while True:
+            with self._changed:
+                if not self._queue:
+                    return ending
+                operation, size = self._queue.popleft()
+            self._write(operation)
+            del operation
+            self._sink.tick()
+            with self._changed:
+                self._size -= size
+
+    def _write(self, it: Operation) -> None:
+        if it.role == "statistics":
+            self._sink.statistics(it.value, it.stamp)
+            return
+        try:
+            getattr(self, f"_write_{it.role}")(it)
+        except FullError:
+            self.counts.lose(it.path)
+            self.behind.add(str(it.path[0]))
+
+    def _write_update(self, it: Operation) -> None:
+        name, rest = str(it.path[0]), it.path[1:]
+        tree = self._extracted(it)
+        if type(tree) is not Stored:
+            self._count(self._sink.json(it.path, "update", it.kind, to_json(tree), it.stamp))
+        before = self._trees.get(name, MISSING)
+        if it.kind == "kvs":
+            self._trees[name] = planted(before, rest, tree)
+            return
+        try:
+            self._trees[name] = replaced(before, rest, tree)
+        except CannotApply:  # the server has refused it too, or an update is missing here
+            self.behind.add(name)
+
+    def _write_delete(self, it: Operation) -> None:
+        name, rest = str(it.path[0]), it.path[1:]
+        before = self._trees.get(name, MISSING)
+        if it.kind == "kvs" and get(before, rest) is MISSING:
+            return
+        self._event(it, {"op": "delete", "path": show(it.path)})
+        self._trees[name] = removed(before, rest)
+
+    def _write_gap(self, it: Operation) -> None:
+        self.counts.gaps += 1
+        self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
+
+    def _event(self, it: Operation, text: dict[str, Any]) -> None:
+        self._count(self._sink.json(it.path, it.role, it.kind, Document(text, wrapped=False), it.stamp))
+
+    def _write_state(self, it: Operation) -> None:
+        name = str(it.path[0])
+        before = self._trees.get(name, MISSING)
+        self.behind.discard(name)
+        if it.value is MISSING:
+            if before is not MISSING:
+                self._write_delete(it._replace(role="delete", kind="pub"))
+            return
+        tree = self._extracted(it, before)
+        if before is MISSING or not same(tree, before):
+            self._trees[name] = tree
+            self._keyframe(it, tree)
+
+    def _write_keyframe(self, it: Operation) -> None:
+        tree = self._trees.get(str(it.path[0]), MISSING)
+        if tree is not MISSING:
+            self._keyframe(it, tree)
+
+    def _keyframe(self, it: Operation, tree: Any) -> None:
+        document = to_json(tree)
+        if not document.wrapped:
+            notes = {key: document.tree.pop(key) for key in ("$ship",) if key in document.tree}
+            document = Document({WRAPPER: document.tree, **notes}, wrapped=True)
+        document.tree["key"] = str(it.path[0])
+        self._count(self._sink.json(it.path, it.role, "kvs", document, it.stamp))
+
+    def _extracted(self, it: Operation, before: Any = None) -> Any:
+        """Return the value with everything long written as a message of its own, unless `before` has it unchanged."""
+
+        def store(label: str, path: Path, value: Any) -> Stored:
+            data, label = self._packed(label, value)
+            if data is None:
+                self.counts.lose(path)
+                return Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
+            stored = _described(label, path, it.stamp[0], data)
+            old = get(before, path[len(it.path) :]) if it.role == "state" else None
+            if type(old) is Stored and stored.digest == old.digest and stored.label == old.label:
+                return old
+            role = "update" if path == it.path and it.role == "update" else "part"
+            encoded = encode(label, data, show(path), it.stamp[1] or it.stamp[0])
+            try:
+                self._count(self._sink.part(path, role, it.kind, label, encoded, it.stamp))
+            except FullError:
+                self.counts.lose(path)
+                return Stored(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
+            return stored
+
+        return extract(it.value, it.path, store)
+
+    def _packed(self, label: str, value: Any) -> tuple[Any, str]:
+        """Return an array or bytes, and the label; None if there is no way to make bytes of the value."""
+        if label:
+            return value, label
+        ship = None if self._ships.asynchronous else self._ships.fits(value)
+        if ship is None or ship.blob is None:
+            return None, LOST
+        return b"".join(ship.blob.pack(value)), ship.label
+
+    def _count(self, size: int) -> None:
+        self.counts.messages += 1
+        self.counts.bytes += size
+
+
+def _described(label: str, path: Path, at: int, data: Any) -> Stored:
+    if isinstance(data, np.ndarray):
+        size, summary = _NUMPY.describe(data)
+        head, body = _NUMPY.pack(data)
+        digest = hashlib.blake2b(body, digest_size=16, salt=hashlib.blake2b(head, digest_size=16).digest()).digest()
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, digest)
+    digest = hashlib.blake2b(data, digest_size=16).digest()
+    return Stored(label, path, at, len(data), label, digest=digest)

@@ -1,0 +1,243 @@
+"""The MCAP file that a recording is written to: its channels, and chunks that are closed in time.
+
+One channel per path, role and shape of message. A channel's metadata says what it holds:
+
+    reem.path     the path, top-level key first, as a JSON list
+    reem.role     update: what is now at the path; part: a piece that an update or a state refers to;
+                  delete: what was at the path is gone; state: the whole key as it was read from the server;
+                  keyframe: the whole key as the recording has it; gap: updates of the key were lost
+    reem.kind     pub: published; kvs: sampled or read
+    reem.ship     the label of the ship, for what is not JSON
+    reem.wrapped  1: the JSON message is {"value": ...}
+    reem.channels the last axis of a picture that has three
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import zlib
+from collections.abc import Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+import orjson
+from mcap.writer import CompressionType, Writer
+
+from ..errors import BadValue
+from ..plan.paths import Path, show
+from .errors import RecordingFailed
+from .layout import Document, topic_of
+from .messages import Encoded, schema_bytes
+from .schema import OPEN, Signature, fits, schema_text, signature
+
+__all__ = ["COMPRESSIONS", "FLUSH_SECONDS", "FORMAT", "FullError", "Output", "Sink"]
+
+FORMAT = "1"
+FLUSH_SECONDS = 0.5
+"""Seconds after which a chunk is closed and given to the operating system, however small it is."""
+
+COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+_CHUNK = 1 << 20
+_MOST_CHANNELS = 60_000
+"""MCAP numbers them with 16 bits."""
+_MOST_SCHEMAS = 8
+"""Schemas a path may have before it gets one that fits everything."""
+
+KEYFRAMES = "/_reem/keyframe"
+OPERATIONS = "/_reem/ops"
+STATISTICS = "/_reem/stats"
+CHANNELS = "reem.channels"
+"""The name of the metadata records that list channels."""
+_SHARED_TOPICS = {"state": KEYFRAMES, "keyframe": KEYFRAMES, "delete": OPERATIONS, "gap": OPERATIONS}
+
+
+class FullError(Exception):
+    """There are as many channels as MCAP can have."""
+
+
+class Output:
+    """A file that is either extended by a whole piece or left as it was.
+
+    What is written has been handed to the operating system: it survives the end of the program, however
+    it ends, but not a power cut in the next half minute.
+    """
+
+    def __init__(self, path: FilePath, *, overwrite: bool) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
+        try:
+            self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
+        except FileExistsError:
+            raise BadValue(f"{path} is there already; choose another name, or say --force (overwrite=True)") from None
+        except OSError as error:
+            raise BadValue(f"{path} cannot be written: {error.strerror}") from None
+        self._pieces: list[bytes] = []
+        self._written = 0
+        self._waiting = 0
+
+    def write(self, data: bytes) -> int:
+        """Take a piece; it is written by `flush`."""
+        self._pieces.append(data)
+        self._waiting += len(data)
+        if self._waiting >= _CHUNK:
+            self.flush()
+        return len(data)
+
+    def tell(self) -> int:
+        """Return where the next piece will be."""
+        return self._written + self._waiting
+
+    def flush(self) -> None:
+        """Write all pieces; if that fails, the file ends where it did before, and OSError is raised."""
+        data, self._pieces, self._waiting = memoryview(b"".join(self._pieces)), [], 0
+        done = 0
+        try:
+            while done < len(data):
+                done += os.write(self._file, data[done:])
+        except OSError:
+            with contextlib.suppress(OSError):  # a device has no length
+                os.ftruncate(self._file, self._written)
+            raise
+        self._written += done
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+
+class Sink:
+    """Writes messages of a recording. Belongs to one thread.
+
+    Args:
+        path: The file.
+        compression: "zstd", "lz4" or "none".
+        overwrite: Replace a file of that name.
+        metadata: What is said of the recording at its beginning.
+
+    Raises:
+        BadValue: The file is there already or cannot be made; an unknown compression.
+        RecordingFailed: It cannot be written.
+    """
+
+    def __init__(self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool) -> None:
+        if compression not in COMPRESSIONS:
+            raise BadValue(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
+        self.output = Output(path, overwrite=overwrite)
+        stream: Any = self.output
+        self._writer: Any = Writer(stream, _CHUNK, COMPRESSIONS[compression])
+        self._writer.start(profile="", library=f"reem/{metadata.get('version', '')}")
+        self._writer.add_metadata("reem", dict(metadata))
+        try:
+            self.output.flush()
+        except OSError as error:
+            self.output.close()
+            raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
+        self._schemas: dict[Any, int] = {}
+        self._channels: dict[Any, int] = {}
+        self._matched: dict[Any, int] = {}  # which channel messages of a signature go to: found once
+        self._known: dict[Any, list[tuple[Signature, int]]] = {}
+        self._count = 0
+        self._new: list[Any] = []
+        self._closed_at = time.monotonic()
+        self._open = 0
+
+    def json(self, path: Path, role: str, kind: str, document: Document, stamp: tuple[int, int, int]) -> int:
+        """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
+        found = signature(document.tree) if role == "update" else OPEN
+        key = path, role, kind, document.wrapped, found
+        channel = self._matched.get(key)
+        if channel is None:
+            if len(self._matched) >= _MOST_CHANNELS:
+                self._matched.clear()
+            channel = self._matched[key] = self._json_channel(path, role, kind, document.wrapped, found)
+        return self._message(channel, document.text, stamp)
+
+    def _json_channel(self, path: Path, role: str, kind: str, wrapped: bool, found: Signature) -> int:
+        known = self._known.setdefault((path, role, kind, wrapped), [])
+        for types, channel in known:
+            if fits(found, types):
+                return channel
+        if len(known) == _MOST_SCHEMAS:
+            found = OPEN
+        name = f"reem.{show(path)}" if role == "update" else f"reem.{role}"
+        # All channels of a shared topic have one schema: viewers want that.
+        schema = self._schema(name if role == "update" else "reem.event", "jsonschema", found)
+        extra = {"reem.wrapped": "1"} if wrapped else {}
+        channel = self._channel(path, role, kind, "json", schema, **extra)
+        known.append((found, channel))
+        return channel
+
+    def part(self, path: Path, role: str, kind: str, label: str, encoded: Encoded, stamp: tuple[int, int, int]) -> int:
+        """Write a protobuf message; returns its bytes."""
+        key = path, role, kind, label, encoded.schema, encoded.channels
+        channel = self._channels.get(key)
+        if channel is None:
+            schema = self._schema(encoded.schema, "protobuf", None)
+            extra = {"reem.ship": label, **({"reem.channels": encoded.channels} if encoded.channels else {})}
+            channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
+        return self._message(channel, encoded.data, stamp)
+
+    def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
+        """Write figures on the recording itself."""
+        document = Document(dict(figures), wrapped=False)
+        if "statistics" not in self._channels:
+            schema = self._schema("reem.stats", "jsonschema", signature(document.tree))
+            self._channels["statistics"] = self._register(STATISTICS, "json", schema, {})
+        self._message(self._channels["statistics"], document.text, stamp)
+
+    def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
+        """Return the number and the name of a schema."""
+        key = name, encoding, known
+        if key not in self._schemas:
+            text = schema_bytes(name) if encoding == "protobuf" else schema_text(name, known)
+            self._schemas[key] = self._writer.register_schema(name, encoding, text)
+        return self._schemas[key], name
+
+    def _channel(self, path: Path, role: str, kind: str, encoding: str, schema: tuple[int, str], **extra: str) -> int:
+        if self._count >= _MOST_CHANNELS:
+            raise FullError
+        self._count += 1
+        metadata = {"reem.path": orjson.dumps(path).decode(), "reem.role": role, "reem.kind": kind, **extra}
+        return self._register(_SHARED_TOPICS.get(role) or topic_of(path), encoding, schema, metadata)
+
+    def _register(self, topic: str, encoding: str, schema: tuple[int, str], metadata: dict[str, str]) -> int:
+        metadata["reem.version"] = FORMAT
+        number: int = self._writer.register_channel(topic, encoding, schema[0], metadata)
+        self._new.append([number, topic, encoding, schema[1], metadata])
+        return number
+
+    def _message(self, channel: int, data: bytes, stamp: tuple[int, int, int]) -> int:
+        log_time, publish_time, number = stamp
+        self._writer.add_message(channel, log_time, data, max(publish_time, 0), number & 0xFFFFFFFF)
+        self._open += 1
+        return len(data)
+
+    def tick(self, *, now: bool = False) -> None:
+        """Close the chunk if it is time, so that it can be read whatever happens."""
+        late = time.monotonic() - self._closed_at >= FLUSH_SECONDS
+        if now or late:
+            self._closed_at = time.monotonic()
+            if self._open:
+                self._open = 0
+                self._writer.flush()
+                self._tell_channels()
+
+    def _tell_channels(self) -> None:
+        """Say outside of the chunks too what new channels are for: the chunk that says so may be damaged."""
+        if self._new:
+            text = orjson.dumps(self._new)
+            self._new = []
+            self._writer.add_metadata(CHANNELS, {"channels": text.decode(), "crc32": str(zlib.crc32(text))})
+            self.output.flush()
+
+    def finish(self, metadata: Mapping[str, str]) -> None:
+        """Write the last chunk, what is said of the recording at its end, and the index; close the file."""
+        self._writer.flush()
+        self._tell_channels()
+        self._writer.add_metadata("reem", dict(metadata))
+        self._writer.finish()
+        self.output.flush()
+        self.output.close()

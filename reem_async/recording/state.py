@@ -1,0 +1,64 @@
+"""Rebuilding what a key held at an instant from what was recorded of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from ..plan.paths import Path
+from ..plan.patterns import Pattern, parse_pattern
+from ..plan.trees import MISSING, CannotApply, removed, replaced
+
+__all__ = ["applied", "planted", "pruned"]
+
+_LONGEST_PADDING = 10_000
+
+
+def planted(tree: Any, path: Path, value: Any) -> Any:
+    """Return `tree` with `value` at `path`, making the parents that are not there.
+
+    For what was sampled: only this path was looked at, so nobody knows what is around it. Missing items of
+    a list before it are None.
+    """
+    if not path:
+        return value
+    key, rest = path[0], path[1:]
+    if isinstance(key, str):
+        known = tree if type(tree) is dict else {}
+        return {**known, key: planted(known.get(key, MISSING), rest, value)}
+    items = list(tree) if type(tree) is list else []
+    if key >= _LONGEST_PADDING:
+        return items
+    items += [None] * (key + 1 - len(items))
+    items[key] = planted(items[key], rest, value)
+    return items
+
+
+def applied(tree: Any, path: Path, role: str, kind: str, value: Any) -> Any:
+    """Return `tree` after one recorded update of `path`; unchanged where the server had refused it."""
+    if role == "delete":
+        return removed(tree, path)
+    if kind == "kvs":
+        return planted(tree, path, value)
+    try:
+        return replaced(tree, path, value)
+    except CannotApply:
+        return tree
+
+
+def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
+    """Return what is at the full `path` without what none of the patterns name; MISSING if nothing is left."""
+    wanted = [pattern for pattern in patterns if pattern.concerns(path)]
+    if any(len(pattern.rest) < len(path) for pattern in wanted):
+        return tree
+    if type(tree) is list and wanted:  # the items keep their places
+        return tree
+    if type(tree) is not dict:
+        return MISSING
+    left = {key: pruned(item, (*path, key), wanted) for key, item in tree.items()}
+    return {key: item for key, item in left.items() if item is not MISSING} or MISSING
+
+
+def parsed(patterns: Iterable[str]) -> list[Pattern]:
+    """Return the patterns a user typed."""
+    return [parse_pattern(text) for text in patterns]

@@ -1,0 +1,119 @@
+"""Values that have a message of their own: arrays, bytes, long lists of numbers, custom types.
+
+In trees they are represented by `Stored`, which says what they are and where in the file to find them, so
+that a tree can be looked at, kept and written again without touching a single array.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..plan.paths import Path, show
+
+__all__ = ["LONGEST_INLINE", "LOST", "Store", "Stored", "extract", "is_inline", "resolve", "same"]
+
+LONGEST_INLINE = 64
+"""Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""
+
+LOST = "lost"
+"""The label of what could not be recorded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stored:
+    """A value in a message of its own.
+
+    Attributes:
+        label: "numpy", "bytes", "list" (a list of numbers, stored as an array), or a custom ship's label.
+        path: The full path under which it was written.
+        at: The log time of its message, in ns.
+        size: Its bytes.
+        summary: What it is, for people: "uint8[480,640,3]".
+        dtype: The dtype of an array, for people.
+        shape: The shape of an array, None for anything else.
+        digest: A digest of its bytes, to tell whether it has changed; not in the file.
+    """
+
+    label: str
+    path: Path
+    at: int
+    size: int
+    summary: str = ""
+    dtype: str = ""
+    shape: tuple[int, ...] | None = None
+    digest: bytes = field(default=b"", compare=False)
+
+    @property
+    def shown(self) -> str:
+        """The path as people write it."""
+        return show(self.path)
+
+
+Store = Callable[[str, Path, Any], Stored]
+"""Writes a value (its label, its full path, itself) as a message and returns what stands for it."""
+
+
+def is_inline(array: np.ndarray[Any, Any], longest: int = LONGEST_INLINE) -> bool:
+    """Return whether an array is a few plain numbers, which viewers want to plot."""
+    return array.size <= longest and array.dtype.kind in "biuf"
+
+
+def extract(value: Any, path: Path, store: Store, longest: int = LONGEST_INLINE) -> Any:
+    """Return `value`, at the full `path`, with everything that gets a message of its own replaced by `Stored`.
+
+    Containers in which nothing was replaced are shared with `value`.
+    """
+    kind = type(value)
+    if kind is dict:
+        items = {key: extract(item, (*path, key), store, longest) for key, item in value.items()}
+        return items if any(items[key] is not item for key, item in value.items()) else value
+    if kind is list:
+        if len(value) > longest and (array := _numbers(value)) is not None:
+            return store("list", path, array)
+        found = [extract(item, (*path, index), store, longest) for index, item in enumerate(value)]
+        return found if any(new is not old for new, old in zip(found, value, strict=True)) else value
+    if kind in _PLAIN or (kind is np.ndarray and is_inline(value, longest)):
+        return value
+    label = "numpy" if kind is np.ndarray else "bytes" if kind is bytes else ""
+    return store(label, path, value)
+
+
+_PLAIN = frozenset({str, int, float, bool, type(None), Stored})
+
+
+def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
+    """Return an array that gives the very list back by `tolist()`, or None."""
+    kinds = set(map(type, values))
+    if kinds == {float}:
+        return np.array(values)
+    if kinds == {int} and min(values) >= -(2**63) and max(values) < 2**63:
+        return np.array(values, np.int64)
+    return None
+
+
+def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
+    """Return a copy of `tree` with every `Stored` replaced by what `load` makes of it."""
+    kind = type(tree)
+    if kind is dict:
+        return {key: resolve(item, load) for key, item in tree.items()}
+    if kind is list:
+        return [resolve(item, load) for item in tree]
+    return load(tree) if kind is Stored else tree
+
+
+def same(one: Any, other: Any) -> bool:
+    """Return whether two trees are equal, type by type and bit by bit."""
+    if type(one) is not type(other):
+        return False
+    if type(one) is dict:
+        return one.keys() == other.keys() and all(same(item, other[key]) for key, item in one.items())
+    if type(one) is list:
+        return len(one) == len(other) and all(map(same, one, other))
+    if type(one) is np.ndarray:
+        equal: bool = one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+        return equal
+    return bool(one == other) and (type(one) is not float or str(one) == str(other))

@@ -1,0 +1,183 @@
+"""`reem record`, `reem play` and `reem log`, run as a user runs them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from conftest import ROOT, assert_same, eventually
+from test_recording import IMAGE
+
+from reem_async.recording import open_log
+
+APP = """
+import typer
+from reem_async.cli import log, play, record
+app = typer.Typer(pretty_exceptions_enable=False)
+app.command()(record.record)
+app.command()(play.play)
+app.add_typer(log.app, name="log")
+app()
+"""
+REEM = [sys.executable, "-W", "error", "-c", APP]
+
+
+def environment(url):
+    return {**os.environ, "PYTHONPATH": str(ROOT), "REEM_URL": url, "COLUMNS": "200"}
+
+
+@pytest.fixture
+def reem(server_url, tmp_path):
+    """Runs a command to its end."""
+
+    def run(*arguments, **options):
+        command = [*REEM, *map(str, arguments)]
+        settings = {"env": environment(server_url), "cwd": tmp_path, "timeout": 30, **options}
+        return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+
+    return run
+
+
+@contextlib.contextmanager
+def started(url, cwd, *arguments, **options):
+    """A command that is running."""
+    command = [*REEM, *map(str, arguments)]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
+    with subprocess.Popen(command, env=environment(url), cwd=cwd, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def is_recording(file):
+    """Whether the first messages are in the file."""
+    with contextlib.suppress(OSError, ValueError), open_log(file) as log:
+        return bool(log.names())
+
+
+@pytest.fixture
+def recorded(key, server_url, pspace, tmp_path):
+    """A recording that Ctrl-C has ended."""
+    pspace[key("a")] = {"n": 0, "image": IMAGE}
+    file = tmp_path / "run.mcap"
+    with started(server_url, tmp_path, "record", key("*"), "-o", file, "--json") as process:
+        eventually(lambda: is_recording(file))
+        for number in range(1, 11):
+            pspace[key("a")]["n"] = number
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        out, errors = process.communicate(timeout=10)
+    assert (process.returncode, errors) == (0, "")
+    return file, [json.loads(line) for line in out.splitlines()]
+
+
+def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
+    file, said = recorded
+    assert said[-1]["ended"] is True
+    assert (said[-1]["dropped"], said[-1]["gaps"], said[-1]["file"]) == (0, 0, str(file))
+
+    run = reem("log", "info", file, "--verify", "--json")
+    assert (run.returncode, run.stderr) == (0, "")
+    info = json.loads(run.stdout)
+    assert (info["complete"], info["damaged"], info["gaps"]) == (True, 0, [])
+    counts = {each["topic"]: each["messages"] for each in info["channels"] if each["role"] == "update"}
+    assert counts == {f"/{key('a')}/n": 10}
+    run = reem("log", "info", file)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "complete" in run.stdout
+    assert f"/{key('a')}/n\tupdate\treem.{key('a')}.n\t10\t" in run.stdout
+
+    run = reem("play", file, "--rate", "20", "--remap", f"{key('a')}={key('b')}")
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "11 published" in run.stdout
+    assert_same(kvs[key("b")].read(), {"n": 10, "image": IMAGE})
+    run = reem("play", file, key("a.n"), "--start", info["duration"], "--remap", f"{key('a')}={key('c')}", "--json")
+    assert (run.returncode, json.loads(run.stdout.splitlines()[-1])["published"]) == (0, 1)
+    assert kvs[key("c")].read() == {"n": 10}
+
+    run = reem("log", "export", file, "--to", "npz")
+    assert run.returncode == 0, run.stderr
+    assert np.load(tmp_path / "run.npz")[f"{key('a')}.n"].tolist() == list(range(11))
+    run = reem("log", "export", file, "--to", "npz")
+    assert (run.returncode, "there already" in run.stderr) == (2, True)
+
+
+def test_step(key, recorded, server_url, kvs, tmp_path):
+    """One update for each line; the end of the input ends it."""
+    file, _ = recorded
+    with started(
+        server_url, tmp_path, "play", file, "--step", "--remap", f"{key('a')}={key('b')}", stdin=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline().endswith(f"{key('a')}.n\n")
+        eventually(lambda: kvs.get(key("b.n"), None) == 1)
+        process.stdin.write("\n")
+        process.stdin.flush()
+        assert process.stdout.readline().endswith(f"{key('a')}.n\n")
+        assert kvs[key("b")]["n"].read() == 2
+        rest, errors = process.communicate(timeout=10)
+        assert (process.returncode, errors) == (0, "")
+        assert "published" in rest
+
+
+def test_samples_for_some_time(key, kvs, reem, tmp_path):
+    kvs[key("a")] = {"joint": 1.5}
+    (tmp_path / "keys.csv").write_text(f"{key('a')}.joint, 0.02\n")
+    (tmp_path / "run.mcap").write_bytes(b"old")
+    run = reem("record", "--sample", "keys.csv", "--duration", "0.3", "--force")
+    assert (run.returncode, run.stderr) == (0, "")
+    assert run.stdout.startswith("run.mcap: ")
+    with open_log(tmp_path / "run.mcap") as log:
+        assert set(log[key("a.joint")].history()[1].tolist()) == {1.5}
+
+
+def test_what_cannot_be(key, reem, tmp_path):
+    (tmp_path / "there.mcap").write_bytes(b"precious")
+    for arguments, code, text in (
+        (("record", key("a"), "-o", "there.mcap"), 2, "--force"),
+        (("record", "--sample", "none.csv", "-o", "x.mcap"), 2, "none.csv"),
+        (("play", "there.mcap"), 1, "not an MCAP file"),
+    ):
+        run = reem(*arguments)
+        assert (run.returncode, run.stdout if code == 2 else "") == (code, ""), run
+        assert text in run.stderr
+        assert "Traceback" not in run.stderr
+    assert (tmp_path / "there.mcap").read_bytes() == b"precious"
+    assert not (tmp_path / "x.mcap").exists()
+    run = reem("record", "--url", "redis://127.0.0.1:1", "-o", "x.mcap")
+    assert (run.returncode, "127.0.0.1:1" in run.stderr) == (1, True)
+    assert not (tmp_path / "x.mcap").exists()
+
+
+def test_on_a_terminal_a_line_is_written_over(key, server_url, pspace, tmp_path):
+    """Messages, rate, bytes, drops; Ctrl-C in the terminal ends it with a summary."""
+    mine, its = pty.openpty()
+    try:
+        with started(
+            server_url, tmp_path, "record", key("*"), stdin=its, stdout=its, stderr=its, text=False
+        ) as process:
+            said, deadline = b"", time.monotonic() + 20
+            while b"0 dropped" not in said and time.monotonic() < deadline:
+                pspace[key("a")] = 1
+                if select.select([mine], [], [], 0.05)[0]:
+                    said += os.read(mine, 4096)
+            assert b"\r0:0" in said
+            assert b"/s" in said
+            process.send_signal(signal.SIGINT)
+            assert process.wait(10) == 0
+            while select.select([mine], [], [], 0)[0]:
+                said += os.read(mine, 4096)
+            assert b"run.mcap: " in said
+            assert b"Traceback" not in said
+    finally:
+        os.close(mine)
+        os.close(its)

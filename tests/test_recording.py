@@ -1,0 +1,399 @@
+"""Recording a real server, and looking into what was recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from conftest import aeventually, assert_same, eventually
+from hypothesis import HealthCheck, given, settings
+from test_values import mixed
+
+import reem
+import reem.recording
+import reem_async
+from reem_async.errors import BadInput, BadKey, BadType, BadValue, MissingKey
+from reem_async.recording import ArrayHandle, Recorder, Replayer, open_log
+
+IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64, 3)
+FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture
+async def binterface(server_url):
+    """The recorder's own interface."""
+    async with reem_async.RedisInterface(server_url) as opened:
+        yield opened
+
+
+@contextlib.contextmanager
+def logged(file):
+    with open_log(file) as log:
+        yield log
+
+
+async def test_every_update_is_recorded_bit_for_bit(key, apspace, akvs, binterface, file):
+    """Small ones from their notices, large ones fetched; numbers of an arithmetic and appended items too."""
+    name = key("arm")
+    async with Recorder(binterface, [key("*")], file) as recorder:
+        values = []
+        for number in range(20):
+            values.append({"n": number, "q": np.array([0.1, number]), "image": IMAGE + np.uint8(number), "b": b"x"})
+            await apspace[name].write(values[-1])
+            await aeventually(lambda n=number: recorder.status.messages > 2 * n)  # else newer ones overtake large ones
+        await apspace[name]["n"].increment(5)
+        await apspace[name]["list"].write([1])
+        await apspace[name]["list"].append({"a": IMAGE})
+        await apspace[name]["list"][0].delete()
+    assert (recorder.status.dropped, recorder.status.lost, recorder.status.gaps) == (0, 0, 0)
+    with logged(file) as log:
+        assert (log.indexed, log.damaged, log.names()) == (True, 0, [name])
+        updates = [update for update in log.updates(patterns=[name]) if update.path == (name,)]
+        assert_same([update.value for update in updates], values)
+        assert [update.sequence for update in updates] == list(range(1, 21))
+        for update, value in zip(updates, values, strict=True):
+            assert_same(log[name].at(update.time), value)
+            assert_same(log[name]["image"].at(update.time), value["image"])
+            assert update.published <= update.time + 0.1
+        assert_same(log[name].at(log.end), await akvs[name].read())
+        times, images = log[f"{name}.image"].history()
+        assert (images.shape, images.dtype) == ((20, *IMAGE.shape), np.uint8)
+        assert len(times) == 20
+        assert (np.diff(times) > 0).all()
+        times, numbers = log[f"{name}.n"].history()
+        assert numbers.tolist() == [*range(20), 24]
+        assert log[name]["list"][0].at(log.end)["a"].shape == IMAGE.shape
+
+
+async def test_what_was_there_and_what_only_was_stored(key, akvs, binterface, file):
+    """At the beginning everything is read, and at each keyframe what no publisher told of."""
+    await akvs[key("a")].write({"map": FRAME, "n": 1})
+    await akvs[key("gone")].write(5)
+    async with Recorder(binterface, [key("*")], file, keyframe=0.1) as recorder:
+        first = time.time()
+        await akvs[key("a")]["n"].write(2)
+        await akvs[key("a")]["map"].write(FRAME + np.uint8(1))
+        await akvs[key("new")].write("x")
+        await akvs[key("gone")].delete()
+        before = recorder.status.messages
+        await aeventually(lambda: recorder.status.messages > before + 12)
+    with logged(file) as log:
+        assert_same(log.value_at("", first), {key("a"): {"map": FRAME, "n": 1}, key("gone"): 5})
+        assert_same(log.value_at("", log.end), {key("a"): {"map": FRAME + np.uint8(1), "n": 2}, key("new"): "x"})
+        assert log[key("a.n")].history()[1].tolist() == [1, 2]  # a keyframe that says nothing new is no update
+        frames = [each for each in log.channels() if each.schema == "foxglove.RawImage"]
+        assert sum(each.messages for each in frames) == 2  # an array that stays is written once
+        assert log.changes(log.start, log.end) >= {(key("a"),), (key("new"),)}
+
+
+async def test_deleting_and_other_types(key, apspace, binterface, file):
+    async with Recorder(binterface, [key("a")], file):
+        instants = []
+        for value in ({"x": {"y": 1}}, {"x": "text"}, 5, [1, 2.5], None, IMAGE, b"bytes", {"x": [0, 1, 2]}):
+            await apspace[key("a")].write(value)
+            instants.append((time.time(), value))
+            await asyncio.sleep(0.02)
+        await apspace[key("a")]["x"][0].delete()
+        instants.append((time.time(), {"x": [1, 2]}))
+        await asyncio.sleep(0.02)
+        await apspace[key("a")]["x"][0].write(7)
+        instants.append((time.time(), {"x": [7, 2]}))
+        await asyncio.sleep(0.02)
+        await apspace[key("a")]["x"].delete()
+        instants.append((time.time(), {}))
+        await asyncio.sleep(0.02)
+        await apspace[key("a")].delete()
+        gone = time.time()
+        await asyncio.sleep(0.02)
+        await apspace[key("a")].write(1)
+    with logged(file) as log:
+        for instant, value in instants:
+            assert_same(log[key("a")].at(instant + 0.01), value)
+        assert log[key("a.x[1]")].at(instants[-2][0] + 0.01) == 2
+        assert [int(value) for _, value in log[key("a.x[0]")].values()] == [0, 1, 7]
+        with pytest.raises(MissingKey, match=key("a")):
+            log[key("a")].at(gone + 0.01)
+        assert key("a") not in log.tree_at(gone + 0.01)
+        assert log[key("a")].at(log.end) == 1
+
+
+async def test_a_part_of_a_key(key, apspace, binterface, file):
+    """Patterns below a key leave everything else out, also when the whole key is written."""
+    name = key("robot")
+    await apspace[name].write({"left": {"battery": 1, "image": IMAGE}, "n": 0})
+    async with Recorder(binterface, [f"{name}.*.battery"], file):
+        await apspace[name]["left"]["battery"].write(2)
+        await apspace[name]["n"].write(1)
+        await apspace[name].write({"left": {"battery": 3, "image": IMAGE}, "right": {"battery": 4}, "n": 2})
+    with logged(file) as log:
+        assert log[f"{name}.left.battery"].history()[1].tolist() == [1, 2, 3]
+        assert log.value_at("", log.end) == {name: {"left": {"battery": 3}, "right": {"battery": 4}}}
+
+
+async def test_trees_without_their_arrays(key, apspace, binterface, file):
+    async with Recorder(binterface, [key("a")], file):
+        await apspace[key("a")].write({"image": FRAME, "q": np.arange(3.0), "list": list(range(100)), "t": "é"})
+    with logged(file) as log:
+        tree = log.tree_at(log.end)[key("a")]
+        handle = tree["image"]
+        assert type(handle) is ArrayHandle
+        found = handle.label, handle.dtype, handle.shape, handle.size, handle.summary
+        assert found == ("numpy", "uint8", (480, 640, 3), FRAME.nbytes, "uint8[480,640,3]")
+        assert_same(handle.read(), FRAME)
+        assert_same(tree["q"], np.arange(3.0))
+        assert tree["list"].read() == list(range(100))
+        outline = log.outline_at(np.datetime64(round(log.end * 1e6), "us"))[key("a")]
+        kinds = {child.path[-1]: (child.kind, child.summary, child.size) for child in outline.children}
+        assert kinds == {
+            "image": ("numpy", "uint8[480,640,3]", FRAME.nbytes),
+            "q": ("numpy", "float64[3]", 24),
+            "list": ("list", "int64[100]", 800),
+            "t": ("str", "", 2),
+        }
+
+
+@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@given(batch=st.lists(st.tuples(mixed, st.sampled_from(["whole", "inside", "delete"])), min_size=3, max_size=8))
+def test_anything_recorded_replays_to_the_same(server_url, tmp_path_factory, batch):
+    """Random trees with arrays, written whole, below a path and deleted: record, look, replay, read back."""
+    asyncio.run(_recorded_and_replayed(server_url, tmp_path_factory.mktemp("any") / "run.mcap", batch))
+
+
+async def _recorded_and_replayed(url, file, batch):
+    name = f"any{time.time_ns()}"
+    async with reem_async.RedisInterface(url) as one, reem_async.RedisInterface(url) as two:
+        kvs, space = reem_async.KeyValueStore(one), reem_async.PublishSpace(one)
+        other = reem_async.KeyValueStore(two)
+        seen = []
+        await space[name].write({"first": 1})
+        async with Recorder(two, [name], file):
+            for value, how in batch:
+                if how == "whole":
+                    await space[name].write({"x": value, "y": 1})
+                elif how == "inside":
+                    await space[name]["first"].write(value)
+                else:
+                    with contextlib.suppress(MissingKey):
+                        await space[name]["first"].delete()
+                    await space[name].write({"first": [value]})
+                seen.append((time.time(), await kvs[name].read()))
+                await asyncio.sleep(0.003)
+        with open_log(file) as log:
+            for (instant, value), following in zip(seen, [*seen[1:], (log.end + 1, None)], strict=True):
+                assert_same(log.value_at(name, min(instant + 0.001, following[0])), value)
+            replayed = f"{name}again"
+            await Replayer(two, log, rate=1000, remap={name: replayed}).play()
+            assert_same(await other[replayed].read(), seen[-1][1])
+        await kvs[name].delete()
+        await kvs[replayed].delete()
+
+
+async def test_samples(key, akvs, binterface, file, tmp_path):
+    """Paths of a key file at their periods, without drift, whoever writes them; parents need not be recorded."""
+    keys = tmp_path / "keys.csv"
+    keys.write_text(
+        f"{key('arm')}.joint, 0.02\n{key('arm')}.image, 0.1\n{key('arm')}.list[1], 0.05\n{key('no')}, 0.05\n"
+    )
+    await akvs[key("arm")].write({"joint": 0.5, "image": IMAGE, "list": [1, 2]})
+    async with Recorder(binterface, [], file, sample=keys) as recorder:
+        await aeventually(lambda: recorder.status.messages >= 40)
+        await akvs[key("arm")]["joint"].delete()
+        await asyncio.sleep(0.1)
+    with logged(file) as log:
+        times, values = log[key("arm.joint")].history()
+        assert set(values.tolist()) == {0.5}
+        assert len(times) >= 15
+        off = (times - times[0]) / 0.02
+        assert np.median(np.abs(off - np.round(off))) < 0.4  # on the grid of the period, however late some are
+        assert_same(log.value_at("", times[-1]), {key("arm"): {"joint": 0.5, "image": IMAGE, "list": [None, 2]}})
+        assert "joint" not in log[key("arm")].at(log.end)
+        assert log.metadata["samples failed"] == "0"
+        assert {update.kind for update in log.updates()} == {"kvs"}
+
+
+async def test_set_points_and_a_camera_together(key, server_url, binterface, file):
+    """1 kHz and 30 Hz for 3 s: nothing dropped, no gap, every set point there, any instant found at once."""
+    connect = reem_async.RedisInterface
+    async with (
+        connect(server_url) as one,
+        connect(server_url) as two,
+        Recorder(binterface, [key("*")], file) as recorder,
+    ):
+        sent = await asyncio.gather(
+            _publish(one, key("point"), lambda n: {"n": n, "q": [0.1 * n, 0.2, 0.3]}, 1000, 3.0),
+            _publish(two, key("camera"), lambda n: {"n": n, "image": np.roll(FRAME, n)}, 30, 3.0),
+        )
+    status = recorder.status
+    assert (status.dropped, status.gaps, status.lost) == (0, 0, 0)
+    with logged(file) as log:
+        assert log[key("point.n")].history()[1].tolist() == list(range(sent[0]))
+        times, frames = log[key("camera.n")].history()
+        assert len(frames) + status.skipped == sent[1]
+        for place in range(0, len(times), 10):
+            image = log[key("camera.image")].at(times[place])
+            assert_same(image, np.roll(FRAME, int(frames[place])))
+        took = []
+        for instant in np.random.default_rng(1).uniform(log.start + 0.2, log.end, 50):
+            begun = time.perf_counter()
+            log[key("camera")].at(instant)
+            log[key("point")].at(instant)
+            took.append(time.perf_counter() - begun)
+        assert np.median(took) < 0.05
+
+
+async def _publish(interface, name, value, rate, seconds):
+    space, begun, count = reem_async.PublishSpace(interface), time.monotonic(), 0
+    while (now := time.monotonic() - begun) < seconds:
+        await asyncio.sleep(max(0.0, count / rate - now))
+        await space[name].write(value(count))
+        count += 1
+    return count
+
+
+async def test_a_full_queue_drops_and_says_so(key, apspace, akvs, binterface, file):
+    """What cannot be kept is counted by path, and the key is read anew afterwards."""
+    async with Recorder(binterface, [key("*")], file, queue_bytes=200_000) as recorder:
+        for number in range(300):
+            await apspace[key("big")].write({"n": number, "a": np.full(1900, number)})
+        await aeventually(lambda: recorder.scribe.waiting == 0)
+        last = await akvs[key("big")].read()
+        await aeventually(lambda: not recorder.scribe.behind)
+    assert recorder.status.dropped + recorder.status.messages // 2 >= 300
+    with logged(file) as log:
+        assert_same(log[key("big")].at(log.end), last)
+        if recorder.status.dropped:
+            assert log.metadata[f"not recorded: {key('big')}"] == str(recorder.status.dropped + recorder.status.skipped)
+
+
+async def test_a_broken_connection_is_a_gap(key, apspace, akvs, server_url, raw, file):
+    """What was missed is not there, but what came of it is."""
+    connect = reem_async.RedisInterface
+    async with connect(server_url, client_name=key("recorder")) as other, Recorder(other, [key("*")], file) as recorder:
+        await apspace[key("a")].write(1)
+        await aeventually(lambda: recorder.status.messages >= 1)
+        for row in raw.client_list():
+            if row["name"] == key("recorder"):
+                raw.client_kill_filter(_id=row["id"])
+        await akvs[key("a")].write(2)
+        await aeventually(lambda: recorder.status.gaps >= 1)
+        await aeventually(lambda: recorder.status.messages >= 3)
+        await apspace[key("a")].write(3)
+    with logged(file) as log:
+        assert log[key("a")].history()[1].tolist() == [1, 2, 3]
+        assert next(path for _, path, _ in log.gaps()) == key("a")
+
+
+async def test_custom_ships(key, server_url, file):
+    """Those whose value is bytes are recorded; of others it is said that they are not."""
+
+    class Point(reem_async.BlobShip):
+        def check_fit(self, value):
+            return isinstance(value, complex)
+
+        def pack(self, value):
+            return (repr(value).encode(),)
+
+        def unpack(self, blob):
+            return complex(bytes(blob).decode())
+
+        def get_label(self):
+            return "complex"
+
+    class Hash(reem_async.SpecialDatatypeShip):
+        def check_fit(self, value):
+            return isinstance(value, range)
+
+        def write(self, key, value, client):
+            client.hset(key, mapping={"stop": value.stop})
+
+        def read(self, key, client):
+            client.hgetall(key)
+
+        def interpret_read(self, responses):
+            return range(int(responses[0][b"stop"]))
+
+        def get_label(self):
+            return "range"
+
+    async with reem_async.RedisInterface(server_url, ships=[Point(), Hash()]) as interface:
+        space = reem_async.PublishSpace(interface)
+        async with Recorder(interface, [key("a")], file) as recorder:
+            await space[key("a")].write({"z": 1 + 2j, "r": 5})
+            await aeventually(lambda: recorder.status.messages >= 2)
+            await space[key("a")]["r"].write(range(3))
+        assert recorder.status.lost == 1
+    with open_log(file, ships=[Point()]) as log:
+        assert log[key("a.z")].at(log.end) == 1 + 2j
+        with pytest.raises(ValueError, match="not recorded"):
+            log[key("a.r")].at(log.end)
+    with open_log(file) as log, pytest.raises(ValueError, match="'complex'"):
+        log[key("a.z")].at(log.end)
+
+
+async def test_bad_arguments(key, binterface, file, tmp_path):
+    for arguments, error in (
+        ({"patterns": "arm"}, BadType),
+        ({"patterns": []}, BadValue),
+        ({"patterns": ["a{b"]}, BadKey),
+        ({"keyframe": 0}, BadValue),
+        ({"keyframe": float("nan")}, BadValue),
+        ({"compression": "rar"}, BadValue),
+        ({"sample": {"a": 0}}, BadValue),
+        ({"sample": {"": 1}}, BadInput),
+        ({"sample": tmp_path / "none.csv"}, BadValue),
+        ({"path": tmp_path / "no" / "run.mcap"}, BadValue),
+    ):
+        with pytest.raises(error):
+            Recorder(binterface, **{"path": file, **arguments})
+        assert not file.exists(), arguments
+    nobody = reem_async.RedisInterface("redis://127.0.0.1:1")
+    with pytest.raises(reem_async.NotConnected):
+        await Recorder(nobody, path=file).start()
+    assert not file.exists()
+    file.write_bytes(b"precious")
+    with pytest.raises(BadValue, match="overwrite=True"):
+        Recorder(binterface, path=file)
+    assert file.read_bytes() == b"precious"
+    async with Recorder(binterface, [key("a")], file, overwrite=True):
+        pass
+    with logged(file) as log:
+        assert (log.names(), log.duration >= 0) == ([], True)
+
+
+def test_the_blocking_front(key, server_url, pspace, kvs, interface, file):
+    with reem.RedisInterface(server_url) as other:
+        with reem.recording.Recorder(other, [key("a")], file) as recorder:
+            pspace[key("a")] = {"image": IMAGE, "n": 1}
+            eventually(lambda: recorder.status.messages >= 2)
+            pspace[key("a")]["n"] = 2
+            recorder.wait(0.05)
+        with reem.recording.open_log(file) as log:
+            assert log[key("a")]["n"].history()[1].tolist() == [1, 2]
+            replayer = reem.recording.Replayer(other, log, rate=100, remap={key("a"): key("b")})
+            assert replayer.play().published == 3 - 1
+            assert_same(kvs[key("b")].read(), {"image": IMAGE, "n": 2})
+            assert replayer.step().path == (key("a"), "n")
+
+
+def test_both_fronts_promise_the_same():
+    import inspect
+
+    from reem_async import recording as core
+
+    for name in ("Recorder", "Replayer"):
+        ours, theirs = getattr(reem.recording, name), getattr(core, name)
+        assert list(inspect.signature(ours).parameters) == list(inspect.signature(theirs).parameters)
+        for method in [name for name in vars(theirs) if not name.startswith("_")]:
+            if name != "Recorder" or method in ("start", "stop", "wait", "status"):
+                assert hasattr(ours, method), method
+    assert reem.recording.__all__ == core.__all__
+    assert reem.recording.open_log is core.open_log

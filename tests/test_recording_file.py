@@ -1,0 +1,320 @@
+"""The file itself: read by others, cut short, damaged, on a full disk, after kill -9."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import signal
+import sys
+import time
+
+import mcap.reader
+import numpy as np
+import orjson
+import pytest
+from conftest import aeventually, assert_same, eventually, python
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from test_recording import FRAME, IMAGE
+
+import reem
+import reem.recording
+import reem_async
+from reem_async.errors import BadData, MissingKey
+from reem_async.recording import DamagedRecording, Recorder, RecordingFailed, open_log
+
+
+@pytest.fixture
+async def binterface(server_url):
+    async with reem_async.RedisInterface(server_url) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def recorded(server_url, tmp_path_factory):
+    """A file with a few chunks, and what was at a path at some instants; the names are those of `key` below."""
+    file, seen, name = tmp_path_factory.mktemp("recorded") / "run.mcap", [], f"recorded{os.getpid()}"
+    with reem.RedisInterface(server_url) as interface:
+        space = reem.PublishSpace(interface)
+        with reem.recording.Recorder(interface, [f"{name}*"], file, keyframe=0.2) as recorder:
+            for number in range(40):
+                value = {"n": number, "image": IMAGE + np.uint8(number), "t": "x" * number}
+                before = recorder.status.messages
+                space[f"{name}a"] = value
+                eventually(lambda before=before: recorder.status.messages > before + 1)
+                seen.append((time.time(), value))
+                recorder._core._sink._closed_at -= number % 5 == 0  # a chunk for every few updates
+                space[f"{name}b"] = number
+        del space[f"{name}a"], space[f"{name}b"]
+    return file, seen, name
+
+
+@pytest.fixture
+def file_and_values(recorded):
+    return recorded[:2]
+
+
+@pytest.fixture
+def names(recorded):
+    """Makes the names in that file."""
+    return lambda name: recorded[2] + name
+
+
+def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values):
+    file, seen = file_and_values
+    with file.open("rb") as stream:
+        reader = mcap.reader.make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert len(summary.chunk_indexes) > 5
+        assert summary.statistics.message_count == sum(summary.statistics.channel_message_counts.values())
+        images, documents = [], []
+        topics = set()
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None, "every channel has a schema: some viewers skip those without"
+            assert channel.metadata["reem.version"] == "1"
+            topics.add(channel.topic)
+            if channel.topic == f"/{names('a')}/image":
+                assert (schema.name, schema.encoding, channel.message_encoding) == (
+                    "foxglove.RawImage",
+                    "protobuf",
+                    "protobuf",
+                )
+                images.append(RawImage.FromString(message.data))
+            elif channel.topic == f"/{names('a')}":
+                assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+                assert json.loads(schema.data)["properties"]["n"] == {"type": "number"}
+                documents.append((message, json.loads(message.data)))
+        assert topics == {f"/{names('a')}", f"/{names('a')}/image", f"/{names('b')}", "/_reem/keyframe", "/_reem/stats"}
+        assert len(images) == len(documents) == len(seen)
+        for image, (message, document), (_, value) in zip(images, documents, seen, strict=True):
+            assert document["n"] == value["n"]
+            assert (image.width, image.height, image.encoding, image.step) == (64, 48, "rgb8", 192)
+            assert image.data == value["image"].tobytes()
+            assert document["image"]["topic"] == f"/{names('a')}/image"
+            assert message.sequence == value["n"] + 1
+            assert abs(message.publish_time - message.log_time) < 10**9
+            assert image.timestamp.seconds == message.publish_time // 10**9
+        names = {record.name for record in reader.iter_metadata()}
+        assert names == {"reem", "reem.channels"}
+    with file.open("rb") as stream:  # and record by record, every checksum verified
+        assert list(mcap.reader.NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False))
+
+
+def test_metadata_says_who_when_and_what_is_missing(names, file_and_values):
+    with open_log(file_and_values[0]) as log:
+        said = log.metadata
+        assert said["patterns"] == names("*")
+        assert said["dropped"] == said["lost"] == said["gaps"] == "0"
+        assert {"host", "user", "server", "version", "began", "ended", "numpy"} <= said.keys()
+        assert "password" not in str(said)
+        a = next(each for each in log.channels() if each.topic == f"/{names('a')}")
+        assert (a.messages, a.path, a.role, a.kind) == (40, names("a"), "update", "pub")
+        assert a.rate > 0
+
+
+def check(file, names, seen):
+    """Whatever can be read is what was written; returns how many of the values can."""
+    found = 0
+    with open_log(file) as log:
+        values = {value["n"]: value for _, value in seen}
+        for update in log.updates(patterns=[names("a")]):
+            assert_same(update.value, values[update.value["n"]])
+            found += 1
+        for instant, _ in seen[::5]:
+            with contextlib.suppress(MissingKey, DamagedRecording):
+                value = log.value_at(names("a"), instant)
+                assert_same(value, values[value["n"]])
+        with contextlib.suppress(DamagedRecording):
+            log.value_at("", log.end)
+        log.channels()
+        return found, log.damaged
+
+
+def test_cut_anywhere_it_opens(names, file_and_values, tmp_path):
+    """At every kind of place: what is before the cut is there, and never anything else."""
+    file, seen = file_and_values
+    data = file.read_bytes()
+    rng = random.Random(5)
+    cut, counts = tmp_path / "cut.mcap", []
+    places = sorted({*rng.sample(range(8, len(data)), 60), 8, 9, 30, len(data) - 1, len(data) - 8, len(data) - 9})
+    for place in places:
+        cut.write_bytes(data[:place])
+        if place < 1000:  # so short that not even its first record may be there
+            with contextlib.suppress(DamagedRecording):
+                assert check(cut, names, seen)[0] == 0
+        else:
+            counts.append(check(cut, names, seen)[0])
+    assert counts == sorted(counts)
+    assert counts[-1] == len(seen)
+    for place in range(8):
+        cut.write_bytes(data[:place])
+        with pytest.raises(DamagedRecording):
+            open_log(cut)
+
+
+def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_path):
+    """A flipped byte costs the chunk around it at most; with the index and without."""
+    file, seen = file_and_values
+    data = file.read_bytes()
+    rng = random.Random(7)
+    damaged, worst = tmp_path / "damaged.mcap", len(seen)
+    noticed = 0
+    for _ in range(80):
+        place = rng.randrange(8, len(data) - 200)
+        broken = bytearray(data if rng.random() < 0.5 else data[: -rng.randrange(100, 200)])
+        broken[place] ^= 1 << rng.randrange(8)
+        damaged.write_bytes(broken)
+        found, count = check(damaged, names, seen)
+        worst = min(worst, found)
+        noticed += count > 0
+    assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
+    assert noticed > 40
+
+
+async def test_what_is_no_recording(tmp_path, recorded):
+    for data in (b"", b"\x89MCAP0\r\n", b"PK\x03\x04" * 100, recorded[0].read_bytes()[100:]):
+        other = tmp_path / "other"
+        other.write_bytes(data)
+        with pytest.raises(BadData, match="other"):
+            open_log(other)
+    foreign = tmp_path / "foreign.mcap"
+    with foreign.open("wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start()
+        channel = writer.register_channel("/a", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(BadData, match="not a recording of REEM"):
+        open_log(foreign)
+    with pytest.raises(FileNotFoundError):
+        open_log(tmp_path / "none.mcap")
+
+
+async def test_hostile_contents_are_refused(tmp_path):
+    """Well-formed MCAP whose notes lie."""
+    file = tmp_path / "hostile.mcap"
+    notes = orjson.dumps([[["a"], "stored", "numpy", ["x"], 1, 5, "", "", None]]).decode()
+    with file.open("wb") as stream:
+        writer = mcap.writer.Writer(stream)
+        writer.start()
+        schema = writer.register_schema("x", "jsonschema", b"{}")
+        metadata = {"reem.path": '["x"]', "reem.role": "update", "reem.kind": "pub"}
+        channel = writer.register_channel("/x", "json", schema, metadata)
+        writer.add_message(channel, 1_000_000, orjson.dumps({"a": 1, "$ship": notes}), 1)
+        writer.add_message(channel, 2_000_000, b"\xff", 1)
+        writer.finish()
+    with open_log(file) as log:
+        with pytest.raises(DamagedRecording, match="x"):
+            log["x"].at(0.001)
+        with pytest.raises(DamagedRecording):
+            log["x"].at(0.002)
+        assert list(log.updates()) == []
+
+
+RECORD = """
+import asyncio, sys, reem_async
+from reem_async.recording import Recorder
+async def main(url, pattern, file):
+    async with reem_async.RedisInterface(url) as interface, Recorder(interface, [pattern], file):
+        print("up", flush=True)
+        await asyncio.sleep(60)
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace, tmp_path):
+    """While a thousand updates a second and pictures come in."""
+    file, sent = tmp_path / "run.mcap", []
+    process = python(RECORD, server_url, key("*"), file, start=True)
+    try:
+        assert process.stdout.readline() == "up\n", process.stderr.read()
+        begun = time.monotonic()
+        while time.monotonic() - begun < 2.0:
+            value = {"n": len(sent), "image": IMAGE + np.uint8(len(sent) % 256)} if len(sent) % 10 == 0 else len(sent)
+            sent.append((time.time(), value))
+            pspace[key("a" if len(sent) % 10 == 1 else "n")] = value
+            time.sleep(0.001)
+        killed = time.time()
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+    with open_log(file) as log:
+        assert not log.indexed
+        old = [(instant, value) for instant, value in sent if instant < killed - 1.0]
+        assert len(old) > 100
+        assert (
+            log[key("n")].history()[1].tolist()[: len(old) // 2]
+            == [value for _, value in sent if type(value) is int][: len(old) // 2]
+        )
+        assert log.end > killed - 1.0
+        newest = max((value for instant, value in old if type(value) is int))
+        assert log[key("n")].at(log.end) >= newest
+        known = {value["n"]: value for _, value in sent if type(value) is dict}
+        for update in log.updates(patterns=[key("a")]):
+            assert_same(update.value, known[update.value["n"]])
+        assert any(value["n"] == log[key("a")].at(log.end)["n"] for _, value in sent if type(value) is dict)
+
+
+async def test_while_it_grows_it_can_be_read(key, apspace, binterface, tmp_path):
+    file = tmp_path / "run.mcap"
+    async with Recorder(binterface, [key("*")], file):
+        await apspace[key("a")].write({"image": FRAME})
+
+        def there():
+            with open_log(file) as log:
+                return key("a") in log.names()
+
+        await aeventually(there)
+        with open_log(file) as log:
+            assert not log.indexed
+            assert_same(log[key("a.image")].at(log.end), FRAME)
+
+
+FULL = """
+import asyncio, resource, signal, sys, numpy, reem_async
+from reem_async.errors import ReemError
+from reem_async.recording import Recorder, RecordingFailed
+async def main(url, key, file):
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_500_000, 2_500_000))
+    rng = numpy.random.default_rng(0)
+    async with reem_async.RedisInterface(url) as interface:
+        space = reem_async.PublishSpace(interface)
+        recorder = Recorder(interface, [key], file)
+        try:
+            async with recorder:
+                for number in range(10_000):
+                    await space[key].write({"n": number, "noise": rng.integers(0, 255, 20_000, numpy.uint8)})
+                    await asyncio.sleep(0.002)
+                    if recorder.scribe.failure:
+                        await recorder.wait()
+        except RecordingFailed as error:
+            print(number, error, flush=True)
+asyncio.run(main(*sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
+def test_a_full_disk_ends_the_recording_and_leaves_a_file_that_can_be_read(key, server_url, tmp_path):
+    """A limit of the process stands in for the disk: writing fails in the middle of a chunk."""
+    file = tmp_path / "run.mcap"
+    run = python(FULL, server_url, key("a"), file, flags=("-W", "error"))
+    assert run.stderr == ""
+    assert "could not be written any further" in run.stdout
+    assert "can be read" in run.stdout
+    assert file.stat().st_size <= 2_500_000
+    with open_log(file) as log:
+        assert (log.damaged, log.indexed) == (0, False)
+        numbers = log[key("a.n")].history()[1].tolist()
+        assert numbers == sorted(set(numbers))
+        assert 30 < len(numbers) < 130
+        assert log.verify() == 0
+
+
+def test_no_space_at_all(key, server_url, interface):
+    """/dev/full takes nothing: said at once, and by the error that says why."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no /dev/full here")
+    with pytest.raises((RecordingFailed, OSError), match="No space left"):
+        reem.recording.Recorder(interface, [key("a")], "/dev/full", overwrite=True)

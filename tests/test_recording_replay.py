@@ -1,0 +1,204 @@
+"""Replaying: pace, start in the middle, loops, names, and what an export holds."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import time
+
+import numpy as np
+import pytest
+from conftest import aeventually, assert_same
+from test_recording import FRAME, IMAGE
+
+import reem
+import reem.recording
+import reem_async
+from reem_async.errors import BadInput, BadValue
+from reem_async.policy import Every
+from reem_async.recording import Recorder, Replayer, open_log
+from reem_async.recording.export import export
+
+
+@pytest.fixture
+async def other(server_url):
+    async with reem_async.RedisInterface(server_url) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def made(server_url, tmp_path_factory):
+    """Half a second: a counter, a picture for each tenth, a key that comes and goes."""
+    file, name = tmp_path_factory.mktemp("replay") / "run.mcap", f"replay{os.getpid()}"
+    with reem.RedisInterface(server_url) as interface:
+        space = reem.PublishSpace(interface)
+        space[f"{name}arm"] = {"n": 0, "image": IMAGE}
+        with reem.recording.Recorder(interface, [f"{name}*"], file):
+            for number in range(1, 26):
+                space[f"{name}arm"]["n"] = number
+                if number % 10 == 0:
+                    space[f"{name}arm"]["image"] = IMAGE + np.uint8(number)
+                if number == 5:
+                    space[f"{name}late"] = [1.5, {"frame": FRAME}]
+                if number == 15:
+                    del space[f"{name}late"]
+                time.sleep(0.02)
+        del space[f"{name}arm"]
+    return file, name
+
+
+@pytest.fixture
+def names(made):
+    """Makes the names in that recording."""
+    return lambda name: made[1] + name
+
+
+@pytest.fixture
+def log(made):
+    with open_log(made[0]) as opened:
+        yield opened
+
+
+async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs, other):
+    target = key("again")
+    seen = []
+
+    async def follow(watch):
+        async for update in watch:
+            when = time.monotonic()
+            seen.append((when, update.path, update.data))
+
+    async with akvs[target].watch(Every(1000)) as watch:
+        following = asyncio.create_task(follow(watch))
+        status = await Replayer(other, log, patterns=[names("arm")], remap={names("arm"): target}).play()
+        await aeventually(lambda: seen and seen[-1][2]["n"] == 25)
+        following.cancel()
+    assert (status.refused, status.rounds, status.published) == (0, 1, 1 + 25 + 2)
+    times = {data["n"]: when for when, path, data in seen if path.endswith(".n")}
+    assert sorted(times) == list(range(1, 26))
+    recorded = log[names("arm.n")].history()[0]
+    lasted = times[25] - times[1]
+    assert lasted == pytest.approx(recorded[-1] - recorded[1], abs=0.15 + status.most_lag)
+    assert_same(await akvs[target].read(), log[names("arm")].at(log.end))
+
+
+@pytest.mark.parametrize("rate", [10.0, 1e6])
+async def test_faster(names, key, log, akvs, other, rate):
+    begun = time.monotonic()
+    status = await Replayer(other, log, rate=rate, remap={names("arm"): key("b"), names("late"): key("c")}).play()
+    assert time.monotonic() - begun < log.duration + status.most_lag
+    assert status.lag <= status.most_lag
+    assert status.position == log.end
+    assert_same(await akvs[key("b")].read(), log[names("arm")].at(log.end))
+    assert await akvs.get(key("c"), "gone") == "gone"
+
+
+async def test_from_the_middle_the_state_comes_first(names, key, log, akvs, other):
+    middle = log.start + 0.2
+    replayer = Replayer(other, log, start=middle, end=middle, remap={names("arm"): key("b"), names("late"): key("c")})
+    await replayer.play()
+    assert_same({"b": await akvs[key("b")].read()}, {"b": log[names("arm")].at(middle)})
+    assert_same(await akvs[key("c")].read(), log[names("late")].at(middle))
+
+
+async def test_step_by_step(names, key, log, akvs, other):
+    replayer = Replayer(other, log, patterns=[names("arm.n")], remap={names("arm"): key("b")})
+    for number in range(1, 26):
+        update = await replayer.step()
+        assert (update.path, update.value) == ((names("arm"), "n"), number)
+        assert await akvs[key("b")].read() == {"n": number}
+    assert await replayer.step() is None
+    assert replayer.status.rounds == 1
+
+
+async def test_loops_begin_with_what_was_there(names, key, log, akvs, other):
+    """What came during the recording is deleted at the next beginning."""
+    replayer = Replayer(other, log, rate=50, loop=True, remap={names("arm"): key("b"), names("late"): key("c")})
+    playing = asyncio.create_task(replayer.play())
+    await aeventually(lambda: replayer.status.rounds >= 2)
+    playing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await playing
+    assert replayer.status.published > 2 * 28
+    assert (await akvs[key("b")].read()).keys() == {"n", "image"}
+
+
+async def test_what_the_server_refuses_is_counted(key, apspace, akvs, other, server_url, tmp_path):
+    async with reem_async.RedisInterface(server_url) as own:
+        await akvs[key("a")].write({"x": {"y": 1}})
+        async with Recorder(own, [key("a.x.*")], tmp_path / "a.mcap"):
+            await apspace[key("a")]["x"]["y"].write(2)
+    with open_log(tmp_path / "a.mcap") as log:
+        after = log[key("a.x.y")].history()[0][0] + 1e-4
+        status = await Replayer(other, log, start=after, remap={key("a"): key("b")}).play()
+        assert (status.refused, await akvs[key("b")].read()) == (0, {"x": {"y": 2}})
+        replayer = Replayer(other, log, remap={key("a"): key("c")})
+        await replayer.step()  # the start, and the one update
+        await akvs[key("c")].write(5)
+        replayer._updates = iter(log.updates(after))
+        await replayer._publish(next(log.updates(log.start + 1e-4)))
+        assert replayer.status.refused == 1
+
+
+async def test_bad_arguments(log, other):
+    for arguments in (
+        {"rate": 0},
+        {"rate": float("inf")},
+        {"start": log.end, "end": log.start},
+        {"remap": {"a.b": "c"}},
+        {"remap": {"a": "c.d"}},
+        {"remap": {"a": "{c}"}},
+        {"patterns": ["a{"]},
+        {"start": "now"},
+    ):
+        with pytest.raises(BadInput):
+            Replayer(other, log, **arguments)
+
+
+async def test_samples_replay_with_their_parents(key, akvs, other, server_url, tmp_path):
+    await akvs[key("a")].write({"x": {"y": 1, "z": 2}})
+    async with reem_async.RedisInterface(server_url) as own:
+        recorder = Recorder(own, [], tmp_path / "a.mcap", sample={key("a.x.y"): 0.01})
+        async with recorder:
+            await aeventually(lambda: recorder.status.messages > 5)
+    with open_log(tmp_path / "a.mcap") as log:
+        await Replayer(other, log, remap={key("a"): key("b")}).play()
+    assert await akvs[key("b")].read() == {"x": {"y": 1}}
+
+
+def test_export_csv(names, log, tmp_path):
+    result = export(log, "csv", tmp_path / "a.csv", [names("arm")])
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    assert lines[0] == f"time,{names('arm')}.n"
+    assert [line.split(",")[1] for line in lines[1:]] == [str(number) for number in range(26)]
+    assert float(lines[1].split(",")[0]) == pytest.approx(log.start, abs=1e-3)
+    assert result.left_out.keys() == {f"{names('arm')}.image"}
+    assert result.rows == 26
+    with pytest.raises(BadValue, match="there already"):
+        export(log, "csv", tmp_path / "a.csv")
+    with pytest.raises(BadValue, match="none of csv"):
+        export(log, "xls", tmp_path / "a.xls")
+    with pytest.raises(BadValue, match="nothing"):
+        export(log, "csv", tmp_path / "b.csv", ["nobody"])
+    assert not (tmp_path / "b.csv").exists()
+
+
+def test_export_npz(names, log, tmp_path):
+    export(log, "npz", tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
+        times, images = log[names("arm.image")].history()
+        assert_same(arrays[f"{names('arm')}.image"], images)
+        assert_same(arrays[f"{names('arm')}.image.time"], times)
+        assert arrays[f"{names('arm')}.n"].tolist() == list(range(26))
+        assert_same(arrays[f"{names('late')}[1].frame"], FRAME[None])
+
+
+def test_export_parquet(names, log, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    export(log, "parquet", tmp_path / "a.parquet")
+    table = parquet.read_table(tmp_path / "a.parquet")
+    numbers = [value for value in table[f"{names('arm')}.n"].to_pylist() if value is not None]
+    assert numbers == list(range(26))
+    assert str(table.schema.field(f"{names('late')}[0]").type) == "double"
+    assert str(table.schema.field("time").type) == "timestamp[us, tz=UTC]"
