@@ -102,7 +102,7 @@ def test_a_user_who_may_do_little(own):
     assert "with password, without TLS" in report["access"]["message"]
     assert "hidden" not in run.output
     said = cli.error(1, "ls")
-    assert "does not let this user do that" in said
+    assert "the user may not do this" in said
     assert "scan" in said
 
 

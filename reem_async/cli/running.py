@@ -136,11 +136,6 @@ def for_users(error: Exception) -> str:
     if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.strerror and error.filename:
         return f"{error.filename}: {error.strerror}"
     text = str(error) or type(error).__name__
-    kind = type(error).__name__
-    if kind == "NoPermissionError":
-        return f"the server does not let this user do that: {text}"
-    if kind == "AuthenticationError" and "RedisInterface" not in text:
-        return f"the server refused the user or password in --url or REEM_URL: {text}"
     for of_library, of_command in (
         ("RedisInterface('redis://host:port')", "--url redis://host:port or REEM_URL"),
         ("use store['a']['b'] for such keys", 'write it like foo.bar[0]; a key with a dot in it: foo["a.b"]'),

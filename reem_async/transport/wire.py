@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import os
 import sys
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -28,6 +30,12 @@ _LOOKS = 20
 """How many times per time limit to look whether a large value is moving."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
+
+
+_open: weakref.WeakSet[Wire] = weakref.WeakSet()
+_inherited: list[Any] = []
+"""A parent's connections in a forked child, kept from being finalized: closing one would take it out of the parent's
+event loop, since both share one epoll."""
 
 
 class _Due:
@@ -100,8 +108,19 @@ class Wire(asyncio.BufferedProtocol):
         connection._reader = connection._writer = None
         transport: asyncio.Transport = writer.transport
         self._transport, self._socket = transport, transport.get_extra_info("socket")
+        _open.add(self)
         self._tls = transport.get_extra_info("ssl_object") is not None
         transport.set_protocol(self)
+
+    def disown(self) -> None:
+        """Give the connection up without touching it: it belongs to the parent process."""
+        self._reason = self._reason or ConnectionLost("this connection belongs to the parent process")
+        _inherited.append((self._transport, self._keep))
+        self._transport = self._keep = self._on_lost = None
+        waiting, self._due = self._due, collections.deque()
+        for due in waiting:
+            if not due.over:
+                due.done(self._reason)
 
     @property
     def alive(self) -> bool:
@@ -326,3 +345,13 @@ async def open_wire(
     wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
     wire.take_over(connection)
     return wire
+
+
+def _disown_all() -> None:
+    for wire in list(_open):
+        wire.disown()
+    _open.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_disown_all)

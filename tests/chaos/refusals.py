@@ -12,6 +12,7 @@ import redis.exceptions
 from conftest import FRONTS, assert_no_orphans, assert_same
 
 import reem
+from reem_async.errors import ServerNotReady
 
 from .scoreboard import Run, row
 from .servers import PrivateServer
@@ -145,7 +146,7 @@ def _replica(desk: _Desk, name: str) -> None:
         desk.unchanged(f"{name} replica", front, copy)
         primary.kill()
         _until(lambda: copy.info("replication")["master_link_status"] != "up")
-        desk.expect(f"{name} replica alone", redis.exceptions.MasterDownError, lambda: front.read([TOP]))
+        desk.expect(f"{name} replica alone", ServerNotReady, lambda: front.read([TOP]))
 
 
 def _until(condition: Callable[[], Any]) -> None:
