@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from typing import NamedTuple
 
 from .keys import keys_of
@@ -37,7 +38,13 @@ class Pattern(NamedTuple):
 
 
 def _alike(ours: str | int, theirs: str | int) -> bool:
-    return ours == theirs or (isinstance(ours, str) and fnmatchcase(str(theirs), _BRACKETS.sub(r"[\1]", ours)))
+    return ours == theirs or ours == "*" or (isinstance(ours, str) and fnmatchcase(str(theirs), _literal(ours)))
+
+
+@lru_cache(maxsize=1024)
+def _literal(glob: str) -> str:
+    """Return a glob in which only `*` and `?` stand for other characters."""
+    return _BRACKETS.sub(r"[\1]", glob)
 
 
 def parse_pattern(text: str) -> Pattern:
