@@ -96,7 +96,10 @@ class RedisInterface:
     started when first needed and ended by `close()` or at exit.
 
     Args:
-        host: A host name, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`.
+        host: A host name, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`. Several servers:
+            `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an
+            `EmbeddedCluster`; `redis+sentinel://host:26379,host:26380/mymaster` for the primary that
+            sentinels name. With TLS they begin with `rediss+`. See docs/fleet.md.
         ships: What carries values that are not JSON, first fit first; replaces the default list of
             `NumpyShip` and `BytesShip`.
         namespace: Goes before every key and channel, so that several robots can share a server.

@@ -1,4 +1,9 @@
-"""Patterns of channels in a cluster, where servers have none: the keys are looked for, and each is followed."""
+"""Patterns of channels in a cluster, where servers have none: the keys are looked for, and each is followed.
+
+A key that is found a moment after it was made would have been published to already. So publishers
+tell all nodes what they publish in their first seconds with a key, by a channel of the old kind, for
+which there are patterns; whoever hears of a key this way follows it from then on.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +14,7 @@ import weakref
 from typing import TYPE_CHECKING, Any
 
 from .background import in_background
-from .errors import RedisError
+from .errors import InterfaceClosed, RedisError
 from .plan.keys import keys_of
 from .plan.notices import Notice
 from .plan.scan import documents
@@ -27,6 +32,8 @@ logger = logging.getLogger("reem.subscribe")
 _PAUSE = 1.0
 """Seconds between looks for new keys."""
 
+_MOST = 10_000
+
 _TAIL = "}:notices"
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
 
@@ -41,6 +48,7 @@ class Discovery:
     def __init__(self, hub: Hub) -> None:
         self._hub = hub
         self._branches: weakref.WeakKeyDictionary[Listener, dict[bytes, _Branch]] = weakref.WeakKeyDictionary()
+        self._births: weakref.WeakKeyDictionary[Listener, _Births] = weakref.WeakKeyDictionary()
         self._looking: asyncio.Task[Any] | None = None
 
     async def follow(self, listener: Listener) -> None:
@@ -51,6 +59,8 @@ class Discovery:
             if name is not None:  # it need not be there yet
                 await self._found(listener, name.encode(), late=False)
                 return
+            births = self._births[listener] = _Births(self, listener)
+            await self._hub.follow_here(births)
             await self._look(listener, late=False)
         except BaseException:
             await self.unfollow(listener)
@@ -62,6 +72,20 @@ class Discovery:
         """Stop following. Idempotent."""
         for branch in self._branches.pop(listener, {}).values():
             await self._hub.unfollow(branch)
+        births = self._births.pop(listener, None)
+        if births is not None:
+            await self._hub.unfollow_here(births)
+
+    def heard(self, listener: Listener, document: bytes) -> None:
+        """Follow a key that was just heard of."""
+        if document not in self._branches.get(listener, {document: None}):
+            in_background(self._follow_quietly(listener, document), "reem discovery of a key")
+
+    async def _follow_quietly(self, listener: Listener, document: bytes) -> None:
+        try:
+            await self._found(listener, document, late=True)
+        except (RedisError, OSError, InterfaceClosed) as error:
+            logger.debug("a new key is not followed yet: %s", error)
 
     async def close(self) -> None:
         """Stop looking."""
@@ -71,14 +95,16 @@ class Discovery:
     async def _go_on_looking(self) -> None:
         while True:
             await asyncio.sleep(_PAUSE)
-            for listener in [each for each in self._branches if literal(_glob(each)) is None]:
-                try:
-                    await self._look(listener, late=True)
-                except (RedisError, OSError) as error:
-                    logger.debug("new keys could not be looked for: %s", error)
-            del listener
+            await self._look_for_all()
             if not self._branches:
                 return
+
+    async def _look_for_all(self) -> None:
+        for listener in list(self._births):
+            try:
+                await self._look(listener, late=True)
+            except (RedisError, OSError) as error:
+                logger.debug("new keys could not be looked for: %s", error)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:
         """Follow the keys that are not followed yet."""
@@ -96,7 +122,7 @@ class Discovery:
         branches = self._branches.get(listener)
         if branches is None or document in branches or b"{" in document:
             return
-        branch = branches[document] = _Branch(listener, document, late=late)
+        branch = branches[document] = _Branch(listener, document, self._births.get(listener) if late else None)
         try:
             await self._hub.follow(branch)
         except BaseException:
@@ -118,11 +144,11 @@ def literal(glob: str) -> str | None:
 class _Branch:
     """One key of a pattern: a listener of the hub that hands everything on."""
 
-    def __init__(self, listener: Listener, document: bytes, *, late: bool) -> None:
+    def __init__(self, listener: Listener, document: bytes, births: _Births | None) -> None:
         from .hub import Topic
 
         self._listener = weakref.ref(listener)
-        self._late = late
+        self._births = births  # where its first notices came from, if it was found late
         self.topic: Topic = Topic(
             keys_of(document.decode(errors="surrogateescape")).channel.encode(errors="surrogateescape")
         )
@@ -155,15 +181,63 @@ class _Branch:
             listener.doubt()
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Hand it on. Of a key that was found late, the first updates may be lost."""
+        """Hand it on. Of a key that was found late, the first updates may be lost, unless all nodes were told."""
         listener = self._listener()
         if listener is None:
             return
-        if self._late:
-            self._late = False
-            if notice.sequence > 1:
+        if self._births is not None:
+            births, self._births = self._births, None
+            if notice.sequence > 1 and (notice.publisher, channel) not in births.heard:
                 listener.doubt()
         listener.on_notice(notice, channel)
+
+    def on_note(self, note: bytes | None) -> None:
+        """Nothing to compare."""
+
+
+class _Births:
+    """What publishers tell all nodes: a listener of the hub.
+
+    Attributes:
+        heard: Who published what first.
+    """
+
+    def __init__(self, discovery: Discovery, listener: Listener) -> None:
+        self._discovery = discovery
+        self._listener = weakref.ref(listener)
+        self.topic = listener.topic
+        self.note: str | None = None
+        self.ready: asyncio.Future[None] | None = None
+        self.mailboxes: list[Mailbox] = []
+        self.heard: set[tuple[str, bytes]] = set()
+
+    def start(self, wire: Wire, kind: str) -> None:
+        """Begin."""
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_result(None)
+
+    def lost(self, reason: Exception) -> None:
+        """Hand it on, if this had begun."""
+        if self.ready is not None:
+            if not self.ready.done():
+                self.ready.set_exception(reason)
+        elif (listener := self._listener()) is not None:
+            listener.lost(reason)
+
+    def doubt(self) -> None:
+        """Hand it on."""
+        if (listener := self._listener()) is not None:
+            listener.doubt()
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Hand it on, and see to it that the key is followed."""
+        if (listener := self._listener()) is None:
+            return
+        if len(self.heard) >= _MOST:
+            self.heard.clear()
+        self.heard.add((notice.publisher, channel))
+        listener.on_notice(notice, channel)
+        self._discovery.heard(listener, channel.removeprefix(b"{").removesuffix(_TAIL.encode()))
 
     def on_note(self, note: bytes | None) -> None:
         """Nothing to compare."""

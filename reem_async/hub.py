@@ -18,7 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
 
 from .background import in_background
-from .errors import BadData, InterfaceClosed, NotConnected, RedisError
+from .errors import BadData, ClusterNode, InterfaceClosed, NotConnected, RedisError
 from .plan import Reply, blamed
 from .plan.notices import Notice, decode
 from .policy import Mailbox
@@ -138,7 +138,11 @@ class Hub:
         await self._ships.ready()
         if listener.topic.pattern and self.transport.sharded:
             await self._discover().follow(listener)
-            return
+        else:
+            await self.follow_here(listener)
+
+    async def follow_here(self, listener: Listener) -> None:
+        """Follow what the servers themselves know as a topic."""
         deadline = time.monotonic() + self.transport.timeout
         anew = False
         while True:
@@ -146,7 +150,7 @@ class Hub:
                 await self._follow(listener, anew=anew)
                 return
             except RedisError as error:
-                unapplied = is_unapplied(error) or isinstance(error, NotConnected)
+                unapplied = is_unapplied(error) or isinstance(error, NotConnected | ClusterNode)
                 if not self.transport.sharded or not unapplied or self._closed:
                     raise
                 if time.monotonic() > deadline:
@@ -237,6 +241,10 @@ class Hub:
         """Stop following. Idempotent."""
         if self._discovery is not None and listener.topic.pattern:
             await self._discovery.unfollow(listener)
+        await self.unfollow_here(listener)
+
+    async def unfollow_here(self, listener: Listener) -> None:
+        """Stop following what the servers themselves know as a topic."""
         self._drop(listener)
         for mailbox in listener.mailboxes:
             mailbox.close()
@@ -256,7 +264,7 @@ class Hub:
         wire = self._subscribed.pop(topic, None)
         if wire is None or not wire.alive:
             return
-        if self.transport.sharded:
+        if self._prefix(topic) == "S":
             wire.leave(topic.name)
         else:
             wire.send([(f"{self._prefix(topic)}UNSUBSCRIBE", topic.name)], lambda _: None)

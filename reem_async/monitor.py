@@ -78,9 +78,8 @@ class Monitor(Stream[Event]):
         namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
             `event.namespace` says which it was: the shortest that fits.
 
-    In a cluster, whose servers know no patterns, the keys are looked for once a second. What is published
-    to a new key before it is found is lost, and the first event after it has `gap`, as the next event of
-    each other key may. A pattern without `*` and `?` needs no search, and nothing is lost.
+    In a cluster, whose servers have no patterns for what only one node is told, the keys are looked for, and
+    publishers tell all nodes for the first seconds of a key.
 
     Raises:
         BadKey: Not a pattern.
@@ -163,7 +162,7 @@ class Monitor(Stream[Event]):
         namespace, name = place
         whole = namespace + name
         last = self._sequences.get((notice.publisher, whole), notice.sequence - 1)
-        if notice.sequence == last:  # two of the patterns fit
+        if notice.sequence <= last:  # two of the patterns fit, or it came two ways
             return
         if len(self._sequences) >= _MOST_PUBLISHERS:
             self._sequences.clear()

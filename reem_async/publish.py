@@ -36,7 +36,7 @@ class DocumentPublisher(DocumentWriter):
     async def _set_in_order(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             stamp = self._stamp(path)
-            notices = published(self.keys, *stamp[:2], with_value(*stamp, encoded.text, loaded))
+            notices = self._notice(stamp, with_value(*stamp, encoded.text, loaded))
             it = set_change(
                 self.keys, path, encoded.text, loaded, notices=notices, retraction=lambda: self._announced(path)
             )
@@ -63,7 +63,10 @@ class DocumentPublisher(DocumentWriter):
     def _announced(self, path: Path, *, deleted: bool = False) -> list[Command]:
         """Return the commands of a notice without the value."""
         stamp = self._stamp(path)
-        return published(self.keys, *stamp[:2], announce(*stamp, deleted=deleted))
+        return self._notice(stamp, announce(*stamp, deleted=deleted))
+
+    def _notice(self, stamp: tuple[str, int, float, Path], payload: bytes) -> list[Command]:
+        return published(self.keys, *stamp[:2], payload, everywhere=self.session.is_fresh(self.keys))
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         raise WriteOnly(_cannot_read((self.name, *it.path)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import secrets
+import time
 from collections.abc import Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from .hub import Hub
 
 __all__ = ["Session"]
+
+_FRESH = 3.0
+"""Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
 
 
 class Session:
@@ -62,6 +66,7 @@ class Session:
         self.interface: Any = None
         self._publisher = secrets.token_hex(6), os.getpid()
         self._sequences: dict[str, int] = {}
+        self._fresh: dict[str, float] = {}
         self._hub: Hub | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -98,7 +103,19 @@ class Session:
         if self._publisher[1] != os.getpid():  # a forked child is another publisher
             self._publisher, self._sequences = (secrets.token_hex(6), os.getpid()), {}
         number = self._sequences[keys.channel] = self._sequences.get(keys.channel, 0) + 1
+        if number == 1 and self.transport.sharded:
+            self._fresh[keys.channel] = time.monotonic() + _FRESH
         return self._publisher[0], number
+
+    def is_fresh(self, keys: Keys) -> bool:
+        """Return whether this publisher has only begun with a top-level key of a cluster: others may not know it."""
+        until = self._fresh.get(keys.channel)
+        if until is None:
+            return False
+        if time.monotonic() < until:
+            return True
+        self._fresh.pop(keys.channel, None)
+        return False
 
     async def initialize(self) -> None:
         """Connect and check that the server has RedisJSON."""

@@ -45,17 +45,23 @@ def _container():
 
 
 @pytest.fixture(scope="session")
-def server_url():
+def cluster():
+    """A cluster of three primaries."""
+    from reem_async.cluster_server import EmbeddedCluster
+
+    with EmbeddedCluster(replicas=0) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def server_url(request):
     """Where the server of this test run listens."""
     given = os.environ.get("REEM_TEST_URL")
     if given:
         yield given
         return
     if os.environ.get("REEM_TEST_SERVER") == "cluster":
-        from reem_async.cluster_server import EmbeddedCluster
-
-        with EmbeddedCluster(replicas=0) as cluster:
-            yield cluster.url
+        yield request.getfixturevalue("cluster").url
         return
     from reem_async.errors import ServerMissing
     from reem_async.server import EmbeddedServer
@@ -71,6 +77,7 @@ def server_url():
 ONE_SERVER = {
     "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",
     "test_all_subscribers_of_an_interface_share_one_connection": "counts connections: in a cluster, one for each node",
+    "test_monitor_brings_every_update_with_its_size_and_fetches_nothing": "counts commands: new keys are subscribed to",
 }
 """Tests of what only one server has, and why."""
 
@@ -107,6 +114,9 @@ class RawCluster(redis.RedisCluster):
             return super().client_kill_filter(target_nodes=redis.RedisCluster.PRIMARIES, **options)
         node, number = _id.split(" ")
         return super().client_kill_filter(_id=number, target_nodes=self.get_node(node_name=node), **options)
+
+    def pubsub_numpat(self):
+        return sum(node.redis_connection.pubsub_numpat() for node in self.get_primaries())
 
     def publish(self, channel, message):
         return self.spublish(channel, message)

@@ -56,13 +56,16 @@ class Notice(NamedTuple):
     size: int = 0
 
 
-def published(keys: Keys, publisher: str, sequence: int, payload: bytes) -> list[Command]:
+def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, everywhere: bool = False) -> list[Command]:
     """Return the commands that publish a notice, and note that it was the last.
 
     Of a snapshot that holds this note one can tell which notices it has: those up to this one. It
-    expires, since it only matters while a snapshot is on its way.
+    expires, since it only matters while a snapshot is on its way. In a cluster a notice goes to those who
+    know the key; `everywhere` it goes to all nodes besides, for those who look for keys.
     """
-    return [("SET", keys.last, f"{publisher} {sequence}", "EX", 60), (keys.publish, keys.channel, payload)]
+    noted: Command = ("SET", keys.last, f"{publisher} {sequence}", "EX", 60)
+    told: Command = (keys.publish, keys.channel, payload)
+    return [noted, ("PUBLISH", keys.channel, payload), told] if everywhere else [noted, told]
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:

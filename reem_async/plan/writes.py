@@ -236,7 +236,8 @@ class _Outcome:
         """Return whether a key may exist that the document does not refer to."""
         written = {each.suffix.encode() for each in self.it.loaded}
         if judged is REFUSED or isinstance(judged, Exception):
-            return bool(written)
+            # Of nothing that was not there to be deleted, or appended to, there can be leftovers of a broken call.
+            return bool(written) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
         return self.it.replaces and any(
             member not in written and may_hold(self.it.path, _place(member)) for member in members
         )

@@ -32,6 +32,9 @@ logger = logging.getLogger("reem.recording")
 
 _PAUSE = 0.1
 """Seconds after a read that failed."""
+_LET_PASS = 0.004
+"""Seconds, at most, from a large update to reading it. The server is busy with its publisher, others wait behind
+that: reading it in the same moment would make them wait twice as long. A recorder has time."""
 _READ_RATE = 8e6
 """Bytes a second that are read of keys of which nothing is published."""
 
@@ -94,6 +97,7 @@ class Feed:
         self._heard: dict[str, int] = {}
         self._since: list[tuple[str, int, int]] = []  # notices that arrived while a fetch was on its way
         self._known = False
+        self._last_large = 0  # the log time of the last update that was fetched
         self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
         self.busy: asyncio.Task[None] | None = None
         self.news = False
@@ -175,6 +179,9 @@ class Feed:
         """Fetch what the first item announces and put it where it belongs; return whether that worked."""
         collector = self._collector
         try:
+            if head.role == "update":
+                since, self._last_large = head.stamp[0] - self._last_large, head.stamp[0]
+                await asyncio.sleep(min(_LET_PASS, since / 1e9 / 5))  # not if they come fast: none should be missed
             async with collector.fetching:
                 self._since.clear()
                 last = self._items[-1].stamp[0]  # what has been announced until now is older than the reply

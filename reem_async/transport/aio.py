@@ -11,6 +11,7 @@ from typing import Any
 
 import anyio
 
+from ..background import in_background
 from ..errors import InterfaceClosed, WrongLoop
 from ..plan import Command, Reply
 from ..state import States
@@ -43,7 +44,7 @@ class AsyncTransport:
         self._pid = 0
         self._closed = False
         self._lanes: dict[bool, Wire] = {}
-        self._opening: dict[bool, anyio.Lock] = {}
+        self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
         self._orders: dict[str, anyio.Lock] = {}
         self.states = States()
@@ -59,12 +60,21 @@ class AsyncTransport:
         return await wire.roundtrip(commands)
 
     async def _lane(self, bulk: bool) -> Wire:
+        """Return the shared wire, connecting if need be: once for all who ask meanwhile, who share its failure too."""
         self.check()
-        async with self._opening.setdefault(bulk, anyio.Lock()):
-            wire = self._lanes.get(bulk)
-            if wire is None or not wire.alive:
-                wire = self._lanes[bulk] = await self._opened(large=bulk)
+        opening = self._opening.get(bulk)
+        if opening is None:
+            opening = self._opening[bulk] = in_background(self._open_lane(bulk), "reem connect")
+            opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # all may have gone away
+        return await asyncio.shield(opening)
+
+    async def _open_lane(self, bulk: bool) -> Wire:
+        try:
+            wire = self._lanes[bulk] = await self._opened(large=bulk)
             return wire
+        finally:
+            if self._opening.get(bulk) is asyncio.current_task():
+                del self._opening[bulk]
 
     async def _opened(
         self,

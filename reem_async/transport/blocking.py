@@ -31,7 +31,7 @@ __all__ = ["BlockingTransport"]
 
 _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
-_LOOKS = 20
+_LOOKS = 40
 """How many times per time limit to look whether a large value is moving."""
 
 

@@ -19,14 +19,14 @@ from typing import Any
 
 import redis.exceptions
 
-from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotConnected
+from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected
 from ..plan import Command, Reply
 from ..state import States
 from . import Held, Transport
-from .endpoints import NewTransport, listed
+from .endpoints import NewTransport, address_of, listed
 from .options import Options
 from .patience import patience
-from .redirects import Moved, key_of, key_slot, keys_in, publishes, refusal, slot_of
+from .redirects import Moved, key_slot, keys_in, publishes, refusal, slot_of, slots_of
 from .route import HeldAcross, Route, asked_of, places_refused, watched
 
 __all__ = ["ClusterOptions", "ClusterTransport"]
@@ -56,13 +56,10 @@ class ClusterOptions(Options):
 
     def __init__(self, url: str, timeout: float, options: dict[str, Any]) -> None:
         urls = listed(url, _EXAMPLE)
+        self.seeds: list[Address] = [address_of(one, 6379) for one in urls]
         super().__init__(urls[0], timeout, options)
         if self.database:
             raise BadValue(f"db={self.database}: a cluster has only database 0; use namespace= to keep programs apart")
-        self.seeds: list[Address] = [
-            (str(each.settings.get("host", "localhost")), int(each.settings.get("port", 6379)))
-            for each in (Options(one, timeout, options) for one in urls)
-        ]
 
     @property
     def address(self) -> str:
@@ -72,7 +69,14 @@ class ClusterOptions(Options):
     def node(self, address: Address) -> Options:
         """Return how to reach one node."""
         host, port = address
-        return Options(host, self.timeout, {**self.settings, "host": host, "port": port, "ssl": self.tls})
+        return _NodeOptions(host, self.timeout, {**self.settings, "host": host, "port": port, "ssl": self.tls})
+
+
+class _NodeOptions(Options):
+    """How to reach one node."""
+
+    def _warn_of_listeners(self) -> None:
+        """Say nothing: it was said of the cluster."""
 
 
 class ClusterTransport:
@@ -114,7 +118,7 @@ class ClusterTransport:
         if len(commands) > 1:
             if commands[-1][0] == "EXEC":
                 return await (self._publish(commands, bulk) if publishes(commands) else self._apply(commands, bulk))
-            slots = [None if (key := key_of(command)) is None else key_slot(key) for command in commands]
+            slots = slots_of(commands)
             if len(set(slots)) > 1:
                 return await self._scattered(commands, slots, bulk)
         slot = slot_of(commands)
@@ -235,8 +239,8 @@ class ClusterTransport:
         if "cluster support disabled" in str(reply):
             return BadValue(f"the server at {where} is no cluster: connect with redis://{where}")
         if isinstance(reply, redis.exceptions.NoPermissionError):
-            return redis.exceptions.NoPermissionError(
-                f"{where}: {reply}; a user of a cluster needs +cluster|slots (and +asking, which needs no permission)"
+            return NotAllowed(
+                f"{where}: {reply}; a user of a cluster needs +cluster|slots and +asking, see docs/fleet.md"
             )
         return reply
 

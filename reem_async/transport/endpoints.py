@@ -10,7 +10,7 @@ from ..errors import BadValue
 from . import Transport
 from .options import Options
 
-__all__ = ["NewTransport", "listed", "way_to"]
+__all__ = ["NewTransport", "address_of", "listed", "way_to"]
 
 NewTransport = Callable[[Options], Transport]
 """Makes the transport to one server: on an event loop, or for plain threads."""
@@ -40,6 +40,12 @@ def way_to(
         return watched, SentinelTransport(watched, new_transport)
     one = Options(host, timeout, options)
     return one, new_transport(one)
+
+
+def address_of(url: str, port: int) -> tuple[str, int]:
+    """Return host and port of a plain URL; `port` if it names none."""
+    parts = urlsplit(url)
+    return parts.hostname or "localhost", parts.port or port
 
 
 def listed(url: str, example: str) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import redis.crc
 import redis.exceptions
@@ -11,7 +12,7 @@ from ..plan import Command, Reply
 
 __all__ = [
     "Ask", "Moved", "Unapplied", "is_moved", "is_unapplied", "key_of", "key_slot", "keys_in", "publishes",
-    "refusal", "slot_of",
+    "refusal", "slot_of", "slots_of",
 ]  # fmt: skip
 
 key_slot: Callable[[bytes], int] = redis.crc.key_slot
@@ -35,7 +36,7 @@ Unapplied = (
 _KEYLESS = frozenset(
     ["SCAN", "PING", "INFO", "TIME", "CONFIG", "ACL", "CLUSTER", "CLIENT", "COMMAND", "DBSIZE", "MODULE", "UNWATCH"]
 )
-_FRAME = frozenset(["MULTI", "EXEC", "UNWATCH"])
+_NO_KEYS_IN_TRANSACTIONS = frozenset(["MULTI", "EXEC", "UNWATCH", "PUBLISH", "SPUBLISH"])
 
 
 def key_of(command: Command) -> bytes | None:
@@ -52,8 +53,23 @@ def key_of(command: Command) -> bytes | None:
 def slot_of(commands: Sequence[Command]) -> int | None:
     """Return the slot that commands of one top-level key belong to; None if any node may have them."""
     first = commands[0]
-    key = key_of(commands[1] if first[0] == "MULTI" else first)
-    return None if key is None else key_slot(key)
+    return _slot(commands[1] if first[0] == "MULTI" else first)
+
+
+def _slot(command: Command) -> int | None:
+    if len(command) < 2 or command[0] in _KEYLESS:
+        return None
+    return _slot_of_word(command[1])
+
+
+@lru_cache(maxsize=4096)
+def _slot_of_word(word: str | bytes) -> int:
+    return key_slot(word if type(word) is bytes else str(word).encode())
+
+
+def slots_of(commands: Sequence[Command]) -> list[int | None]:
+    """Return the slot of each command."""
+    return [_slot(command) for command in commands]
 
 
 def publishes(commands: Sequence[Command]) -> bool:
@@ -67,7 +83,7 @@ def keys_in(commands: Sequence[Command]) -> list[bytes]:
     for command in commands:
         if command[0] == "UNLINK":
             found.update(dict.fromkeys(word if type(word) is bytes else str(word).encode() for word in command[1:]))
-        elif command[0] not in _FRAME and command[0] != "SPUBLISH" and (key := key_of(command)) is not None:
+        elif command[0] not in _NO_KEYS_IN_TRANSACTIONS and (key := key_of(command)) is not None:
             found[key] = None
     return list(found)
 
@@ -75,7 +91,7 @@ def keys_in(commands: Sequence[Command]) -> list[bytes]:
 def refusal(replies: Sequence[Reply]) -> redis.exceptions.RedisError | None:
     """Return the first reply that means that a command was not applied, None if there is none."""
     for reply in replies:
-        if isinstance(reply, Unapplied):
+        if isinstance(reply, Exception) and isinstance(reply, Unapplied):  # the first check is the faster one
             return reply
     return None
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from ..errors import NotConnected
+from ..errors import ConnectionLost, NotConnected
 from ..plan import Command, Reply
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, publishes, refusal, slot_of
@@ -191,9 +191,13 @@ async def watched(held: Held, keys: Sequence[bytes], asking: bool) -> Exception 
     """Watch all keys, so that none can leave unnoticed; return why that does not help, or None.
 
     Raises:
+        NotConnected: The connection broke, before anything was sent that matters.
         redis.exceptions.RedisError: This user may not.
     """
-    (reply,) = await asked_of(held, [("WATCH", *keys)], asking, bulk=False)
+    try:
+        (reply,) = await asked_of(held, [("WATCH", *keys)], asking, bulk=False)
+    except ConnectionLost as error:
+        raise NotConnected(f"{error}; nothing was sent but a look at the keys, so nothing was applied") from error
     problem = refusal([reply])
     if problem is None and isinstance(reply, Exception):
         raise reply

@@ -2,29 +2,43 @@
 
 After a failover the connections to the old primary break, or its replies say that it takes no writes
 any more. The next connection goes where the sentinels say then, and only a server that calls itself
-a primary is taken.
+a primary is taken. An old primary that is not dead hears of its successor some ten seconds later, and
+what it takes until then is lost: so the sentinels are asked every second, on a thread.
 """
 
 from __future__ import annotations
 
+import os
+import threading
+import weakref
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import redis
 import redis.asyncio
+import redis.asyncio.retry
 import redis.asyncio.sentinel
 import redis.exceptions
+import redis.retry
 import redis.sentinel
+from redis.backoff import NoBackoff
 
-from ..errors import BadValue, NotConnected
+from ..errors import BadValue, ConnectionLost, NotConnected
 from ..plan import Command, Reply
 from ..state import States
 from . import Held, Transport
-from .endpoints import NewTransport, listed
+from .endpoints import NewTransport, address_of, listed
 from .options import Options
 
+if TYPE_CHECKING:
+    from .aio import AsyncTransport
+    from .wire import Wire
+
 __all__ = ["SentinelOptions", "SentinelTransport"]
+
+_LOOK_PAUSE = 1.0
+"""Seconds between questions to the sentinels."""
 
 _EXAMPLE = "redis+sentinel://user:password@host:26379,host2:26379/mymaster"
 
@@ -37,6 +51,11 @@ class SentinelOptions(Options):
         timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options for the servers; besides, `sentinel_username` and
             `sentinel_password` for the sentinels.
+
+    Attributes:
+        service: What the sentinels call the primary.
+        found: Where it was when a connection was made last.
+        changed: Called when a connection is made elsewhere than the last one; may be called on any thread.
 
     Raises:
         BadValue: The URL names no service.
@@ -54,11 +73,10 @@ class SentinelOptions(Options):
             f"{'/'.join([*parts[:3], *parts[4:]])}{mark}{query}"
             for parts, (_, mark, query) in zip(heads, urls, strict=True)
         ]
+        self.found: tuple[str, int] | None = None
+        self.changed: Callable[[], None] = _nothing
+        self._sentinels = [address_of(one, 26379) for one in plain]
         super().__init__(plain[0], timeout, options)
-        self._sentinels = [
-            (str(each.settings.get("host", "localhost")), int(each.settings.get("port", 26379)))
-            for each in (Options(one, timeout, options) for one in plain)
-        ]
         tls = {"ssl": True, **{name: value for name, value in self.settings.items() if name.startswith("ssl_")}}
         self._asking = {
             "socket_connect_timeout": self.handshake_timeout / 2,
@@ -81,13 +99,16 @@ class SentinelOptions(Options):
         return _follow(super().blocking_connection(), self._connect)
 
     async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
-        asked: Any = redis.asyncio.sentinel.Sentinel(self._sentinels, sentinel_kwargs=self._asking)  # type: ignore[no-untyped-call]
+        asked: Any = redis.asyncio.sentinel.Sentinel(  # type: ignore[no-untyped-call]
+            self._sentinels, sentinel_kwargs={**self._asking, "retry": redis.asyncio.retry.Retry(NoBackoff(), 0)}
+        )
         try:
             connection.host, connection.port = await asked.discover_master(self.service)
         finally:
             for each in asked.sentinels:
                 with suppress(redis.exceptions.RedisError, OSError):
                     await each.aclose()
+        self._note((connection.host, connection.port))
         await connect()
         try:
             await connection.send_command("ROLE")
@@ -97,12 +118,8 @@ class SentinelOptions(Options):
             raise
 
     def _connect(self, connection: Any, connect: Callable[[], None]) -> None:
-        asked: Any = redis.sentinel.Sentinel(self._sentinels, sentinel_kwargs=self._asking)  # type: ignore[no-untyped-call]
-        try:
-            connection.host, connection.port = asked.discover_master(self.service)
-        finally:
-            for each in asked.sentinels:
-                each.close()
+        connection.host, connection.port = self.primary()
+        self._note((connection.host, connection.port))
         connect()
         try:
             connection.send_command("ROLE")
@@ -110,6 +127,27 @@ class SentinelOptions(Options):
         except BaseException:
             connection.disconnect()
             raise
+
+    def _note(self, address: tuple[str, int]) -> None:
+        before, self.found = self.found, address
+        if before not in (None, address):
+            self.changed()
+
+    def primary(self) -> tuple[str, int]:
+        """Ask the sentinels where the primary is; raises redis.exceptions.RedisError."""
+        asked: Any = redis.sentinel.Sentinel(  # type: ignore[no-untyped-call]
+            self._sentinels, sentinel_kwargs={**self._asking, "retry": redis.retry.Retry(NoBackoff(), 0)}
+        )
+        try:
+            host, port = asked.discover_master(self.service)
+            return str(host), int(port)
+        finally:
+            for each in asked.sentinels:
+                each.close()
+
+
+def _nothing() -> None:
+    """Nobody wants to know."""
 
 
 def _follow(connection: Any, way: Callable[..., Any]) -> Any:
@@ -140,6 +178,9 @@ class SentinelTransport:
         self._root = new_transport(options)  # for what must outlive a failover: locks and the event loop
         self._now = self._root
         self._demoted: list[Transport] = []
+        self._listening: weakref.WeakSet[Wire] = weakref.WeakSet()
+        self._lookout: _Lookout | None = None
+        self._moved = False
 
     @property
     def states(self) -> States:
@@ -156,8 +197,32 @@ class SentinelTransport:
         Raises:
             NotConnected: It is no primary any more; nothing was applied.
         """
-        now = self._now
+        now = self._current()
         return self._checked(now, await now.roundtrip(commands, bulk=bulk))
+
+    def _current(self) -> Transport:
+        """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
+        if self._lookout is None or self._lookout.pid != os.getpid():
+            self._lookout = _Lookout(self._options, self._on_moved)
+            self._options.changed = self._lookout.tell
+        if self._moved:
+            self._moved = False
+            self._renew()
+        return self._now
+
+    def _on_moved(self) -> None:
+        """Take note that the sentinels name another primary. Runs on a thread of its own."""
+        self._moved = True
+        reason = ConnectionLost(f"the sentinels name another primary for {self._options.service!r}")
+        for wire in list(self._listening):
+            wire.abort_soon(reason)
+
+    async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
+        """Open a connection to the primary whose pushed messages go to `on_push`."""
+        self._root.check()
+        wire = await cast("AsyncTransport", self._current()).listen(on_push, on_lost)
+        self._listening.add(wire)
+        return wire
 
     def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:
         for reply in replies:
@@ -173,13 +238,16 @@ class SentinelTransport:
         """Use new connections from now on. The old ones are left to whoever waits for a reply on them."""
         if demoted is self._now:
             self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
-            self._demoted.append(demoted)
-            self._now = self._new_transport(self._options)
-            self._now.states = self.states
+            self._renew()
+
+    def _renew(self) -> None:
+        self._demoted.append(self._now)
+        self._now = self._new_transport(self._options)
+        self._now.states = self.states
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
-        return _Checking(self, self._now)
+        return _Checking(self, self._current())
 
     @property
     def timeout(self) -> float:
@@ -188,12 +256,11 @@ class SentinelTransport:
 
     async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
         """Return the way to the primary."""
-        self._root.check()
-        return self._now
+        return self
 
     async def nodes(self) -> Sequence[Transport]:
         """Return the way to the primary alone."""
-        return (self._now,)
+        return (self,)
 
     async def pause(self, seconds: float) -> None:
         """Wait."""
@@ -227,11 +294,46 @@ class SentinelTransport:
 
     async def close(self) -> None:
         """Close all connections."""
+        if self._lookout is not None:
+            self._lookout.stop()
         for each in self._all():
             await each.close()
 
     def _all(self) -> list[Transport]:
         return list({id(each): each for each in (self._root, *self._demoted, self._now)}.values())
+
+
+class _Lookout:
+    """A thread that asks the sentinels whether the primary is another one than that of the connections.
+
+    Attributes:
+        pid: The process it runs in.
+    """
+
+    def __init__(self, options: SentinelOptions, told: Callable[[], None]) -> None:
+        self.pid = os.getpid()
+        self._options = options
+        self._told = weakref.WeakMethod(told)
+        self._stopped = threading.Event()
+        threading.Thread(target=self._run, name="reem-sentinel", daemon=True).start()
+
+    def _run(self) -> None:
+        while not self._stopped.wait(_LOOK_PAUSE):
+            if self._told() is None:  # the transport was dropped
+                return
+            with suppress(redis.exceptions.RedisError, OSError):
+                if self._options.found not in (None, self._options.primary()):
+                    self.tell()
+
+    def tell(self) -> None:
+        """Say that it is another one."""
+        told = self._told()
+        if told is not None:
+            told()
+
+    def stop(self) -> None:
+        """End the thread, within a second or so."""
+        self._stopped.set()
 
 
 class _Checking:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import contextlib
 import os
 import sys
 import weakref
@@ -26,7 +27,7 @@ from .patience import confirmed, patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
-_LOOKS = 20
+_LOOKS = 40
 """How many times per time limit to look whether a large value is moving."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
@@ -142,8 +143,7 @@ class Wire(asyncio.BufferedProtocol):
         if idle and not self._outbox:
             self._write(pieces)
             if len(pieces) > 1:
-                self._unsent = self._bytes_unsent()
-                self._watch_until(now + limit / _LOOKS)
+                self._watch_upload(limit)
             return
         # Others wait already: what is sent in the same turn of the loop goes out in one system call.
         if not self._outbox:
@@ -173,7 +173,7 @@ class Wire(asyncio.BufferedProtocol):
         if self._reason is None:
             self._write(pieces)
             if sum(map(len, pieces)) >= LARGE:
-                self._unsent = self._bytes_unsent()
+                self._watch_upload(self._timeout)
 
     def _write(self, pieces: list[Piece]) -> None:
         assert self._transport is not None
@@ -209,6 +209,11 @@ class Wire(asyncio.BufferedProtocol):
         self._fail(reason)
         if self._transport is not None:
             self._transport.abort()
+
+    def abort_soon(self, reason: Exception) -> None:
+        """Break the connection, from another thread."""
+        with contextlib.suppress(RuntimeError):  # the event loop has ended, and the connection with it
+            self._loop.call_soon_threadsafe(self.abort, reason)
 
     async def close(self) -> None:
         """Close the connection and wait until it is."""
@@ -268,6 +273,11 @@ class Wire(asyncio.BufferedProtocol):
             self._due.popleft()
             if not due.over:
                 due.done(due.replies)
+
+    def _watch_upload(self, limit: float) -> None:
+        """Look often from now on: the last progress of a large value on its way up begins the time limit."""
+        self._unsent = self._bytes_unsent()
+        self._watch_until(self._loop.time() + limit / _LOOKS)
 
     def _watch_until(self, moment: float) -> None:
         """Look at the time at `moment`, unless it will be looked at before."""

@@ -1,0 +1,103 @@
+"""Changing a real cluster under a test: moving slots, killing primaries, looking into one node."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+
+import redis
+import redis.crc
+
+
+def slot_of(key):
+    return redis.crc.key_slot(key.encode())
+
+
+def raw_of(node):
+    """A plain client of one node."""
+    return redis.Redis(port=node.port, decode_responses=True)
+
+
+def owner(cluster, key):
+    """The node that has the slot of a key."""
+    with raw_of(cluster.nodes[-1]) as client:
+        for (first, last), row in _ranges(client):
+            if first <= slot_of(key) <= last:
+                return next(node for node in cluster.nodes if node.port == row)
+    raise AssertionError(f"nobody has {key}")
+
+
+def _ranges(client):
+    return [((first, last), primary[1]) for first, last, primary, *_ in client.execute_command("CLUSTER", "SLOTS")]
+
+
+class Move:
+    """A slot on its way from one node to another, key by key."""
+
+    def __init__(self, cluster, key, target=None):
+        self.key = key
+        self.slot = slot_of(key)
+        self.source = owner(cluster, key)
+        self.target = target or next(node for node in cluster.nodes[:3] if node is not self.source)
+        with raw_of(self.source) as client:
+            primaries = {port for _, port in _ranges(client)}
+        self._others = [
+            node for node in cluster.nodes if node.port in primaries and node not in (self.source, self.target)
+        ]
+
+    def begin(self):
+        self._say(self.target, "IMPORTING", self.source.id)
+        self._say(self.source, "MIGRATING", self.target.id)
+        return self
+
+    def take(self, *keys):
+        """Move these keys."""
+        with raw_of(self.source) as client:
+            for key in keys:
+                client.execute_command("MIGRATE", "127.0.0.1", self.target.port, key, 0, 5000)
+
+    def all_keys(self):
+        with raw_of(self.source) as client:
+            return client.execute_command("CLUSTER", "GETKEYSINSLOT", self.slot, 1000)
+
+    def left(self):
+        """What of the key is still here; other keys may share the slot."""
+        return [each for each in self.all_keys() if self.key in each]
+
+    def finish(self):
+        """Move what is left, and tell all nodes."""
+        while keys := self.all_keys():
+            self.take(*keys)
+        for node in (self.target, self.source, *self._others):
+            self._say(node, "NODE", self.target.id)
+
+    def _say(self, node, *words):
+        with raw_of(node) as client:
+            client.execute_command("CLUSTER", "SETSLOT", self.slot, *words)
+
+
+def kill_primary(cluster, key):
+    """Kill -9 the node that has a key; returns it."""
+    victim = owner(cluster, key)
+    os.kill(victim.pid, signal.SIGKILL)
+    return victim
+
+
+def whole_again(cluster, victim, timeout=20.0):
+    """Wait until all other nodes know that a replica has taken the victim's slots."""
+    rest = [node for node in cluster.nodes if node is not victim]
+    deadline = time.monotonic() + timeout
+    while not all(_has_all_slots(node, victim) for node in rest):
+        assert time.monotonic() < deadline, "there was no failover"
+        time.sleep(0.02)
+
+
+def _has_all_slots(node, victim):
+    with contextlib.suppress(redis.exceptions.RedisError), raw_of(node) as client:
+        ranges = _ranges(client)
+        return sum(last - first + 1 for (first, last), _ in ranges) == 16384 and victim.port not in [
+            port for _, port in ranges
+        ]
+    return False

@@ -1,0 +1,385 @@
+"""A cluster of real servers: where things go, what is refused, and what a slot on its way does to calls."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+
+import numpy as np
+import pytest
+from clusterkit import Move, owner, raw_of, slot_of
+from conftest import FRONTS, Keys, aeventually, eventually, python
+
+import reem
+import reem_async
+from reem_async.catalog import names
+from reem_async.cluster_server import EmbeddedCluster
+from reem_async.errors import BadValue, NotConnected, ServerFailed, WrongKind
+from reem_async.monitor import Monitor
+
+
+@pytest.fixture
+def key():
+    return Keys()
+
+
+@pytest.fixture(params=list(FRONTS))
+def front(request, cluster):
+    opened = FRONTS[request.param](cluster, timeout=0.5)
+    yield opened
+    opened.close()
+
+
+def on_each_node(cluster, key):
+    """One name for each node."""
+    found = {}
+    number = 0
+    while len(found) < len(cluster.nodes):
+        found.setdefault(owner(cluster, key(f"k{number}")).port, key(f"k{number}"))
+        number += 1
+    return list(found.values())
+
+
+# --- the embedded cluster -------------------------------------------------
+
+
+def test_a_cluster_takes_writes_when_it_has_started_and_is_gone_when_it_has_stopped():
+    """Primaries first, each replica known; nothing is left over."""
+    with EmbeddedCluster(primaries=3, replicas=1, node_timeout=1.0) as cluster:
+        assert len(cluster.nodes) == 6
+        assert ["role:slave" in node.say("INFO", "replication") for node in cluster.nodes] == [False] * 3 + [True] * 3
+        with reem.RedisInterface(cluster.url) as interface:
+            kvs = reem.KeyValueStore(interface)
+            for number in range(20):
+                kvs[f"k{number}"] = number
+            assert [kvs[f"k{number}"].read() for number in range(20)] == list(range(20))
+        pids = [node.pid for node in cluster.nodes]
+    assert not [pid for pid in pids if os.path.exists(f"/proc/{pid}")]
+    assert cluster.nodes == []
+    with pytest.raises(ServerFailed, match="not started"):
+        _ = cluster.url
+
+
+def test_a_cluster_ends_with_its_owner_however_it_ends():
+    """Killed -9, all nodes go."""
+    code = """
+import os, signal
+from reem_async.cluster_server import EmbeddedCluster
+cluster = EmbeddedCluster(replicas=0)
+cluster.start()
+print(*[node.pid for node in cluster.nodes], flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+    pids = python(code).stdout.split()
+    assert len(pids) == 3
+    eventually(lambda: not [pid for pid in pids if os.path.exists(f"/proc/{pid}")])
+
+
+@pytest.mark.parametrize("wrong", [{"primaries": 2}, {"replicas": 6}, {"node_timeout": 0}])
+def test_a_cluster_that_cannot_be_is_refused(wrong):
+    """Before anything is started."""
+    with pytest.raises(BadValue, match=next(iter(wrong))):
+        EmbeddedCluster(**wrong)
+
+
+# --- addresses -------------------------------------------------
+
+
+@pytest.mark.parametrize("package", [reem, reem_async])
+@pytest.mark.parametrize(
+    ("url", "options", "word"),
+    [
+        ("redis+cluster://127.0.0.1:7000/3", {}, "db=3"),
+        ("redis+cluster://127.0.0.1:7000", {"db": 1}, "db=1"),
+        ("redis+cluster://", {}, "host"),
+        ("redis+cluster://user:secret@127.0.0.1:7000,h:x", {}, "h:x"),
+        ("redis+sentinel://user:secret@127.0.0.1:26379", {}, "service"),
+    ],
+)
+def test_addresses_that_mean_nothing_are_refused_without_a_password_in_the_text(package, url, options, word):
+    """Nothing is connected for it."""
+    with pytest.raises(BadValue, match=word) as refusal:
+        package.RedisInterface(url, **options)
+    assert "secret" not in str(refusal.value)
+
+
+def test_the_password_is_not_shown(cluster):
+    """Neither as hostname nor in errors."""
+    interface = reem.RedisInterface("redis+cluster://user:secret@127.0.0.1:1,127.0.0.1:2")
+    assert interface.hostname == "127.0.0.1:1,127.0.0.1:2"
+    with pytest.raises(NotConnected) as refusal:
+        interface.initialize()
+    assert "secret" not in str(refusal.value) + repr(interface)
+    interface.close()
+
+
+def test_one_server_is_no_cluster(server_url):
+    """It says so, and what to write instead."""
+    if not server_url.startswith("redis://"):
+        pytest.skip("this test run has a cluster")
+    with (
+        pytest.raises(BadValue, match="is no cluster"),
+        reem.RedisInterface(server_url.replace("redis://", "redis+cluster://")),
+    ):
+        pass
+
+
+def test_one_node_leads_to_all_and_an_interface_can_be_pickled(cluster, key):
+    """The others are asked for."""
+    with reem.RedisInterface(f"redis+cluster://127.0.0.1:{cluster.nodes[1].port}") as interface:
+        for name in on_each_node(cluster, key):
+            reem.KeyValueStore(interface)[name] = name
+        copied = pickle.loads(pickle.dumps(reem.KeyValueStore(interface)[name]))
+        assert copied.read() == name
+
+
+# --- everything is where it belongs -------------------------------------------------
+
+
+def test_keys_go_to_the_node_of_their_slot_and_all_of_a_key_to_one(front, cluster, key):
+    """Document, arrays and registry."""
+    for name in on_each_node(cluster, key):
+        front.write((name,), {"image": np.arange(10), "n": 1})
+        with raw_of(owner(cluster, name)) as raw:
+            assert raw.exists(name, "{" + name + "}.image", "{" + name + "}:ships") == 3
+        assert front.read((name, "image")).tolist() == list(range(10))
+
+
+async def test_all_nodes_are_listed(cluster, key):
+    """Each key once."""
+    async with reem_async.RedisInterface(cluster) as interface:
+        there = {key(f"n{number}") for number in range(30)}
+        for name in there:
+            await reem_async.KeyValueStore(interface)[name].write(1)
+        listed = [name async for name in names(interface, key("n*"))]
+    assert len(listed) == len(there)
+    assert set(listed) == there
+
+
+def test_a_foreign_type_is_named_by_the_node_that_has_it(front, cluster, key):
+    """The error needs a second question."""
+    for name in on_each_node(cluster, key):
+        with raw_of(owner(cluster, name)) as raw:
+            raw.set(name, "x")
+        with pytest.raises(WrongKind, match="of type string"):
+            front.read((name,))
+
+
+# --- a slot on its way -------------------------------------------------
+
+
+@pytest.fixture
+def moving(cluster, front, key):
+    """A key with an array, on a slot that is on its way; moved to the end afterwards."""
+    name = key("moving")
+    front.write((name,), {"n": 1, "image": np.zeros(4)})
+    move = Move(cluster, name).begin()
+    move.name = name
+    yield move
+    move.finish()
+
+
+def test_before_anything_has_left_calls_go_on(front, moving):
+    """Reading and writing what is there."""
+    front.write((moving.name, "n"), 2)
+    assert front.read((moving.name,))["n"] == 2
+
+
+def test_what_has_left_is_found_where_it_went(front, moving):
+    """Read, written, counted, and read again."""
+    moving.take(*moving.all_keys())
+    assert front.read((moving.name, "n")) == 1
+    assert front.read((moving.name, "image")).tolist() == [0, 0, 0, 0]
+    front.write((moving.name,), {"n": 5, "image": np.ones(4)})
+    front.increment((moving.name, "n"), 2)
+    value = front.read((moving.name,))
+    assert (value["n"], value["image"].tolist()) == (7, [1, 1, 1, 1])
+    assert moving.left() == []
+
+
+def test_a_transaction_over_keys_here_and_there_waits_until_they_are_together(front, moving):
+    """And says that nothing was applied if that takes too long."""
+    moving.take("{" + moving.name + "}.image")
+    with pytest.raises(NotConnected, match="nothing was applied"):
+        front.write((moving.name,), {"n": 9, "image": np.ones(4)})
+    with pytest.raises(NotConnected, match="nothing was applied"):
+        front.read((moving.name,))
+    moving.take(*moving.all_keys())
+    value = front.read((moving.name,))
+    assert (value["n"], value["image"].tolist()) == (1, [0, 0, 0, 0])
+
+
+def test_a_publisher_never_writes_to_a_key_that_has_left(cluster, moving):
+    """Servers would let it: they do not look at the keys of a transaction that publishes."""
+    moving.take(*moving.all_keys())
+    with reem.RedisInterface(cluster) as interface:
+        reem.PublishSpace(interface)[moving.name] = {"n": 3}
+        reem.PublishSpace(interface)[moving.name]["n"] = 4
+        assert moving.left() == []
+        assert reem.KeyValueStore(interface)[moving.name].read() == {"n": 4}
+
+
+def test_a_publisher_waits_for_keys_that_are_here_and_there(cluster, moving):
+    """Neither node gets anything."""
+    moving.take(moving.name)
+    with reem.RedisInterface(cluster, timeout=0.2) as interface:
+        with pytest.raises(NotConnected, match="nothing was applied"):
+            reem.PublishSpace(interface)[moving.name]["n"] = 3
+        assert reem.KeyValueStore(interface)[moving.name]["n"].read() == 1
+        assert moving.name not in moving.left()
+
+
+def test_a_new_key_of_a_moving_slot_is_made_where_the_slot_goes(front, cluster, key):
+    """As nothing of it is here."""
+    name = key()
+    move = Move(cluster, name).begin()
+    front.write((name,), {"n": 1})
+    assert move.left() == []
+    assert front.read((name, "n")) == 1
+    move.finish()
+    assert front.read((name, "n")) == 1
+
+
+def test_a_slot_that_has_moved_is_followed_by_every_kind_of_call(front, cluster, key):
+    """Plain commands, transactions, and those that watch."""
+    name = key()
+    front.write((name,), {"n": 1, "l": [1], "image": np.zeros(3)})
+    Move(cluster, name).begin().finish()
+    assert front.read((name, "n")) == 1
+    Move(cluster, name).begin().finish()
+    front.write((name, "image"), np.ones(3))
+    Move(cluster, name).begin().finish()
+    front.multiply((name, "n"), 3)
+    Move(cluster, name).begin().finish()
+    assert front.read((name,))["image"].tolist() == [1, 1, 1]
+
+
+def test_an_edit_goes_to_where_the_key_is_now(cluster, key):
+    """It watches, which needs one connection."""
+    name = key()
+    with reem.RedisInterface(cluster) as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs[name] = {"n": 1}
+        with kvs[name] as value:
+            value["n"] = 2
+            Move(cluster, name).begin().finish()
+        assert kvs[name].read() == {"n": 2}
+
+
+async def test_a_follower_goes_where_the_slot_goes_and_says_that_there_is_a_gap(cluster, key):
+    """What was published meanwhile is in the value; the state of the interface is the same all the time."""
+    name = key()
+    async with reem_async.RedisInterface(cluster) as interface:
+        space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
+        await space[name].write({"n": 0})
+        changes = []
+        interface.on_state(changes.append)
+        async with kvs[name].watch(reem_async.Every(100)) as updates:
+            assert (await anext(updates)).initial
+            for number in range(1, 4):
+                move = Move(cluster, name).begin()
+                move.take(*move.all_keys())
+                await space[name]["n"].write(number)
+                move.finish()
+                update = await anext(updates)
+                assert update.gap
+                assert update.data == {"n": number}
+                await space[name]["n"].write(number + 10)
+                update = await anext(updates)
+                assert (update.gap, update.data) == (False, {"n": number + 10})
+        assert not changes
+
+
+async def test_who_begins_to_follow_a_moving_slot_is_told_or_served(cluster, key):
+    """Not served while the document is away from the channel; served when both are together."""
+    name = key()
+    async with reem_async.RedisInterface(cluster) as interface:
+        await reem_async.KeyValueStore(interface)[name].write({"n": 1})
+        move = Move(cluster, name).begin()
+        move.take(name)
+        mirror = reem_async.SilentSubscriber(name, interface)
+        with reem_async.timeout(0.2), pytest.raises(NotConnected, match="nothing is followed"):
+            await mirror.listen()
+        move.finish()
+        mirror = reem_async.SilentSubscriber(name, interface)
+        await mirror.listen()
+        assert mirror.value() == {"n": 1}
+
+
+async def test_leaving_and_coming_back_to_channels_of_one_node_keeps_the_connection_in_order(cluster, key):
+    """Each answer goes to whom it belongs, with the slot moving in between."""
+    name = key()
+    async with reem_async.RedisInterface(cluster) as interface:
+        space = reem_async.PublishSpace(interface)
+        for number in range(60):
+            await space[name].write(number)
+            mirror = reem_async.SilentSubscriber(name, interface)
+            await mirror.listen()
+            if number % 20 == 10:
+                Move(cluster, name).begin().finish()
+            assert mirror.value() == number
+            await space[name].write(-number)
+            await aeventually(lambda mirror=mirror, number=number: mirror.value() == -number)
+            await mirror.close()
+
+
+# --- many keys -------------------------------------------------
+
+
+async def test_a_monitor_hears_of_new_keys_from_their_first_update_on(cluster, key):
+    """Of every node, in order, and what it does not hear it says."""
+    async with reem_async.RedisInterface(cluster) as interface, reem_async.RedisInterface(cluster) as watching:
+        space = reem_async.PublishSpace(interface)
+        there = on_each_node(cluster, key)
+        for name in there:
+            await space[name].write(0)
+        monitor = Monitor(watching, [key("*")])
+        exact = Monitor(watching, [key("exact")])
+        await monitor.listen()
+        await exact.listen()
+        names = [*there, *(key(f"new{number}") for number in range(12)), key("exact")]
+        for number in range(1, 41):
+            for name in names:
+                await space[name].write(number)
+        heard = {name: [] for name in names}
+        async with asyncio.timeout(10):
+            while min(len(values) and values[-1] for values in heard.values()) < 40:
+                event = await anext(monitor)
+                values = heard[event.name]
+                assert not values or event.value > values[-1]
+                assert event.gap or event.value == (values[-1] if values else 0) + 1
+                values.append(event.value)
+            assert [(await anext(exact)).value for _ in range(40)] == list(range(1, 41))
+        await monitor.close()
+        await exact.close()
+
+
+async def test_a_key_that_is_found_late_has_a_gap(cluster, key, monkeypatch):
+    """As when it was made, and published to, by somebody who had done so before."""
+    monkeypatch.setattr("reem_async.session._FRESH", 0.0)  # so long all nodes are told
+    async with reem_async.RedisInterface(cluster) as interface:
+        space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
+        await space[key()].write(1)
+        await kvs[key()].delete()
+        monitor = Monitor(interface, [key("*")])
+        await monitor.listen()
+        await space[key()].write(2)
+
+        async def publish():
+            for number in range(3, 1000):
+                await space[key()].write(number)
+                await asyncio.sleep(0.05)
+
+        publishing = asyncio.create_task(publish())
+        async with asyncio.timeout(10):
+            event = await anext(monitor)
+        publishing.cancel()
+        assert event.gap
+        await monitor.close()
+
+
+def test_slots_are_those_of_the_servers(cluster, key):
+    """Of names with every kind of character."""
+    for name in (key("a b"), key("ü"), key(":x"), key("\n")):
+        assert int(cluster.nodes[0].say("CLUSTER", "KEYSLOT", name)) == slot_of(name)

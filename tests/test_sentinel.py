@@ -1,0 +1,97 @@
+"""A primary that sentinels watch: found, lost, found again where they say."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+
+import pytest
+from conftest import FRONTS, aeventually
+from loadkit import Load
+from sentinelkit import Watched, eventually
+
+import reem
+import reem_async
+from reem_async.errors import BadType, NotConnected
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory):
+    with contextlib.ExitStack() as stack:
+        yield Watched(tmp_path_factory.mktemp("sentinels"), stack)
+
+
+@pytest.fixture(params=list(FRONTS))
+def front(request, watched):
+    opened = FRONTS[request.param](watched.url)
+    yield opened
+    opened.close()
+
+
+def test_the_primary_is_found_through_any_sentinel_that_answers(watched):
+    """The first of the URL may be down."""
+    url = watched.url.replace("redis+sentinel://", "redis+sentinel://127.0.0.1:1,")
+    with reem.RedisInterface(url) as interface:
+        reem.KeyValueStore(interface)["found"] = 1
+        assert interface.hostname.startswith("mymaster (sentinels 127.0.0.1:1,")
+    assert watched.now().json().get("found") == 1
+
+
+@pytest.mark.parametrize("package", [reem, reem_async])
+def test_an_option_that_nobody_knows_is_refused(package):
+    """Those of the sentinels are known."""
+    package.RedisInterface("redis+sentinel://127.0.0.1/mymaster", sentinel_password="x")
+    with pytest.raises(BadType, match="sentinel_pasword"):
+        package.RedisInterface("redis+sentinel://127.0.0.1/mymaster", sentinel_pasword="x")
+
+
+def test_a_service_that_no_sentinel_knows_is_named(watched):
+    """With the sentinels that were asked."""
+    interface = reem.RedisInterface(watched.url.replace("mymaster", "yours"))
+    with pytest.raises(NotConnected, match="yours"):
+        interface.initialize()
+    interface.close()
+
+
+def test_a_write_to_a_demoted_primary_is_not_reported_as_done(front, watched):
+    """Nothing is applied, and as long as the sentinels name it nobody connects to it."""
+    front.write(("demoted",), 1)
+    old, new = watched.now(), watched.standby()
+    new.replicaof("NO", "ONE")
+    old.replicaof("127.0.0.1", new.connection_pool.connection_kwargs["port"])
+    try:
+        with pytest.raises(NotConnected, match="nothing was applied"):
+            front.write(("demoted",), 2)
+        assert front.interface.state == "lost"
+        with pytest.raises(NotConnected, match="not the primary any more"):
+            front.write(("demoted",), 3)
+        assert new.json().get("demoted") == 1
+    finally:
+        old.replicaof("NO", "ONE")
+        new.replicaof("127.0.0.1", old.connection_pool.connection_kwargs["port"])
+    front.write(("demoted",), 4)
+    assert (front.read(("demoted",)), front.interface.state) == (4, "connected")
+    watched.settle()
+
+
+async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
+    """Killed -9: calls fail until the sentinels have agreed; followers converge, and say that there is a gap."""
+    load = Load(watched.url, "robot", failover=True)
+    async with reem_async.RedisInterface(watched.url) as interface, load.running():
+        changes = []
+        interface.on_state(changes.append)
+        store = reem_async.KeyValueStore(interface)
+        async with store["robot"].watch() as updates:
+            assert (await anext(updates)).initial
+            old = await asyncio.to_thread(watched.primary)
+            os.kill(watched.pid(old), signal.SIGKILL)
+            await aeventually(lambda: interface.state == "reconnecting")
+            await asyncio.to_thread(eventually, lambda: watched.primary() != old)
+            async with asyncio.timeout(10):
+                while not (await anext(updates)).gap:
+                    pass
+        assert [change.state for change in changes] == ["lost", "reconnecting", "connected"]
+        assert changes[-1].restarted
+    assert load.gaps >= 1
