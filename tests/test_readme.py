@@ -24,7 +24,7 @@ PROGRAMS = [
 
 def run(code, url, prefix):
     """Run a block on the test server, its keys out of the way of others; returns the lines it printed."""
-    if "EmbeddedServer" in code:
+    if "Embedded" in code:
         if python("from reem_async._server_programs import find_program; find_program()").returncode:
             pytest.skip("there is no embedded server here")
     else:
