@@ -86,9 +86,9 @@ def test_up_until_told_to_stop(number):
 
 STORM = """
 import os, signal, threading
-from reem_async.cli.up import _Stop
+from reem_async.cli.up import Stop
 
-stop = _Stop()
+stop = Stop()
 ended = threading.Event()
 
 def send():
@@ -306,3 +306,26 @@ def test_without_the_extra(missing):
     assert run.returncode == 1
     assert "pip install 'reem[server]'" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+def test_a_cluster_until_told_to_stop():
+    import reem
+
+    with up("--cluster") as (process, said):
+        url = re.search(r"address +(redis\+cluster://\S+)\n", said)[1]
+        assert said.count("process ") == 6
+        with reem.RedisInterface(url) as interface:
+            store = reem.KeyValueStore(interface)
+            for name in ("a", "b", "c", "d"):
+                store[name] = {"x": name}
+            assert [store[name]["x"].read() for name in ("a", "b", "c", "d")] == ["a", "b", "c", "d"]
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=10)
+        assert (process.returncode, errors) == (0, "")
+        assert "Stopped." in rest
+
+
+def test_a_cluster_takes_no_other_option():
+    run = reem_command("up", "--cluster", "--port", "0")
+    assert run.returncode == 1
+    assert "--cluster takes no other option" in run.stderr

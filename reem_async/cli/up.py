@@ -54,6 +54,12 @@ def up(
             help="Begin with what this snapshot holds, portable or RDB. A --directory must have no data yet.",
         ),
     ] = None,
+    cluster: Annotated[
+        bool,
+        typer.Option(
+            "--cluster", help="A cluster of three primaries and three replicas, in memory, on free ports; to try it."
+        ),
+    ] = False,
 ) -> None:
     """Start a private server and keep it up until Ctrl-C.
 
@@ -63,20 +69,28 @@ def up(
       reem up
       reem up --directory /var/lib/robot --port 6400
       reem up --from reem-20260801T120000Z.zip
+      reem up --cluster
     """
+    if cluster:
+        if any(given is not None for given in (port, directory, password_from_env, snapshot)):
+            fail("--cluster takes no other option: it is in memory, on free ports, without a password")
+        from reem_async.cli.up_cluster import up_cluster
+
+        up_cluster(Stop())
+        return
     variable = _password_variable(password_from_env)
     if port is None:
         port = 0 if snapshot else DEFAULT_PORT
-    stop = _Stop()
+    stop = Stop()
     try:
         server = EmbeddedServer(port, directory, os.environ[variable] if variable else None, snapshot)
         with server:
             _describe(server, directory, variable, snapshot)
             while not stop.wait(LOOK_SECONDS):
                 if not server.running:
-                    _fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
+                    fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
     except (BadData, BadValue, OSError, ServerFailed, ServerMissing) as error:
-        _fail(str(error))
+        fail(str(error))
     with suppress(OSError):  # the terminal may have closed
         Console().print(f"Stopped. The data is {'kept' if directory else 'gone'}.")
 
@@ -87,11 +101,11 @@ def _password_variable(name: str | None) -> str | None:
         return None
     name = name or PASSWORD_VARIABLE
     if not os.environ.get(name):
-        _fail(f"the environment variable {name} is {'empty' if name in os.environ else 'not set'}")
+        fail(f"the environment variable {name} is {'empty' if name in os.environ else 'not set'}")
     return name
 
 
-class _Stop:
+class Stop:
     """Set by Ctrl-C, by SIGTERM, and when the terminal closes.
 
     A pipe, not a `threading.Event`: a handler that runs while the main thread is inside of `Event.wait` would
@@ -120,7 +134,7 @@ def _describe(server: EmbeddedServer, directory: Path | None, variable: str | No
     imports = "import os; from" if variable else "from"
     console = Console()
     console.print(Text("REEM's server is up.", style="bold green"), f"(process {server.pid})")
-    for label, value in (
+    rows = [
         *((("snapshot", _summary(snapshot)),) if snapshot else ()),
         ("address", url),
         ("socket", f"unix://{server.socket_path}"),
@@ -132,7 +146,13 @@ def _describe(server: EmbeddedServer, directory: Path | None, variable: str | No
         ("blocking", f"{imports} reem import KeyValueStore, RedisInterface; kvs = {connect}"),
         ("asyncio", f"{imports} reem_async import KeyValueStore, RedisInterface; kvs = {connect}"),
         ("to stop", "Ctrl-C"),
-    ):
+    ]
+    print_rows(console, rows)
+
+
+def print_rows(console: Console, rows: list[tuple[str, str]]) -> None:
+    """Print what there is to know, one fact a line."""
+    for label, value in rows:
         # soft_wrap: a line to be copied stays one line, however narrow the terminal
         console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value), soft_wrap=True)
 
@@ -153,7 +173,7 @@ def _log_end(server: EmbeddedServer) -> str:
     return "\n".join((server.directory / "server.log").read_text(errors="replace").splitlines()[-5:])
 
 
-def _fail(message: str) -> NoReturn:
+def fail(message: str) -> NoReturn:
     """Say why on standard error and exit with code 1."""
     Console(stderr=True).print(Text.assemble(("reem up: ", "bold red"), message), soft_wrap=True)
     raise typer.Exit(1)
