@@ -12,6 +12,7 @@ import contextlib
 import operator
 import os
 import re
+import signal
 import struct
 import subprocess
 import sys
@@ -22,6 +23,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import redis
+
+# Started in the background, this process ignores Ctrl-C, and so would every program that it starts.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -14,6 +14,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -96,10 +97,13 @@ class CommandLine:
             bufsize=0,
         ) as process:
             said, todo = b"", list(keys)
+            patience = threading.Timer(60.0, process.kill)
+            patience.start()
             while data := process.stdout.read(4096):
                 said += data
                 while todo and todo[0][0] in said:
                     process.stdin.write(todo.pop(0)[1])
+            patience.cancel()
             code = process.wait(10)
         assert not todo, said
         assert b"Traceback" not in said
