@@ -196,14 +196,20 @@ class Proxy:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        await asyncio.sleep(0)
+        await asyncio.sleep(0.01)  # for the connections that were just aborted to be closed
 
     async def _link(self, reader: asyncio.StreamReader, client: asyncio.StreamWriter) -> None:
+        connecting = asyncio.ensure_future(asyncio.open_connection("127.0.0.1", self._target))
         try:
-            replies, server = await asyncio.open_connection("127.0.0.1", self._target)
+            replies, server = await asyncio.shield(connecting)
         except OSError:
             _abort(client)
             return
+        except asyncio.CancelledError:  # the proxy ends: what was just begun is ended too
+            _abort(client)
+            with contextlib.suppress(OSError):
+                (await connecting)[1].transport.abort()
+            raise
         link = _Link(client, server)
         link.swallowed = self._hole
         self._links.add(link)
