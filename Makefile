@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test modes fuzz coverage check chaos bench clean
+.PHONY: demo test modes fuzz coverage check chaos bench scale clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -38,6 +38,9 @@ chaos: $(VENV)/ready  ## the reliability scoreboard, under 20 minutes; CHAOS="--
 
 bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick for about one
 	.venv-bench/bin/python -m benchmarks $(BENCH)
+
+scale: .venv-bench/ready  ## cost per operation, and docs/scale.md from it, under four minutes; SCALE=--quick
+	.venv-bench/bin/python -m benchmarks.scale $(SCALE)
 
 .venv-bench/ready: pyproject.toml
 	$(PYTHON) -m venv .venv-bench

@@ -1,0 +1,364 @@
+"""How far it goes: the model's arithmetic, the simulation, the kept page, and a measurement of a real server."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+from pathlib import Path
+
+import hiredis
+import numpy as np
+import pytest
+
+import reem
+from benchmarks.scale import full, kinds, page, results, spread
+from benchmarks.scale.audience import Audience
+from benchmarks.scale.measure import QUICK, measure
+from benchmarks.scale.model import (
+    Cost,
+    Figures,
+    Load,
+    Node,
+    Robot,
+    Topic,
+    Value,
+    bottleneck,
+    carried,
+    most_followers,
+    on_the_line,
+    robot_load,
+    topic_load,
+    use,
+)
+from benchmarks.scale.servers import running
+from benchmarks.scale.slots import (
+    SLOTS,
+    balance,
+    dealt,
+    fits,
+    loads,
+    most_robots,
+    numbered,
+    reshard,
+    shared_out,
+    slot_of,
+    weigh,
+)
+from benchmarks.scale.text import bits, number, size, times
+
+# --- the kept page -------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def kept():
+    return results.load()
+
+
+@pytest.mark.parametrize("name", list(page.TABLES))
+def test_each_table_of_the_page_is_what_the_kept_figures_give(kept, name):
+    assert page.block(name, kept) in page.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_page_is_of_a_whole_run(kept):
+    assert kept["mode"] == "full"
+    assert kept["seconds"] < 240
+
+
+def test_other_figures_give_another_page(kept, tmp_path):
+    copy = tmp_path / "scale.md"
+    copy.write_text(page.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
+    page.rewrite({**kept, "rounds": 99}, copy)
+    assert "medians of 99 rounds" in copy.read_text(encoding="utf-8")
+    page.rewrite(kept, copy)
+    assert copy.read_text(encoding="utf-8") == page.PAGE.read_text(encoding="utf-8")
+
+
+def test_a_page_without_a_place_for_a_table_is_refused(kept, tmp_path):
+    copy = tmp_path / "scale.md"
+    copy.write_text("nothing\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="0 places for the table 'where'"):
+        page.rewrite(kept, copy)
+
+
+def test_the_page_states_the_budgets_it_uses(kept):
+    text = page.PAGE.read_text(encoding="utf-8")
+    node = kinds.node(10)
+    assert node == Node(0.6, 7e9, 7e9, 8 * 2**30, 10_000)
+    for stated in ("60 % busy", "70 % full", "8 GiB", "10,000 connections"):
+        assert stated in text
+
+
+# --- the model, by hand -------------------------------------------------
+
+POINT = Value(((0, Cost(20, 800, 60)), (10, Cost(40, 800, 3560)), (50, Cost(140, 800, 17_560))), memory=1000)
+FRAME = Value(((0, Cost(250, 900_000, 100, 900_000)), (2, Cost(550, 900_400, 1_800_100, 900_000))), memory=900_000)
+FIGURES = Figures({"point": POINT, "frame": FRAME}, Cost(10, 60, 20), connections=2, connection_memory=100)
+
+
+def test_bytes_on_the_line_have_headers():
+    assert on_the_line(1448) == 8 * (1448 + 2 * 90)  # one full packet, and one that is not
+    assert on_the_line(0) == 0
+
+
+def test_the_load_of_a_topic_by_hand():
+    load = topic_load(Topic("t", "point", 100, 5), FIGURES)
+    assert load.core == pytest.approx((100 * 20 + 100 * 5 * 2 + 5 * 10) / 1e6)
+    assert load.line_in == pytest.approx(100 * on_the_line(800) + 5 * on_the_line(60))
+    assert load.line_out == pytest.approx(100 * on_the_line(60) + 500 * on_the_line(350) + 5 * on_the_line(20))
+    assert load.connections == 5 * 2 + 1
+    assert load.memory == 1000 + 11 * 100
+
+
+def test_what_goes_to_replicas_is_sent_too():
+    load = topic_load(Topic("t", "frame", 1, 0), FIGURES)
+    assert load.line_out == pytest.approx(on_the_line(100) + on_the_line(900_000))
+
+
+def test_a_robot_is_the_sum_of_its_topics():
+    one, other = Topic("a", "point", 10, 1), Topic("b", "frame", 2, 3)
+    both = robot_load(Robot("r", (one, other)), FIGURES)
+    assert both == topic_load(one, FIGURES) + topic_load(other, FIGURES)
+
+
+def test_what_is_used_up_first_decides_how_many_are_carried():
+    node = Node(core=0.6, line_in=100, line_out=100, memory=1000, connections=10)
+    load = Load(core=0.1, line_in=30, line_out=10, memory=10, connections=1)
+    assert use(load, node)["line_in"] == pytest.approx(0.3)
+    assert bottleneck(load, node) == "line_in"
+    assert carried(load, node) == 3  # 100 / 30
+    assert carried(load, node, primaries=3) == 10
+    assert carried(dataclasses.replace(load, line_in=20), node) == 5  # 100 / 20 and not one less
+
+
+def test_the_most_followers_of_one_key_by_hand():
+    node = Node(core=0.5, line_in=1e12, line_out=1e12, memory=1e12, connections=1e6)
+    # 1000 x (140 us + (n - 50) x 2.5 us) + n x 10 us = 0.5
+    assert most_followers(Topic("t", "point", 1000, 0), FIGURES, node) == int((0.5 - 0.140 + 0.125) / 0.00251)
+    assert most_followers(Topic("t", "point", 1e6, 0), FIGURES, node) == 0  # not even without followers
+
+
+def test_costs_lie_on_straight_lines_between_what_was_measured():
+    assert POINT.publish(0) == Cost(20, 800, 60)
+    assert POINT.publish(10) == Cost(40, 800, 3560)
+    assert POINT.publish(30) == Cost(90, 800, 10_560)
+    assert POINT.publish(90) == Cost(240, 800, 31_560)  # and go on as they end
+    assert POINT.following(50) == Cost(2.4, 0, 350)
+    assert POINT.following(0) == Cost()
+    with pytest.raises(ValueError, match="not from 0 on"):
+        Value(((1, Cost()), (2, Cost())), 0).publish(1)
+
+
+def test_bytes_too_few_for_a_message_are_noise():
+    noisy = Value(((0, Cost(20, 800, 60)), (10, Cost(40, 890, 60))), memory=0)
+    assert noisy.following(10).bytes_in == 0
+    assert Value(((0, Cost(20, 800, 60)), (10, Cost(40, 910, 60))), memory=0).following(10).bytes_in == 11
+
+
+def test_the_kept_figures_are_what_the_model_works_with(kept):
+    given = results.figures(kept, "six")
+    case = kept["settings"]["six"]["cases"]["frame.publish.10"]
+    assert given.values["frame"].publish(10).core_us == case["core_us"]
+    assert given.values["frame"].publish(10).bytes_replica == case["bytes_replica"]
+    assert given.heartbeat.core_us == kept["settings"]["six"]["heartbeat"]["core_us"]
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (number(0.01234), "0.0123"),
+        (number(12_345), "12,300"),
+        (number(99.96), "100"),
+        (size(921_737), "922 kB"),
+        (size(9_220_000), "9.22 MB"),
+        (size(823.4), "823 B"),
+        (bits(1.18e9), "1.18 Gbit/s"),
+        (bits(7.7e6), "7.7 Mbit/s"),
+        (times(1.299), "1.30"),
+        (times(24.94), "24.9"),
+    ],
+)
+def test_numbers_for_people(shown, expected):
+    assert shown == expected
+
+
+# --- the simulation -------------------------------------------------
+
+
+def test_slots_are_the_servers(server_url):
+    import redis
+
+    with contextlib.closing(redis.Redis.from_url(server_url.replace("redis+cluster", "redis").split(",")[0])) as raw:
+        try:
+            theirs = raw.execute_command("CLUSTER", "KEYSLOT", "{robots/r7:camera}.image")
+        except redis.ResponseError:  # no cluster: the value it gives
+            theirs = 13509
+    assert slot_of("camera", "robots/r7:") == theirs
+
+
+def test_slots_are_dealt_in_equal_ranges():
+    for nodes in (1, 3, 7, 50):
+        owners = shared_out(nodes)
+        counts = np.bincount(owners)
+        assert len(counts) == nodes
+        assert counts.sum() == SLOTS
+        assert counts.max() - counts.min() <= 1
+        assert (np.diff(owners) >= 0).all()
+
+
+def test_weights_land_in_their_keys_slots():
+    weights = weigh(["robots/r1:", "robots/r2:"], {"pose": 2.0, "camera": 3.0})
+    assert weights.sum() == 10
+    assert weights[slot_of("pose", "robots/r1:")] >= 2
+    assert weights[slot_of("camera", "robots/r2:")] >= 3
+
+
+def test_balance_by_hand():
+    slots = np.zeros(SLOTS)
+    slots[0], slots[1], slots[SLOTS - 1] = 4.0, 2.0, 2.0
+    owners = shared_out(2)
+    assert loads(slots, owners, 2).tolist() == [6.0, 2.0]
+    assert balance(loads(slots, owners, 2)) == 1.5
+    after, moved = reshard(slots, owners, 2)
+    assert loads(slots, after, 2).tolist() == [4.0, 4.0]
+    assert moved == 1
+
+
+def test_a_hot_key_cannot_be_resharded_away():
+    slots = np.ones(SLOTS)
+    slots[5] = 10 * SLOTS
+    after, _ = reshard(slots, shared_out(4), 4)
+    assert loads(slots, after, 4).max() == 10 * SLOTS  # alone on its node
+    assert balance(loads(slots, after, 4)) == pytest.approx(10 * SLOTS / (11 * SLOTS - 1) * 4)
+
+
+def test_moving_slots_by_weight_makes_fleets_even():
+    slots, owners = weigh(numbered(1000), {"pose": 1.0, "camera": 2.0}), shared_out(50)
+    before = balance(loads(slots, owners, 50))
+    after, moved = reshard(slots, owners, 50)
+    assert loads(slots, after, 50).sum() == pytest.approx(slots.sum())
+    assert balance(loads(slots, after, 50)) < 1.02 < 1.2 < before
+    assert moved == np.count_nonzero(after != owners) < 200
+
+
+def test_dealing_anew_by_hand():
+    slots = np.zeros(SLOTS)
+    slots[[3, 4, 5, 6]] = [1.0, 5.0, 3.0, 2.0]
+    owners = dealt(slots, 2)
+    assert loads(slots, owners, 2).tolist() == [6.0, 5.0]  # 5; 3; then 2 to the 3; then 1, both have 5
+    assert owners[[4, 5, 6]].tolist() == [0, 1, 1]
+
+
+def test_as_many_robots_fit_as_no_node_has_too_much():
+    demands = {"core": {"a": 0.05, "b": 0.02}, "memory": {"a": 0.001, "b": 0.0}}
+    most = most_robots(demands, 3, moving=False)
+    assert fits(most, demands, 3)
+    assert not fits(most + 1, demands, 3)
+    moved = most_robots(demands, 3, moving=True)
+    assert most < moved <= int(3 / 0.07)
+
+
+def test_a_key_too_heavy_for_a_node_fits_on_no_cluster():
+    assert most_robots({"line_out": {"camera": 1.1}}, 50, moving=True) == 0
+    assert most_robots({"line_out": {"camera": 1.1}}, 50, moving=False) == 0
+
+
+def test_a_key_that_all_follow_grows_with_the_fleet(kept):
+    given = results.figures(kept, "six")
+    base = spread.cores(kinds.BASE, given)
+    small, large = (spread.spread(numbered(count), base, 50, spread.shared_core(count, given)) for count in (30, 3000))
+    assert large.resharded == pytest.approx(large.hot, rel=0.05)  # nothing is left to gain
+    assert small.hot > 1
+    assert spread.shared_core(3000, given) > 50 * spread.shared_core(30, given)
+
+
+# --- a real server -------------------------------------------------
+
+EFFORT = dataclasses.replace(QUICK, rounds=2, points=60, frames=3, seconds=0.5, keys=50, buffers=0.0)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    with running("one") as servers:
+        yield measure({"one": servers}, EFFORT)["one"], full.run_arms(servers, 1, 1.0)
+
+
+def test_what_is_measured_is_what_was_done(measured):
+    found, _ = measured
+    frame = 480 * 640 * 3
+    cases = found["cases"]
+    for name in ("frame.write", "frame.publish.0", "frame.publish.10"):
+        assert frame < cases[name]["bytes_in"] < frame * 1.02
+    assert frame < cases["frame.read"]["bytes_out"] < frame * 1.02
+    assert 10 * frame < cases["frame.publish.10"]["bytes_out"] < 10 * frame * 1.02
+    inline = (cases["point.publish.50"]["bytes_out"] - cases["point.publish.0"]["bytes_out"]) / 50
+    assert 300 < inline < 420  # the notice, with seven floats in it
+    for name, case in cases.items():
+        assert case["client_us"] > 0, name
+    assert cases["point.publish.50"]["core_us"] > cases["point.publish.0"]["core_us"] > 0
+    assert cases["frame.publish.10"]["core_us"] > cases["frame.publish.0"]["core_us"] > 0
+
+
+def test_memory_is_counted(measured):
+    memory = measured[0]["memory"]
+    assert 480 * 640 * 3 < memory["frame.array"] < 480 * 640 * 3 * 1.1
+    assert memory["frame.document"] < 1000
+    assert memory["connection"] > 1000
+
+
+def test_whole_arms_send_what_they_should(measured):
+    ran = measured[1]
+    assert ran["robots"] == 1
+    published, seconds = ran["published"], ran["seconds"]
+    assert 0 < published["set_point"] <= 1001
+    assert 0 < published["camera"] <= 31
+    frames = 5 * published["camera"] * 480 * 640 * 3
+    assert frames < ran["bytes_out"] * seconds < (frames + 45 * published["set_point"] * 450) * 1.05
+    assert ran["core"] > 0
+
+
+@pytest.mark.parametrize("sharded", [False, True])
+def test_scripts_are_reems_own_commands(sharded):
+    it = asyncio.run(full.script(kinds.ARM.topics[1], "robots/r1:", sharded))
+    reader = hiredis.Reader()
+    reader.feed(it.publish)
+    words = [command[0] for command in iter(reader.gets, False)]
+    published = b"SPUBLISH" if sharded else b"PUBLISH"
+    expected = [b"MULTI", b"UNLINK", b"SET", b"JSON.SET", b"SADD", b"SMEMBERS", b"SET", published, b"EXEC"]
+    assert words == expected
+    reader.feed(it.fetch)
+    assert [command[0] for command in iter(reader.gets, False)] == [b"MULTI", b"JSON.GET", b"GET", b"GET", b"EXEC"]
+    assert it.watch.startswith(b"*") == sharded
+
+
+def children():
+    """The processes that this one has started and that still run."""
+    found = set()
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            state, parent = entry.read_text().rpartition(")")[2].split()[:2]
+            if int(parent) == os.getpid() and state != "Z":
+                found.add(entry.parent.name)
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at /proc")
+def test_followers_that_cannot_begin_are_an_error_and_end():
+    before = children()
+    with pytest.raises(RuntimeError, match="NotConnected"):
+        Audience("redis://127.0.0.1:1", {"robots/r1:pose": 1})
+    assert children() == before
+
+
+def test_updates_that_do_not_arrive_are_an_error(server_url, key):
+    name = key()
+    with Audience(server_url, {name: 2}) as audience:
+        assert audience.seen() == {name: 0}
+        with pytest.raises(RuntimeError, match="KeyError"):
+            audience.wait("other", 1)
+        with contextlib.closing(reem.RedisInterface(server_url)) as interface:
+            reem.PublishSpace(interface)[name] = {"joint": 1.0}
+        audience.wait(name, 2)
+        assert audience.seen() == {name: 2}
+        assert audience.cpu() > 0
