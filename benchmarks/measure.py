@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from .contenders import CONTENDERS
+from .cores import on_one_core
 from .process import ContenderError, Worker, Workers
 from .results import Entry, failure, summary
 from .values import Spec
@@ -70,6 +71,7 @@ class CallCase(Case):
     count: int = 1000
     limit: float = 0.6
     width: int = 0  # callers at once; 0 for one after the other
+    one_core: bool = False
 
     rounds = 5
 
@@ -83,6 +85,14 @@ class CallCase(Case):
             except ContenderError as error:
                 yield self.identifier, name, failure(error)
         samples: dict[str, list[float]] = {name: [] for name in ready}
+        pids = [bench.workers.server.pid(), *(bench.workers.get(name).pid for name in ready.values())]
+        with on_one_core(pids if self.one_core else []):
+            yield from self._rounds(bench, ready, samples)
+        for name in ready:
+            yield self.identifier, name, summary(samples[name], **more[name])
+
+    def _rounds(self, bench: Bench, ready: dict[str, str], samples: dict[str, list[float]]) -> Found:
+        """Blocks of all in turn; whoever fails is left out from then on."""
         for number in range(self.rounds):
             order = list(ready)
             shift = number % max(1, len(order))
@@ -92,8 +102,6 @@ class CallCase(Case):
                 except ContenderError as error:
                     del ready[name]
                     yield self.identifier, name, failure(error)
-        for name in ready:
-            yield self.identifier, name, summary(samples[name], **more[name])
 
     def _prepare(self, worker: Worker) -> None:
         worker.ask(

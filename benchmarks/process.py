@@ -33,6 +33,11 @@ class Worker:
             cwd=environment.FOLDER.parent,
         )
 
+    @property
+    def pid(self) -> int:
+        """Its process."""
+        return self._process.pid
+
     def ask(self, do: str, patience: float = PATIENCE, **keywords: Any) -> Any:
         """Send one request and wait for its reply."""
         assert self._process.stdin

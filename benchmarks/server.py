@@ -30,6 +30,11 @@ class Server:
         """Over the unix socket."""
         return f"unix://{self.socket_path}"
 
+    def pid(self) -> int:
+        """Its process."""
+        with redis.Redis(host=self.host, port=self.port) as client:
+            return int(client.info("server")["process_id"])
+
     def empty(self) -> None:
         """Forget all data: this server is the benchmark's own."""
         with redis.Redis(host=self.host, port=self.port) as client:
