@@ -261,6 +261,9 @@ class Machine(RuleBasedStateMachine):
         assert stored == members, f"arrays {stored}, registry {members}"
         assert named == stored or (self.broken and named < stored), f"placeholders {named}, arrays {stored}"
 
+    def _left_over(self) -> list[str]:
+        return [key for key in self.world.raw.scan_iter(match=f"*{self.top}*") if not key.endswith(":last")]
+
     def teardown(self) -> None:
         if not hasattr(self, "model"):
             return
@@ -273,8 +276,11 @@ class Machine(RuleBasedStateMachine):
         if self.model is not ABSENT:
             self._no_orphans()
             del self.world.direct[self.top]
-        keys = [key for key in self.world.raw.scan_iter(match=f"*{self.top}*") if not key.endswith(":last")]
-        assert not keys, f"left over: {keys}"
+        # What a broken, refused write with arrays leaves behind, a delete takes away: the exception of promise 3.
+        if self.broken and self._left_over():
+            with contextlib.suppress(KeyError):
+                del self.world.direct[self.top]
+        assert not self._left_over(), f"left over: {self._left_over()}"
         self.world.raw.flushdb()
 
 
