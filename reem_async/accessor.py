@@ -85,7 +85,8 @@ class Accessor:
     async def write(self, value: Any) -> None:
         """Store `value` here, in place of what was here. One round trip.
 
-        Three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
+        Two where this interface puts arrays for the first time (unless it is a whole top-level key), two or
+        three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
 
         Raises:
             BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
@@ -121,7 +122,9 @@ class Accessor:
         return await self._reader.type_at(self._path)
 
     async def increment(self, number: float = 1) -> Any:
-        """Add `number` to the number here; returns the result. One round trip.
+        """Add `number` to the number here; returns the result.
+
+        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits.
 
         Raises:
             MissingKey: Nothing is here.
@@ -164,7 +167,7 @@ class Accessor:
             await self.increment(value)
 
     async def append(self, value: Any) -> None:
-        """Append `value` to the list here. One round trip.
+        """Append `value` to the list here. One round trip, two if it holds arrays.
 
         Raises:
             MissingKey: Nothing is here.
@@ -173,7 +176,7 @@ class Accessor:
         await self._writer.extend(self._path, [value])
 
     async def extend(self, values: Iterable[Any]) -> None:
-        """Append each of `values` to the list here, all or none. One round trip. Raises as `append`."""
+        """Append each of `values` to the list here, all or none. Raises and costs as `append`."""
         await self._writer.extend(self._path, list(values))
 
     def edit(self) -> Edit:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import inspect
 import secrets
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .errors import BadType, MissingKey, PathRefused
-from .plan import Command
+from .plan import Command, Plan
 from .plan.documents import Encoded, Parcel, encode, number_text
 from .plan.paths import Path, counts_from_end, show, suffix
 from .plan.reads import Sealed, interpret, length, read, type_of
@@ -18,10 +18,12 @@ from .plan.writes import (
     Change,
     Loaded,
     append_change,
+    appendable,
     change,
     delete_change,
     exchange,
     set_change,
+    takes,
 )
 from .session import Session
 
@@ -134,6 +136,7 @@ class DocumentWriter:
         await self._set(path, encoded, loaded)
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+        await self._check_place(path, loaded)
         await self._change(set_change(self.keys, path, encoded.text, loaded))
 
     async def delete(self, path: Path) -> None:
@@ -161,7 +164,19 @@ class DocumentWriter:
             await self._append(path, texts, tuple(loaded))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
+        await self._check_list(path, loaded)
         await self.session.run(change(append_change(self.keys, path, texts, loaded), self.session.memory))
+
+    async def _check_list(self, path: Path, loaded: tuple[Loaded, ...]) -> None:
+        """Raise MissingKey or BadType if ships' values would be stored for nothing."""
+        if loaded:
+            await self.session.run(appendable(self.keys, path))
+
+    async def _check_place(self, path: Path, loaded: tuple[Loaded, ...]) -> None:
+        """Raise PathRefused if ships' values would be stored for nothing."""
+        plan = takes(self.keys, path, loaded, self.session.memory)
+        if plan is not None:
+            await self.session.run(plan)
 
     async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
         """Apply a JSON arithmetic command; returns the new number."""
@@ -173,7 +188,8 @@ class DocumentWriter:
         if isinstance(operand, np.generic):
             operand = operand.item()
         return await self._run(
-            path, lambda notices: calculate(self.keys, path, command, operation, operand, text, notices)
+            path,
+            lambda notices: calculate(self.keys, path, command, operation, operand, text, notices, self.session.memory),
         )
 
     async def compute(self, path: Path, function: Any) -> Any:
@@ -182,10 +198,17 @@ class DocumentWriter:
 
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
-        return await self._run(path, lambda notices: compute(self.keys, path, function, notices))
+        return await self._run(path, lambda notices: compute(self.keys, path, function, notices, self.session.memory))
 
-    async def _run(self, path: Path, plan: Any) -> Any:
-        return await self.session.run(plan(lambda: ()))
+    async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Plan]) -> Any:
+        return await self._calculated(plan(lambda: ()))
+
+    async def _calculated(self, plan: Plan) -> Any:
+        try:
+            return await self.session.run(plan)
+        except BaseException:  # it may have been applied or not
+            self.session.memory.forget_numbers(self.keys.document)
+            raise
 
     async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
@@ -193,6 +216,8 @@ class DocumentWriter:
         await self._exchange(set_change(self.keys, path, encoded.text, loaded), before)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
+        gone = tuple(crate.placeholder.suffix.encode() for crate, _, _ in before.crates)
+        it = it._replace(gone=gone)
         await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))
 
     async def _change(self, it: Change) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from .accessor import Accessor
 from .document import DocumentWriter
 from .errors import WriteOnly
-from .plan import Command
+from .plan import Command, Plan
 from .plan.documents import Encoded
 from .plan.notices import announce, published, with_value
 from .plan.paths import Path, show
@@ -35,6 +35,7 @@ class DocumentPublisher(DocumentWriter):
 
     async def _set_in_order(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            await self._check_place(path, loaded)
             stamp = self._stamp(path)
             notices = self._notice(stamp, with_value(*stamp, encoded.text, loaded))
             it = set_change(
@@ -53,12 +54,13 @@ class DocumentPublisher(DocumentWriter):
 
     async def _append_in_order(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            await self._check_list(path, loaded)
             it = append_change(self.keys, path, texts, loaded, notices=self._announced(path))
             await self.session.run(change(it, self.session.memory))
 
-    async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Any]) -> Any:
+    async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Plan]) -> Any:
         async with self.session.transport.ordered(self.keys.channel):
-            return await self.session.run(plan(lambda: self._announced(path)))
+            return await self._calculated(plan(lambda: self._announced(path)))
 
     def _announced(self, path: Path, *, deleted: bool = False) -> list[Command]:
         """Return the commands of a notice without the value."""

@@ -17,7 +17,7 @@ from conftest import EXAMPLES, PATIENCE, assert_no_orphans, assert_same, command
 
 import reem
 import reem_async
-from reem_async.errors import MissingKey, PathRefused
+from reem_async.errors import BadType, MissingKey, PathRefused
 
 READS = max(200, EXAMPLES // 5)
 CHANGES = max(40, EXAMPLES // 50)
@@ -234,6 +234,26 @@ def test_a_write_refused_by_the_server_leaves_no_arrays(front, key, raw, array):
         assert set(raw.scan_iter(match=f"*{key()}*")) == before
     assert_same(front.read([key()]), {"scalar": 1, "image": np.zeros(2), "l": [np.ones(1)]})
     assert_no_orphans(raw, key())
+
+
+@pytest.mark.parametrize("published", [False, True], ids=["store", "space"])
+def test_arrays_of_a_write_that_cannot_be_are_not_even_sent(interface, key, raw, published):
+    """If the connection broke just then, nobody would take them away."""
+    place = (reem.PublishSpace if published else reem.KeyValueStore)(interface)[key()]
+    place.write({"scalar": 1, "l": [1], "d": {"a": np.zeros(900)}})
+    del place["d"]
+    before = commands_run(raw)
+    for path in (["scalar", "x"], ["gone", "x"], ["l", 5], ["l", 0, "x"], ["d", "a"]):
+        at = place
+        for element in path:
+            at = at[element]
+        with pytest.raises(PathRefused):
+            at.write(np.arange(900))
+    for name, error in (("scalar", BadType), ("gone", MissingKey)):
+        with pytest.raises(error):
+            place[name].append(np.arange(900))
+    after = commands_run(raw)
+    assert {name: after.get(name) for name in ("set", "sadd")} == {name: before.get(name) for name in ("set", "sadd")}
 
 
 def test_a_writer_does_not_trust_what_it_remembers(front, open_front, key, raw):

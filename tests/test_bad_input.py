@@ -353,6 +353,24 @@ def test_arithmetic_out_of_range_is_an_overflow_and_changes_nothing(front, key, 
     assert_same(front.read([key()]), {"n": start})
 
 
+def test_the_server_never_calculates_near_the_end_of_its_range(front, key, raw):
+    """It would wrap around, and everybody could read that until it is put right."""
+    path = [key(), "n"]
+    for start, step in ((2**63 - 3, 2), (-(2**63), 1), (2**62, 1), (0, 2**62)):
+        front.write([key()], {"n": start})
+        before = commands_run(raw).get("json.numincrby", 0)
+        front.increment(path, step)
+        with pytest.raises(Overflow):
+            front.increment(path, 2**63 - 1 if start >= 0 else -(2**63))
+        assert commands_run(raw).get("json.numincrby", 0) == before
+        assert front.read(path) == start + step
+    front.write([key()], {"n": 0})
+    for _ in range(5):
+        front.increment(path, 2)
+    assert commands_run(raw).get("json.numincrby", 0) == before + 4
+    assert front.read(path) == 10
+
+
 @pytest.mark.parametrize("value", ["text", None, True, [1], {"a": 1}, np.arange(3), np.array(1), b"1"], ids=repr)
 def test_arithmetic_on_what_is_no_number_is_a_type_error(front, key, value):
     """An array is none: its elements are not on the server as numbers."""

@@ -1,8 +1,9 @@
 """Plans that calculate on the server: one atomic command, checked against Python's arithmetic.
 
-RedisJSON wraps integers around without a word when they leave 64 bits. So the old value is read in
-the same transaction, the result is compared with what it has to be, and a wrong one is put right
-under WATCH.
+RedisJSON wraps integers around without a word when they leave 64 bits. So the server calculates only
+where the number was seen to be far from that; everything else is read, calculated here and written
+back under WATCH. Still the old value is read in the same transaction and the result compared with
+what it has to be: somebody else may have made the number large, and then the old one is put back.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from ..errors import BadType, Overflow
 from . import Command, Plan, Reply
 from .documents import encode
 from .keys import Keys
+from .memory import Memory
 from .paths import Path, show, to_jsonpath
 from .placeholders import find
 from .reads import get_command, present
@@ -29,6 +31,9 @@ Notices = Callable[[], Sequence[Command]]
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 """The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
 
+_FAR = 2**62
+"""Results that ought to be below this are left to the server."""
+
 
 def calculate(
     keys: Keys,
@@ -38,14 +43,18 @@ def calculate(
     operand: float,
     text: bytes,
     notices: Notices,
+    memory: Memory,
 ) -> Plan:
     """Plan `command` (JSON.NUMINCRBY, JSON.NUMMULTBY) with `operand`, in one transaction; returns the new number.
 
     Raises (in decode):
         MissingKey: Nothing is there.
         BadType: Not a number.
-        Overflow: The result is out of range; the old value is back.
+        Overflow: The result is out of range; the old value stays.
     """
+    known = memory.number(keys.document, path)
+    if known is None or not -_FAR < operation(known, operand) < _FAR:
+        return compute(keys, path, lambda number: operation(number, operand), notices, memory)
     place = to_jsonpath(path)
     commands = [
         get_command(keys, path),
@@ -57,28 +66,34 @@ def calculate(
     def decode(replies: Sequence[Reply]) -> Any:
         old = _number(present(replies[0], keys, path), keys, path)
         if replies[1] == [None]:  # a float that is stored as text
-            return compute(keys, path, lambda number: operation(number, operand), notices)
+            return compute(keys, path, lambda number: operation(number, operand), notices, memory)
         if isinstance(replies[1], Exception) and "not a number" in str(replies[1]):
             raise _overflow(keys, path, old)
         checked(replies[1], keys, path)
         text = present(replies[2], keys, path)
         new, due = loads(text, keys)[0], operation(old, operand)
         if type(new) is type(due) and new == due:
+            memory.saw_number(keys.document, path, new)
             return new
         return _put_right(keys, path, text, old, due, notices)
 
     return Plan(commands, decode, atomic=True)
 
 
-def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Notices) -> Plan:
+def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Notices, memory: Memory) -> Plan:
     """Plan to replace the number at `path` by `function` of it; repeats until nobody interferes."""
 
     def look(replies: Sequence[Reply]) -> Any:
         old = _number(present(replies[1], keys, path), keys, path)
-        return _guarded(keys, path, _in_range(function(old), keys, path, old), notices, again)
+        new = _in_range(function(old), keys, path, old)
+        return _guarded(keys, path, new, notices, again, lambda: finish(new))
 
-    def again() -> Plan:
-        return compute(keys, path, function, notices)
+    def again(notices: Notices) -> Plan:
+        return compute(keys, path, function, notices, memory)
+
+    def finish(new: Any) -> Any:
+        memory.saw_number(keys.document, path, new)
+        return new
 
     return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True)
 
@@ -89,22 +104,19 @@ def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices
 
     def look(replies: Sequence[Reply]) -> Any:
         if present(replies[1], keys, path) != wrong:
-            return Plan([("UNWATCH",)], lost, held=True)
-        return _guarded(keys, path, due if fits else old, notices, again, then=finish)
+            raise Overflow(
+                f"{show(full(keys, path))}: the result left the range of 64 bits and was wrapped around by the server; "
+                "somebody else changed it before it could be put right: write it again"
+            )
+        return _guarded(keys, path, due if fits else old, notices, again, finish)
 
-    def again() -> Plan:
+    def again(notices: Notices) -> Plan:
         return _put_right(keys, path, wrong, old, due, notices)
 
     def finish() -> Any:
         if not fits:
             raise _overflow(keys, path, old)
         return due
-
-    def lost(_: Sequence[Reply]) -> Any:
-        raise Overflow(
-            f"{show(full(keys, path))}: the result left the range of 64 bits and was wrapped around by the server; "
-            "somebody else changed it before it could be put right: write it again"
-        )
 
     return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True)
 
@@ -114,19 +126,20 @@ def _guarded(
     path: Path,
     value: Any,
     notices: Notices,
-    again: Callable[[], Plan],
-    then: Callable[[], Any] | None = None,
+    again: Callable[[Notices], Plan],
+    then: Callable[[], Any],
 ) -> Plan:
-    """Plan to set a number on the watched connection."""
+    """Plan to set a number on the watched connection; `again` is what to do if somebody else was faster."""
+    told = notices()
     text = encode(value, full(keys, path), lambda _: None, lambda _: "").text
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         if replies is None:
-            return again()
+            return again(lambda: told)  # nobody has seen these yet, so their numbers are not used up
         checked(replies[0], keys, path)
-        return then() if then else value
+        return then()
 
-    return Plan([("JSON.SET", keys.document, to_jsonpath(path), text), *notices()], decode, atomic=True, held=True)
+    return Plan([("JSON.SET", keys.document, to_jsonpath(path), text), *told], decode, atomic=True, held=True)
 
 
 def _number(text: bytes, keys: Keys, path: Path) -> Any:
@@ -153,5 +166,5 @@ def _in_range(number: Any, keys: Keys, path: Path, old: Any) -> Any:
 
 def _overflow(keys: Keys, path: Path, old: Any) -> Overflow:
     return Overflow(
-        f"{show(full(keys, path))}: the result is out of range of 64-bit numbers; the old value {old!r} is back"
+        f"{show(full(keys, path))}: the result is out of range of 64-bit numbers; the old value {old!r} stays"
     )

@@ -21,17 +21,29 @@ class Memory:
 
     def __init__(self) -> None:
         self._members: dict[str, frozenset[bytes]] = {}
+        self._unsure: set[str] = set()
         self._layouts: dict[tuple[str, Path], tuple[Placeholder, ...]] = {}
         self._shapes: dict[tuple[str, Path], frozenset[str]] = {}
+        self._numbers: dict[str, dict[Path, float]] = {}
 
     def members(self, document: str) -> frozenset[bytes]:
-        """Return the suffixes of ships' keys that were last seen to exist."""
+        """Return the suffixes of ships' keys that may exist: all that this interface knows of."""
         return self._members.get(document, frozenset())
+
+    def sure_members(self, document: str) -> frozenset[bytes]:
+        """Return the suffixes of ships' keys that were seen to exist when this interface last wrote."""
+        return frozenset() if document in self._unsure else self.members(document)
+
+    def expects_members(self, document: str, members: frozenset[bytes]) -> None:
+        """Remember what may exist while a write is under way, and if its reply is lost."""
+        self._unsure.add(document)
+        _put(self._members, document, members)
 
     def saw_members(self, document: str, members: frozenset[bytes]) -> None:
         """Remember a reply to SMEMBERS of the registry."""
         if members or document in self._members:
             _put(self._members, document, members)
+            self._unsure.discard(document)
 
     def layout(self, document: str, path: Path) -> tuple[Placeholder, ...]:
         """Return the placeholders that a read of `path` last met."""
@@ -54,6 +66,20 @@ class Memory:
     def saw_shape(self, document: str, path: Path, suffixes: frozenset[str]) -> None:
         """Remember where the arrays of a full write were."""
         _put(self._shapes, (document, path), suffixes)
+
+    def number(self, document: str, path: Path) -> float | None:
+        """Return the last result of a calculation at `path`, None if anything else was done to the document since."""
+        return self._numbers.get(document, {}).get(path)
+
+    def saw_number(self, document: str, path: Path, number: float) -> None:
+        """Remember the result of a calculation."""
+        if document not in self._numbers:
+            _put(self._numbers, document, {})
+        _put(self._numbers.get(document, {}), path, number)
+
+    def forget_numbers(self, document: str) -> None:
+        """Forget the results of calculations: the document is written, or it is not known what became of one."""
+        self._numbers.pop(document, None)
 
 
 def _put(store: dict[Any, Any], key: Any, value: Any) -> None:

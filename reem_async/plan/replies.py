@@ -31,7 +31,7 @@ from .paths import Path, show, to_jsonpath
 
 __all__ = [
     "checked", "decoded", "diagnose", "explained", "full", "loads", "missing", "no_json", "refusal",
-    "registered", "type_name",
+    "registered", "settable", "type_name",
 ]  # fmt: skip
 
 _REFUSALS: dict[str, tuple[type[Refused], str]] = {
@@ -134,7 +134,7 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
     if "created at the root" in text:
         return PathRefused(f"{where}: nothing is stored at {keys.name!r}; write {keys.name} itself first, as a dict")
     if "index out of range" in text:
-        return PathRefused(f"{where}: the list index is out of range; use append() to make a list longer")
+        return out_of_range(keys, path)
     return error
 
 
@@ -154,24 +154,39 @@ def no_json() -> str:
     )
 
 
-def diagnose(keys: Keys, path: Path) -> Plan:
-    """Plan to find out why a write at `path` was refused. Its decode always raises PathRefused."""
-    prefixes = [path[:length] for length in range(len(path))]
-    commands = [("JSON.TYPE", keys.document, to_jsonpath(prefix)) for prefix in prefixes]
+def settable(keys: Keys, path: Path) -> Plan:
+    """Plan to find out whether something can be set at `path`. Its decode raises PathRefused if not."""
+    places = [path[:length] for length in range(len(path) + 1)]
+    commands = [("JSON.TYPE", keys.document, to_jsonpath(place)) for place in places]
 
-    def decode(replies: Sequence[Reply]) -> Any:
-        for prefix, reply in zip(prefixes, replies, strict=True):
-            kind = type_name(checked(reply, keys, prefix))
-            key = path[len(prefix)]
+    def decode(replies: Sequence[Reply]) -> None:
+        kinds = [type_name(checked(reply, keys, path)) for reply in replies]
+        for place, kind, inner in zip(places[:-1], kinds[:-1], path, strict=True):
+            whole, outer = show(full(keys, path)), show(full(keys, place))
             if kind is None:
-                raise PathRefused(f"{show(full(keys, path))}: there is no {show(full(keys, prefix))} to write into")
-            if kind not in ("object", "array") or (kind == "object") != isinstance(key, str):
-                raise PathRefused(
-                    f"{show(full(keys, path))}: {show(full(keys, prefix))} is of type {kind} and has no element {key!r}"
-                )
-        raise PathRefused(f"{show(full(keys, path))}: its parent changed while it was written; write again")
+                raise PathRefused(f"{whole}: there is no {outer} to write into")
+            if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
+                raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}")
+        if kinds[-1] is None and isinstance(path[-1], int):
+            raise out_of_range(keys, path)
 
     return Plan(commands, decode)
+
+
+def diagnose(keys: Keys, path: Path) -> Plan:
+    """Plan to find out why a write at `path` was refused. Its decode always raises PathRefused."""
+    plan = settable(keys, path)
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        plan.decode(replies)
+        raise PathRefused(f"{show(full(keys, path))}: its parent changed while it was written; write again")
+
+    return plan._replace(decode=decode)
+
+
+def out_of_range(keys: Keys, path: Path) -> PathRefused:
+    """Return the error for an item beyond the end of a list."""
+    return PathRefused(f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer")
 
 
 def type_name(reply: Reply) -> str | None:

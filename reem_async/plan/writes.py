@@ -2,7 +2,8 @@
 
 Every key a ship fills is entered in a registry set, so that what a write replaces can be found and
 removed. Most of it goes in the write's own transaction: what was known to be there, below a path
-without list indexes, can only be referred to from there. What nobody here knew of (another client
+without list indexes, can only be referred to from there; in lists, where names tell nothing about
+places, a look under WATCH says what is about to be replaced. What nobody here knew of (another client
 changed the shape meanwhile) shows in the registry, which the same round trip returns, and is then
 removed under WATCH, after a look at what the document refers to.
 """
@@ -12,24 +13,25 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadKey, BadType, Conflict, MissingKey, PartialWrite, WrongKind
+from ..errors import BadKey, BadType, Conflict, MissingKey, PartialWrite
 from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
+from .orphans import clean, survey, unreferred, watch
 from .paths import Path, below, may_hold, parse_suffix, show, to_jsonpath
-from .placeholders import find
-from .reads import get_command
-from .replies import checked, diagnose, explained, full, loads, registered
+from .replies import checked, diagnose, explained, full, registered, settable, type_name
 
 __all__ = [
     "Change",
     "Loaded",
     "append_change",
+    "appendable",
     "change",
     "delete_change",
     "exchange",
     "make_parents",
     "set_change",
+    "takes",
 ]
 
 
@@ -60,6 +62,7 @@ class Change(NamedTuple):
         loaded: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
         looks: Whether to look for ships' keys that it replaces; if not, somebody vouches for there being none.
+        gone: The suffixes of those that it replaces, if this is known for certain: the document is watched.
         notices: What tells subscribers, in the same transaction.
         retraction: Makes what tells them if the server refuses the change after all.
     """
@@ -71,6 +74,7 @@ class Change(NamedTuple):
     loaded: tuple[Loaded, ...] = ()
     replaces: bool = True
     looks: bool = True
+    gone: tuple[bytes, ...] | None = None
     notices: Sequence[Command] = ()
     retraction: Callable[[], Sequence[Command]] | None = None
 
@@ -101,29 +105,63 @@ def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
 
 def append_change(keys: Keys, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...], **notices: Any) -> Change:
     """Return the change that appends to the list at `path`; raises MissingKey or BadType if there is none."""
-    where = show(full(keys, path))
 
     def judge(reply: Reply) -> Any:
-        if reply == []:
-            raise MissingKey(f"nothing is stored at {where}; write a list there first")
-        if reply == [None]:
-            raise BadType(f"{where} is not a list; only lists can be appended to")
+        if reply in ([], [None]):
+            raise _no_list(keys, path, nothing=not reply)
         return None
 
     command = ("JSON.ARRAPPEND", keys.document, to_jsonpath(path), *texts)
     return Change(keys, path, command, judge, loaded, replaces=False, **notices)
 
 
-def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
-    """Plan one change, in one round trip unless somebody else changed the shape meanwhile.
+def _no_list(keys: Keys, path: Path, *, nothing: bool) -> Exception:
+    where = show(full(keys, path))
+    if nothing:
+        return MissingKey(f"nothing is stored at {where}; write a list there first")
+    return BadType(f"{where} is not a list; only lists can be appended to")
+
+
+def appendable(keys: Keys, path: Path) -> Plan:
+    """Plan to make sure that there is a list at `path`. Its decode raises MissingKey or BadType if there is none.
+
+    For what goes by ship: the transaction would store it even if the server refused to append.
+    """
+
+    def decode(replies: Sequence[Reply]) -> None:
+        kind = type_name(checked(replies[0], keys, path))
+        if kind != "array":
+            raise _no_list(keys, path, nothing=kind is None)
+
+    return Plan([("JSON.TYPE", keys.document, to_jsonpath(path))], decode)
+
+
+def takes(keys: Keys, path: Path, loaded: tuple[Loaded, ...], memory: Memory) -> Plan | None:
+    """Plan to make sure that something can be set at `path`; None if that is known, or nothing goes by ship.
+
+    The transaction would store what goes by ship even if the server refused to set the rest.
+    """
+    known = memory.sure_members(keys.document)
+    if not path or not loaded or any(each.suffix.encode() in known for each in loaded):
+        return None
+    return settable(keys, path)
+
+
+def change(it: Change, memory: Memory) -> Plan:
+    """Plan one change, in one round trip unless somebody else changed the shape meanwhile, in two in lists of arrays.
 
     Args:
         it: The change.
         memory: What is known of the server.
-        held: The connection watches keys.
-        given_up: Gives the next plan if a watched key changed.
     """
-    stale = _stale(it, memory) if it.replaces and it.looks else []
+    return _change_exactly(it, memory) if _moves(it, memory) else _change(it, memory)
+
+
+def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
+    """Plan the transaction; if the connection is `held`, it watches keys, and `given_up` is next if one changed."""
+    memory.forget_numbers(it.keys.document)
+    stale = _stale(it, memory)
+    _expect(it, memory, stale)
     before = _clearing(it, stale)
     writes = [command for each in it.loaded for command in each.commands]
     after: list[Command] = []
@@ -144,13 +182,46 @@ def change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable
     return Plan(commands, decode, atomic=len(commands) > (2 if it.looks else 1) or held, held=held)
 
 
+def _moves(it: Change, memory: Memory) -> bool:
+    """Return whether it may replace something that has moved from the place after which it is named."""
+    return (
+        it.replaces
+        and it.looks
+        and any(isinstance(key, int) for key in it.path)
+        and any(may_hold(it.path, _place(member)) for member in memory.members(it.keys.document))
+    )
+
+
+def _change_exactly(it: Change, memory: Memory) -> Plan:
+    """Plan to look first, and then to remove with what is replaced whatever nothing refers to any more."""
+
+    def look(replies: Sequence[Reply]) -> Plan:
+        gone = unreferred(replies[1:], it.keys)
+        if gone is None:
+            return Plan([("UNWATCH",)], lambda _: _change(it, memory), held=True)
+        return _change(it._replace(gone=gone), memory, held=True, given_up=lambda: _change_exactly(it, memory))
+
+    return Plan([watch(it.keys), *survey(it.keys, it.path)], look, held=True)
+
+
 def _stale(it: Change, memory: Memory) -> list[bytes]:
     """Return the known keys that only what is replaced can refer to, and that are not written again."""
-    if any(isinstance(key, int) for key in it.path):
+    if not it.replaces or not it.looks:
         return []
     written = {each.suffix.encode() for each in it.loaded}
+    if it.gone is not None:
+        return [member for member in it.gone if member not in written]
+    if any(isinstance(key, int) for key in it.path):
+        return []
     known = memory.members(it.keys.document)
     return [member for member in known if member not in written and below(_place(member), it.path)]
+
+
+def _expect(it: Change, memory: Memory, stale: list[bytes]) -> None:
+    """Note what may exist from now on: the reply that tells may be lost."""
+    known, written = memory.members(it.keys.document), frozenset([each.suffix.encode() for each in it.loaded])
+    if it.looks and (stale or not written <= known):
+        memory.expects_members(it.keys.document, known | written)
 
 
 def _place(member: bytes) -> Path:
@@ -238,8 +309,10 @@ class _Outcome:
         if judged is REFUSED or isinstance(judged, Exception):
             # Of nothing that was not there to be deleted, or appended to, there can be leftovers of a broken call.
             return bool(written) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
-        return self.it.replaces and any(
-            member not in written and may_hold(self.it.path, _place(member)) for member in members
+        return (
+            self.it.replaces
+            and self.it.gone is None
+            and any(member not in written and may_hold(self.it.path, _place(member)) for member in members)
         )
 
     def _finish(self, judged: Any) -> Any:
@@ -262,38 +335,6 @@ def make_parents(keys: Keys, path: Path) -> Plan:
     return Plan(commands, decode)
 
 
-def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
-    """Plan to remove the ships' keys that the document does not refer to, then go on with `then`.
-
-    Looks and removes under WATCH: if anybody writes to the document in between, it looks again.
-    """
-
-    def look(replies: Sequence[Reply]) -> Any:
-        text = replies[1]
-        if isinstance(text, Exception):
-            if not isinstance(explained(text, keys, ()), WrongKind):  # nobody knows what the document refers to
-                return Plan([("UNWATCH",)], lambda _: then(), held=True)
-            text = None  # a foreign type refers to nothing
-        members = registered(replies[2], keys)
-        used = {crate.placeholder.suffix.encode() for crate in find(loads(text, keys), keys.name)} if text else set()
-        orphans = sorted(members - used)
-        memory.saw_members(keys.document, members)
-        if not orphans:
-            return Plan([("UNWATCH",)], lambda _: then(), held=True)
-        tag = keys.tag.encode()
-        removal = [("UNLINK", *(tag + orphan for orphan in orphans)), ("SREM", keys.registry, *orphans)]
-        return Plan(removal, lambda replies: remove(replies, members - frozenset(orphans)), atomic=True, held=True)
-
-    def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
-        if replies is None:
-            return clean(keys, memory, then)
-        memory.saw_members(keys.document, left)
-        return then()
-
-    commands = [("WATCH", keys.document, keys.registry), get_command(keys, ()), ("SMEMBERS", keys.registry)]
-    return Plan(commands, look, held=True)
-
-
 def exchange(it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory) -> Plan:
     """Plan a change that is made only if what `reads` fetch is still `before`.
 
@@ -303,11 +344,9 @@ def exchange(it: Change, reads: Sequence[Command], before: tuple[Any, ...], memo
     where = show(full(it.keys, it.path))
 
     def compare(replies: Sequence[Reply]) -> Any:
-        if tuple(replies[1:]) == before:
-            return change(it, memory, held=True, given_up=lambda: exchange(it, reads, before, memory))
-        return Plan([("UNWATCH",)], refuse, held=True)
-
-    def refuse(_: Sequence[Reply]) -> Any:
+        if tuple(replies[4:]) == before:
+            exact = it._replace(gone=unreferred(replies[1:4], it.keys))
+            return _change(exact, memory, held=True, given_up=lambda: exchange(it, reads, before, memory))
         raise Conflict(f"{where} was changed by somebody else while it was edited; nothing was written: edit it again")
 
-    return Plan([("WATCH", it.keys.document, it.keys.registry), *reads], compare, held=True)
+    return Plan([watch(it.keys), *survey(it.keys, it.path), *reads], compare, held=True)

@@ -212,11 +212,11 @@ class _Put:
     def _look(self, replies: Sequence[Reply]) -> Plan:
         keys, kind, members = self._keys, _type(replies[1]), replies[2]
         if kind not in ("none", DOCUMENT):
-            return _refused(WrongKind(keys.document, keys.name))
+            raise WrongKind(keys.document, keys.name)
         if kind == DOCUMENT and not self._replace:
-            return _refused(Conflict(f"{keys.name!r} is there already; nothing of it was changed"))
+            raise Conflict(f"{keys.name!r} is there already; nothing of it was changed")
         if isinstance(members, Exception):
-            return _refused(BadData(f"{keys.name}: {keys.registry} is not the set of names it should be: {members}"))
+            raise BadData(f"{keys.name}: {keys.registry} is not the set of names it should be: {members}")
         self._told = self._told or self._notices()
         commands = [self._clearing(members), *self._writes, *self._told]
         return Plan(commands, partial(self._done, [command[:2] for command in commands]), atomic=True, held=True)
@@ -238,11 +238,5 @@ class _Put:
                 )
         self._memory.saw_members(self._keys.document, frozenset(suffix.encode() for suffix in self._registry))
         self._memory.forget_shapes(self._keys.document)
+        self._memory.forget_numbers(self._keys.document)
         return None
-
-
-def _refused(error: Exception) -> Plan:
-    def refuse(_: Sequence[Reply]) -> Any:
-        raise error
-
-    return Plan([("UNWATCH",)], refuse, held=True)

@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
+from ..errors import BadData, ReemError
 from ..plan import Command, Plan, Reply, wire_commands
 from ..plan.replies import decoded
 from ..state import States
 
 __all__ = ["Held", "Transport", "drive"]
+
+_UNWATCH: Command = ("UNWATCH",)
 
 
 class Held(Protocol):
@@ -89,6 +92,8 @@ async def drive(transport: Transport, plan: Plan) -> Any:
         if plan.held:
             async with transport.hold() as held:
                 outcome = await _drive_held(held, plan)
+            if isinstance(outcome, _Raised):
+                raise outcome.error
         else:
             replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
             outcome = decoded(plan, replies)
@@ -97,9 +102,21 @@ async def drive(transport: Transport, plan: Plan) -> Any:
         plan = outcome
 
 
+class _Raised(NamedTuple):
+    """What a decode raised: no fault of the connection, which can be lent again."""
+
+    error: ReemError
+
+
 async def _drive_held(held: Held, plan: Plan) -> Any:
     outcome: Any = plan
     while type(outcome) is Plan and outcome.held:
         replies = await held.roundtrip(wire_commands(outcome))
-        outcome = decoded(outcome, replies)
+        try:
+            outcome = decoded(outcome, replies)
+        except BadData:
+            raise
+        except ReemError as error:
+            await held.roundtrip([_UNWATCH])
+            return _Raised(error)
     return outcome

@@ -128,7 +128,6 @@ class Machine(RuleBasedStateMachine):
     """One game: a top-level key of its own, and a mirror of it."""
 
     world: World
-    broken = False  # whether a call of this run was interrupted
 
     @initialize(value=values)
     def begin(self, value: Any) -> None:
@@ -138,10 +137,18 @@ class Machine(RuleBasedStateMachine):
             tell(f"{it.runs} runs, {it.steps} steps, {it.faults} faults")
         it.proxy.heal()
         self.top = f"top{next(it.tops)}"
-        it.direct[self.top] = value
+        self._begin_with(value)
         self.model: Any = _as_read(value)
         self.mirror = reem.SilentSubscriber(self.top, it.following)
         self._listen()
+
+    def _begin_with(self, value: Any) -> None:
+        for _ in range(100):  # its connection, too
+            with contextlib.suppress(reem.ConnectionLost, reem.NotConnected):
+                self.world.kvs[self.top] = value
+                return
+            assert self.world.proxy.settled(), "the proxy hangs"
+        raise AssertionError("no connection within 100 attempts")
 
     def _listen(self) -> None:
         for _ in range(100):  # the mirror's connection may have been cut just now
@@ -188,7 +195,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule()
     def lose_a_reply(self) -> None:
-        self._fault(lambda proxy: proxy.drop_reply(b"\r\n"))
+        self._fault(lambda proxy: proxy.drop_reply(b"JSON."))
 
     @rule()
     def reset(self) -> None:
@@ -227,7 +234,6 @@ class Machine(RuleBasedStateMachine):
             call(self._at(self.world.space, path))
         except (reem.ConnectionLost, reem.NotConnected) as raised:
             self.world.unknown += 1
-            self.broken = True
             assert self.world.proxy.settled(), "the proxy hangs"
             stored = self.world.direct.get(self.top, ABSENT)
             possible = [self.model] + ([after] if error is None and isinstance(raised, reem.ConnectionLost) else [])
@@ -248,18 +254,13 @@ class Machine(RuleBasedStateMachine):
             time.sleep(0.001)
 
     def _no_orphans(self) -> None:
-        """Arrays and registry name each other; those placeholders that hold their value themselves need neither.
-
-        A write that the server refused removes its arrays in a second step. If the connection breaks before
-        that, they stay, registered, until the next write to this place: here, until the key is deleted.
-        """
+        """Arrays and registry name each other; those placeholders that hold their value themselves need neither."""
         raw, tag = self.world.raw, "{" + self.top + "}"
         text = raw.execute_command("JSON.GET", self.top)
         named = {parsed.suffix for parsed in map(parse, placeholders(json.loads(text))) if type(parsed) is Placeholder}
         stored = {key.removeprefix(tag) for key in keys_of(raw, self.top)} - {":ships", ":last"}
         members = set(raw.smembers(f"{tag}:ships"))
-        assert stored == members, f"arrays {stored}, registry {members}"
-        assert named == stored or (self.broken and named < stored), f"placeholders {named}, arrays {stored}"
+        assert named == stored == members, f"placeholders {named}, arrays {stored}, registry {members}"
 
     def _left_over(self) -> list[str]:
         return [key for key in self.world.raw.scan_iter(match=f"*{self.top}*") if not key.endswith(":last")]
@@ -276,10 +277,6 @@ class Machine(RuleBasedStateMachine):
         if self.model is not ABSENT:
             self._no_orphans()
             del self.world.direct[self.top]
-        # What a broken, refused write with arrays leaves behind, a delete takes away: the exception of promise 3.
-        if self.broken and self._left_over():
-            with contextlib.suppress(KeyError):
-                del self.world.direct[self.top]
         assert not self._left_over(), f"left over: {self._left_over()}"
         self.world.raw.flushdb()
 

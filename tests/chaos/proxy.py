@@ -187,12 +187,14 @@ class Proxy:
             task = asyncio.get_running_loop().create_task(self._link(reader, writer))
             tasks.add(task)
             task.add_done_callback(tasks.discard)
+            task.add_done_callback(lambda _: writer.transport.abort())  # even if it never began
 
         server = await asyncio.start_server(connected, "127.0.0.1", 0, backlog=1000)
         self.port = server.sockets[0].getsockname()[1]
         self._ready.set()
         await self._over.wait()
         server.close()
+        await asyncio.sleep(0)  # for connections that were accepted before, and are on their way to `connected`
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
@@ -220,11 +222,11 @@ class Proxy:
             pass
         finally:
             self._links.discard(link)
-            for pump in pumps:
-                pump.cancel()
-            await asyncio.gather(*pumps, return_exceptions=True)
             client.transport.abort()
             server.transport.abort()
+            for pump in pumps:
+                pump.cancel()
+            await asyncio.gather(*pumps, return_exceptions=True)  # may be cancelled: nothing is left to do after it
 
     async def _up(self, link: _Link, reader: asyncio.StreamReader) -> None:
         scanner, tail = Scanner(self.names), b""
