@@ -120,9 +120,9 @@ def _killed(run: Run, url: str, folder: Path, findings: _Findings) -> None:
             with program("record", url, path) as process:
                 said(process)
                 time.sleep(delays[number])
+                killed = time.monotonic()  # what is published from now on cannot be in the file
                 process.kill()
                 process.wait()
-            killed = time.monotonic()
             found = findings.numbers(path, f"killed {number}")
             if found is None:
                 findings.closed.append(f"killed {number}: not a recording")

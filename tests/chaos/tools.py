@@ -113,7 +113,8 @@ class Log:
     """What one subscriber was told, update by update: repetitions, steps back, and losses that nobody flagged.
 
     Numbers of one publisher go up one by one. If one is skipped, then an update in between, or the one
-    after it, must say `gap`, or the loop's own counter of skipped updates must have moved.
+    after it, must say `gap`, or the loop itself has skipped it and counted that. That counter runs ahead of
+    the updates that still wait in the loop, so it is drawn on like an account: never more than it says.
 
     Attributes:
         told: How many updates came.
@@ -131,7 +132,7 @@ class Log:
         self.silent: list[Any] = []
         self._last: dict[str, int] = {}
         self._excused: dict[str, bool] = {}
-        self._dropped = 0
+        self._drawn = 0  # how many of the loop's own skipped updates have been met
 
     async def follow(self) -> None:
         """Take updates until the loop ends."""
@@ -142,8 +143,7 @@ class Log:
         """Note one update."""
         self.told += 1
         self.gaps += update.gap
-        if update.gap or self.updates.dropped > self._dropped:
-            self._dropped = self.updates.dropped
+        if update.gap:
             self._excused = dict.fromkeys(self._last, True)
         publisher, sequence = update.publisher, update.sequence
         if publisher is None:
@@ -153,6 +153,8 @@ class Log:
             (self.repeated if sequence == last else self.backward).append((publisher, last, sequence))
             return
         if last is not None and sequence > last + 1 and not self._excused.get(publisher):
-            self.silent.append((publisher, last, sequence))
+            self._drawn += sequence - last - 1
+            if self._drawn > self.updates.dropped:
+                self.silent.append((publisher, last, sequence))
         self._last[publisher] = sequence
         self._excused[publisher] = False
