@@ -10,14 +10,10 @@ import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from types import TracebackType
-from typing import Self
-
-import anyio
-import anyio.to_thread
 
 from ._server_process import HOST, PortTaken, ServerProcess, ServerProgram
 from ._server_programs import find_program
+from ._startable import Startable
 from .errors import BadValue, ServerFailed
 
 __all__ = ["ClusterNode", "EmbeddedCluster"]
@@ -79,7 +75,7 @@ class ClusterNode(ServerProcess):
         return text.decode()
 
 
-class EmbeddedCluster:
+class EmbeddedCluster(Startable):
     """A cluster of servers with JSON that belongs to this program and ends with it, however it ends.
 
         with EmbeddedCluster() as cluster:        # or: async with
@@ -196,32 +192,6 @@ class EmbeddedCluster:
         known = kinds.count("master") == self._primaries and kinds.count("slave") == standing_by
         synced = "role:slave" not in (text := node.say("INFO", "replication")) or "master_link_status:up" in text
         return known and synced
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    async def __aenter__(self) -> Self:
-        try:
-            await anyio.to_thread.run_sync(self.start)
-        except BaseException:  # cancelled: the thread goes on, and what it starts would be nobody's
-            await self._stop_shielded()
-            raise
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._stop_shielded()
-
-    async def _stop_shielded(self) -> None:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(self.stop)
 
     def __repr__(self) -> str:
         state = f"{len(self.nodes)} nodes on {HOST}" if self.nodes else "not started"

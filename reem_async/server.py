@@ -9,15 +9,12 @@ import socket
 import threading
 import weakref
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 from urllib.parse import quote
-
-import anyio
-import anyio.to_thread
 
 from reem_async._server_process import HOST, PortTaken, ServerProcess, has_data
 from reem_async._server_programs import find_program
+from reem_async._startable import Startable
 from reem_async.errors import BadValue, Misuse, ServerFailed
 
 __all__ = ["EmbeddedServer"]
@@ -27,7 +24,7 @@ FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored
 PASSWORD_BYTES = 512  # the server's own limit
 
 
-class EmbeddedServer:
+class EmbeddedServer(Startable):
     """A Redis-compatible server with JSON that belongs to this program and ends with it, however it ends.
 
         with EmbeddedServer() as server:          # or: async with
@@ -148,36 +145,10 @@ class EmbeddedServer:
         """The password given."""
         return self._password
 
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.stop()
-
-    async def __aenter__(self) -> Self:
-        try:
-            await anyio.to_thread.run_sync(self.start)
-        except BaseException:  # cancelled: the thread goes on, and what it starts would be nobody's
-            await self._stop_shielded()
-            raise
-        return self
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        await self._stop_shielded()
-
     def __repr__(self) -> str:
         process = self._process
         state = f"on {HOST}:{process.port}, pid {process.pid}" if process is not None else "not started"
         return f"<EmbeddedServer {state}>"
-
-    async def _stop_shielded(self) -> None:
-        with anyio.CancelScope(shield=True):
-            await anyio.to_thread.run_sync(self.stop)
 
     def _begun(self) -> ServerProcess:
         """Start the server with what it begins with."""

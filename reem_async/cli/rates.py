@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -31,112 +31,51 @@ Every = Annotated[
 ]
 
 
-def hz(
-    patterns: Patterns = None,
-    window: WindowLength = _WINDOW,
-    count: Count = None,
-    timeout: Timeout = None,
-    every: Every = 1.0,
-    as_json: AsJson = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
-    """Measure how often paths are published, until Ctrl-C (exit code 0).
+def _command(name: str, measure: Measure, text: str) -> Callable[..., None]:
+    """Return the command that shows one measure of updates; `text` is its help."""
 
-    Updates a second, and the time between two: mean, least, greatest, standard deviation, of the last
-    updates of each path. Nothing is fetched, so it costs the same for a number and an image. "lost"
-    counts updates that did not arrive here.
+    def command(
+        patterns: Patterns = None,
+        window: WindowLength = _WINDOW,
+        count: Count = None,
+        timeout: Timeout = None,
+        every: Every = 1.0,
+        as_json: AsJson = False,
+        url: Url = DEFAULT_URL,
+        namespace: Namespace = "",
+    ) -> None:
+        board, wanted = Board(measure, window), patterns or ()
 
-    Examples:
-        reem hz
-        reem hz raw_image --window 100
-        reem hz set_point --timeout 5 --json
-    """
-    _measure("hz", RATE, patterns or (), window, count, timeout, every, as_json, url, namespace)
+        async def work(interface: RedisInterface) -> int:
+            if is_terminal() and not as_json:
+                from reem_async.cli.picture import Picture
 
-
-def bw(
-    patterns: Patterns = None,
-    window: WindowLength = _WINDOW,
-    count: Count = None,
-    timeout: Timeout = None,
-    every: Every = 1.0,
-    as_json: AsJson = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
-    """Measure how many bytes are published, until Ctrl-C (exit code 0).
-
-    Bytes a second and bytes of one update: mean, least, greatest, of the last updates of each path.
-    Nothing is fetched: each notice says the size of its value. += and append() do not, and count as 0.
-
-    Examples:
-        reem bw
-        reem bw 'cam_*'
-        reem bw raw_image --count 300 --json
-    """
-    _measure("bw", BANDWIDTH, patterns or (), window, count, timeout, every, as_json, url, namespace)
-
-
-def delay(
-    patterns: Patterns = None,
-    window: WindowLength = _WINDOW,
-    count: Count = None,
-    timeout: Timeout = None,
-    every: Every = 1.0,
-    as_json: AsJson = False,
-    url: Url = DEFAULT_URL,
-    namespace: Namespace = "",
-) -> None:
-    """Measure the time from publishing to receiving, until Ctrl-C (exit code 0).
-
-    The time at which a notice is received here, minus the time that its publisher wrote into it, of
-    the last updates of each path. Both clocks matter: between two machines it also shows how far they
-    are apart, and may be negative; see `reem doctor`. Fetching a large value is not in it.
-
-    Examples:
-        reem delay
-        reem delay raw_image set_point
-        reem delay set_point --timeout 5 --json
-    """
-    _measure("delay", DELAY, patterns or (), window, count, timeout, every, as_json, url, namespace)
-
-
-def _measure(
-    name: str,
-    measure: Measure,
-    patterns: Sequence[str],
-    length: int,
-    count: int | None,
-    timeout: float | None,
-    every: float,
-    as_json: bool,
-    url: str,
-    namespace: str,
-) -> None:
-    board = Board(measure, length)
-
-    async def work(interface: RedisInterface) -> int:
-        if is_terminal() and not as_json:
-            from reem_async.cli.picture import Picture
-
-            waiting = f"waiting for updates of {', '.join(patterns) or 'any key'}"
-            with Picture(board, waiting) as picture:
-                ending = await follow(
-                    interface, patterns, board.take, count=count, seconds=timeout, every=_SECONDS_PER_PICTURE,
-                    tick=lambda _: picture.draw(),
-                )  # fmt: skip
+                waiting = f"waiting for updates of {', '.join(wanted) or 'any key'}"
+                with Picture(board, waiting) as picture:
+                    ending = await follow(
+                        interface, wanted, board.take, count=count, seconds=timeout, every=_SECONDS_PER_PICTURE,
+                        tick=lambda _: picture.draw(),
+                    )  # fmt: skip
+                return ending.tell()
+            report = board.report_json if as_json else board.report
+            ending = await follow(
+                interface,
+                patterns or (),
+                board.take,
+                count=count,
+                seconds=timeout,
+                every=every,
+                tick=lambda _: report(),
+            )
+            report(final=True)
+            if measure.remark and not as_json:
+                note(measure.remark)
             return ending.tell()
-        report = board.report_json if as_json else board.report
-        ending = await follow(
-            interface, patterns, board.take, count=count, seconds=timeout, every=every, tick=lambda _: report()
-        )
-        report(final=True)
-        if measure.remark and not as_json:
-            note(measure.remark)
-        return ending.tell()
 
-    run(name, work, url, namespace, live=True)
+        run(name, work, url, namespace, live=True)
+
+    command.__name__, command.__doc__ = name, text
+    return command
 
 
 class Board:
@@ -185,3 +124,51 @@ class Board:
         due = [(path, it) for path, it in self.windows.items() if final or self._reported.get(path) != it.total]
         self._reported = {path: it.total for path, it in self.windows.items()}
         return sorted(due, key=lambda pair: pair[0])
+
+
+hz = _command(
+    "hz",
+    RATE,
+    """Measure how often paths are published, until Ctrl-C (exit code 0).
+
+Updates a second, and the time between two: mean, least, greatest, standard deviation, of the last
+updates of each path. Nothing is fetched, so it costs the same for a number and an image. "lost"
+counts updates that did not arrive here.
+
+Examples:
+    reem hz
+    reem hz raw_image --window 100
+    reem hz set_point --timeout 5 --json
+""",
+)
+
+bw = _command(
+    "bw",
+    BANDWIDTH,
+    """Measure how many bytes are published, until Ctrl-C (exit code 0).
+
+Bytes a second and bytes of one update: mean, least, greatest, of the last updates of each path.
+Nothing is fetched: each notice says the size of its value. += and append() do not, and count as 0.
+
+Examples:
+    reem bw
+    reem bw 'cam_*'
+    reem bw raw_image --count 300 --json
+""",
+)
+
+delay = _command(
+    "delay",
+    DELAY,
+    """Measure the time from publishing to receiving, until Ctrl-C (exit code 0).
+
+The time at which a notice is received here, minus the time that its publisher wrote into it, of
+the last updates of each path. Both clocks matter: between two machines it also shows how far they
+are apart, and may be negative; see `reem doctor`. Fetching a large value is not in it.
+
+Examples:
+    reem delay
+    reem delay raw_image set_point
+    reem delay set_point --timeout 5 --json
+""",
+)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -25,8 +25,8 @@ from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
 from .options import Options
-from .patience import patience
 from .redirects import Moved, key_slot, keys_in, publishes, refusal, slot_of, slots_of
+from .rooted import Rooted
 from .route import HeldAcross, Route, asked_of, places_refused, watched
 
 __all__ = ["ClusterOptions", "ClusterTransport"]
@@ -79,7 +79,7 @@ class _NodeOptions(Options):
         """Say nothing: it was said of the cluster."""
 
 
-class ClusterTransport:
+class ClusterTransport(Rooted):
     """Connections to the nodes of a cluster, made when first needed.
 
     Attributes:
@@ -146,41 +146,13 @@ class ClusterTransport:
             raise
         await held.leave()
 
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled."""
-        return await self._root.whole(call)
-
-    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
-        """Return the lock of `key`."""
-        return self._root.ordered(key)
-
-    async def pause(self, seconds: float) -> None:
-        """Wait."""
-        await self._root.pause(seconds)
-
-    def check(self) -> None:
-        """Raise if this cannot be used here."""
-        self._root.check()
-
-    @property
-    def at_end(self) -> Callable[[], Awaitable[None]]:
-        """What ends subscriptions and connections when the event loop in use ends."""
-        return self._root.at_end
-
-    @at_end.setter
-    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
-        self._root.at_end = action
-
-    async def release(self) -> None:
-        """Close the connections that are not in use; new ones are made when needed."""
-        for node in list(self._nodes.values()):
-            await node.release()
-
     async def close(self) -> None:
         """Close all connections."""
         self.states.closed()
-        for node in list(self._nodes.values()):
-            await node.close()
+        await super().close()
+
+    def _all(self) -> list[Transport]:
+        return list(self._nodes.values())
 
     async def nodes(self) -> Sequence[Transport]:
         """Return the primaries, which together hold all keys."""
@@ -340,11 +312,6 @@ class ClusterTransport:
                 except NotConnected as error:
                     problem = error
                 await (route.contended() if problem is None else route.refused(problem))
-
-    @property
-    def timeout(self) -> float:
-        """Seconds for which a call made now is tried."""
-        return patience(self._options.timeout)
 
     def lost(self, address: Address, reason: Exception) -> None:
         """Note that a connection to a node broke."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import weakref
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
@@ -30,6 +30,7 @@ from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
 from .options import Options
+from .rooted import Rooted
 
 if TYPE_CHECKING:
     from .aio import AsyncTransport
@@ -162,7 +163,7 @@ def _check_role(role: Any, connection: Any) -> None:
         raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
 
 
-class SentinelTransport:
+class SentinelTransport(Rooted):
     """Connections to the primary of the moment.
 
     Attributes:
@@ -249,11 +250,6 @@ class SentinelTransport:
         """Return a connection of the caller's own, given back on exit."""
         return _Checking(self, self._current())
 
-    @property
-    def timeout(self) -> float:
-        """Seconds without a byte moving after which a call made now is given up."""
-        return self._root.timeout
-
     async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
         """Return the way to the primary."""
         return self
@@ -262,42 +258,11 @@ class SentinelTransport:
         """Return the way to the primary alone."""
         return (self,)
 
-    async def pause(self, seconds: float) -> None:
-        """Wait."""
-        await self._root.pause(seconds)
-
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled; return its result."""
-        return await self._root.whole(call)
-
-    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
-        """Return the lock of `key`."""
-        return self._root.ordered(key)
-
-    def check(self) -> None:
-        """Raise if this cannot be used here."""
-        self._root.check()
-
-    @property
-    def at_end(self) -> Callable[[], Awaitable[None]]:
-        """What ends subscriptions and connections when the event loop in use ends."""
-        return self._root.at_end
-
-    @at_end.setter
-    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
-        self._root.at_end = action
-
-    async def release(self) -> None:
-        """Close the connections that are not in use; new ones are made when needed."""
-        for each in self._all():
-            await each.release()
-
     async def close(self) -> None:
         """Close all connections."""
         if self._lookout is not None:
             self._lookout.stop()
-        for each in self._all():
-            await each.close()
+        await super().close()
 
     def _all(self) -> list[Transport]:
         return list({id(each): each for each in (self._root, *self._demoted, self._now)}.values())

@@ -1,0 +1,62 @@
+"""What the ways to several servers have in common: one of them lends its locks and its event loop to all."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from contextlib import AbstractAsyncContextManager
+from typing import Any
+
+from . import Transport
+
+__all__ = ["Rooted"]
+
+
+class Rooted(ABC):
+    """A transport over others, one of which, the root, is there from beginning to end."""
+
+    _root: Transport
+
+    @abstractmethod
+    def _all(self) -> Iterable[Transport]:
+        """Return the transports there are, the root among them."""
+
+    async def pause(self, seconds: float) -> None:
+        """Wait."""
+        await self._root.pause(seconds)
+
+    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled; return its result."""
+        return await self._root.whole(call)
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        """Return the lock of `key`."""
+        return self._root.ordered(key)
+
+    def check(self) -> None:
+        """Raise if this cannot be used here."""
+        self._root.check()
+
+    @property
+    def timeout(self) -> float:
+        """Seconds without a byte moving after which a call made now is given up."""
+        return self._root.timeout
+
+    @property
+    def at_end(self) -> Callable[[], Awaitable[None]]:
+        """What ends subscriptions and connections when the event loop in use ends."""
+        return self._root.at_end
+
+    @at_end.setter
+    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
+        self._root.at_end = action
+
+    async def release(self) -> None:
+        """Close the connections that are not in use; new ones are made when needed."""
+        for each in self._all():
+            await each.release()
+
+    async def close(self) -> None:
+        """Close all connections. Idempotent."""
+        for each in self._all():
+            await each.close()
