@@ -105,6 +105,14 @@ class RedisInterface:
         namespace: Goes before every key and channel, so that several robots can share a server.
         timeout: Seconds without a byte moving after which a call is given up; `reem.timeout` sets another
             limit for some calls.
+        read_from_replicas: Have replicas answer `read`, `get`, `length` and `type`, to spare primaries; for a
+            cluster or behind sentinels. What it gives up: replicas get updates some time later, usually
+            milliseconds, but without any bound if one lags or has lost its primary. A read may bring what was
+            there before this very program's last write, and, once another server had to be asked (one replica
+            is kept to as long as it answers), even what was there before its last read. What stays: each read
+            is of one instant, document and arrays together, and what a replica does not have is asked of the
+            primary, so that MissingKey is as true as ever. Writes, `edit()`, arithmetic, subscribers, `watch()`
+            and recordings stay with primaries, and `state` tells of them alone. See docs/fleet.md.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ...
 
     Raises:
@@ -118,9 +126,10 @@ class RedisInterface:
         *,
         namespace: str = "",
         timeout: float = 1.0,
+        read_from_replicas: bool = False,
         **options: Any,
     ) -> None:
-        settings = {"namespace": namespace, "timeout": timeout, **options}
+        settings = {"namespace": namespace, "timeout": timeout, "read_from_replicas": read_from_replicas, **options}
         self._direct = _OnThread(host, ships, **settings)
         self._background = _Background(self._direct)
         self._closing = weakref.finalize(self, self._background.close)  # when dropped, or at exit

@@ -38,6 +38,14 @@ class RedisInterface:
         namespace: Goes before every key and channel, so that several robots can share a server.
         timeout: Seconds without a byte moving after which a call is given up; `reem_async.timeout` sets
             another limit for some calls.
+        read_from_replicas: Have replicas answer `read`, `get`, `length` and `type`, to spare primaries; for a
+            cluster or behind sentinels. What it gives up: replicas get updates some time later, usually
+            milliseconds, but without any bound if one lags or has lost its primary. A read may bring what was
+            there before this very program's last write, and, once another server had to be asked (one replica
+            is kept to as long as it answers), even what was there before its last read. What stays: each read
+            is of one instant, document and arrays together, and what a replica does not have is asked of the
+            primary, so that MissingKey is as true as ever. Writes, `edit()`, arithmetic, subscribers, `watch()`
+            and recordings stay with primaries, and `state` tells of them alone. See docs/fleet.md.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ...
 
     Raises:
@@ -53,11 +61,15 @@ class RedisInterface:
         *,
         namespace: str = "",
         timeout: float = 1.0,
+        read_from_replicas: bool = False,
         **options: Any,
     ) -> None:
         ships = options.pop("marshallers", ships)  # what REEM 0.1 called them
-        self._given = (getattr(host, "url", host), ships, {"namespace": namespace, "timeout": timeout, **options})
-        self.session = Session(host, ships, namespace, timeout, options, self._new_transport)
+        settings = {"namespace": namespace, "timeout": timeout, "read_from_replicas": read_from_replicas}
+        self._given = (getattr(host, "url", host), ships, {**settings, **options})
+        self.session = Session(
+            host, ships, namespace, timeout, options, self._new_transport, replicas=read_from_replicas
+        )
         self.session.interface = self
         self.session.transport.at_end = self.session.release
 

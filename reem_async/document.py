@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .errors import BadType, MissingKey, PathRefused
+from .errors import BadData, BadType, MissingKey, PathRefused
 from .plan import Command, Plan
 from .plan.documents import Encoded, Parcel, encode, number_text
 from .plan.paths import Path, counts_from_end, show, suffix
@@ -29,6 +29,7 @@ from .session import Session
 
 if TYPE_CHECKING:
     from .plan.arithmetic import Operation
+    from .transport import Transport
 
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
 
@@ -48,31 +49,40 @@ class DocumentReader:
 
     async def read(self, path: Path) -> Any:
         """Return the value at `path`; raises MissingKey."""
+        at = self.session.readers
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
-        sealed = await self.sealed(path)
-        return await opened(sealed) if sealed.crates else sealed.holder[0]
+            path, at = await self._resolved(path)
+        try:
+            sealed = await self.sealed(path, at)
+            return await opened(sealed) if sealed.crates else sealed.holder[0]
+        except BadData:
+            if at is self.session.transport:
+                raise
+        # From a replica of a node that gives up a slot, arrays may have gone before their document.
+        return await opened(await self.sealed(path))
 
-    async def sealed(self, path: Path) -> Sealed:
-        """Return what the server has at `path`, ships' replies not yet interpreted."""
+    async def sealed(self, path: Path, at: Transport | None = None) -> Sealed:
+        """Return what the server has at `path`, or that `at` which to ask, ships' replies not yet interpreted."""
         if self.session.ships.asynchronous:
             await self.session.ships.ready()
-        sealed: Sealed = await self.session.run(read(self.keys, path, self.session.ships, self.session.memory))
+        sealed: Sealed = await self.session.run(read(self.keys, path, self.session.ships, self.session.memory), at)
         return sealed
 
     async def type_at(self, path: Path) -> type:
         """Return the Python type of the value at `path`."""
+        at = self.session.readers
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
+            path, at = await self._resolved(path)
         await self.session.ships.ready()
-        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships))
+        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships), at)
         return type(await self.read(path)) if kind is None else kind
 
     async def length_at(self, path: Path) -> int:
         """Return the length of the value at `path`."""
+        at = self.session.readers
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
-        count: int | None = await self.session.run(length(self.keys, path))
+            path, at = await self._resolved(path)
+        count: int | None = await self.session.run(length(self.keys, path), at)
         if count is not None:
             return count
         value = await self.read(path)
@@ -81,6 +91,16 @@ class DocumentReader:
         except TypeError:
             where = show((self.name, *path))
             raise BadType(f"{where} is of type {type(value).__name__} and has no length") from None
+
+    async def _resolved(self, path: Path) -> tuple[Path, Transport]:
+        """Return `path` with every index counted from the front, and whom to ask for what is there."""
+        session = self.session
+        try:
+            return await resolved(self, path, MissingKey, session.readers), session.readers
+        except MissingKey:  # a replica need not have all items yet
+            if session.readers is session.transport:
+                raise
+            return await resolved(self, path, MissingKey), session.transport
 
 
 async def opened(sealed: Sealed) -> Any:
@@ -91,7 +111,9 @@ async def opened(sealed: Sealed) -> Any:
     return sealed.holder[0]
 
 
-async def resolved(document: DocumentReader | DocumentWriter, path: Path, error: type[Exception]) -> Path:
+async def resolved(
+    document: DocumentReader | DocumentWriter, path: Path, error: type[Exception], at: Transport | None = None
+) -> Path:
     """Return `path` with every index counted from the front; one round trip for each that was not.
 
     The server takes an index that is too negative for the first item, so it must not see any.
@@ -99,7 +121,7 @@ async def resolved(document: DocumentReader | DocumentWriter, path: Path, error:
     for position, key in enumerate(path):
         if isinstance(key, int) and key < 0:
             try:
-                count = await document.session.run(length(document.keys, path[:position]))
+                count = await document.session.run(length(document.keys, path[:position]), at)
             except MissingKey as missing:
                 raise error(str(missing)) from None
             if count is not None and -key > count:

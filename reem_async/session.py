@@ -40,11 +40,13 @@ class Session:
         timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options.
         new_transport: Makes the transport to one server.
+        replicas: What a user reads comes from replicas.
 
     Attributes:
         ships: Chooses ships.
         memory: What is known of the server.
         transport: The way to the server.
+        readers: The way for what a user reads for its own sake, not to act on it; the same if it is not for replicas.
         interface: The interface this belongs to: what is pickled in its place.
     """
 
@@ -56,13 +58,15 @@ class Session:
         timeout: float,
         options: dict[str, Any],
         new_transport: NewTransport,
+        *,
+        replicas: bool = False,
     ) -> None:
         if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
             raise BadType(f"the namespace {namespace!r} is not a str without braces")
         self.namespace = namespace
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.memory = Memory()
-        self.options, self.transport = way_to(host, timeout, options, new_transport)
+        self.options, self.transport, self.readers = way_to(host, timeout, options, new_transport, replicas=replicas)
         self.interface: Any = None
         self._publisher = secrets.token_hex(6), os.getpid()
         self._sequences: dict[str, int] = {}
@@ -131,10 +135,10 @@ class Session:
         hub, self._hub = self._hub, None
         if hub is not None:
             await hub.close()
-        await self.transport.release()
+        await self.readers.release()
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""
         if self._hub is not None:
             await self._hub.close()
-        await self.transport.close()
+        await self.readers.close()

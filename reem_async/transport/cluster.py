@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Collection, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
@@ -24,7 +24,7 @@ from ..plan import Command, Reply
 from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
-from .options import Options
+from .options import Address, NodeOptions, Options
 from .redirects import Moved, key_slot, keys_in, publishes, refusal, slot_of, slots_of
 from .rooted import Rooted
 from .route import HeldAcross, Route, asked_of, places_refused, watched
@@ -32,8 +32,6 @@ from .route import HeldAcross, Route, asked_of, places_refused, watched
 __all__ = ["ClusterOptions", "ClusterTransport"]
 
 SLOTS = 16384
-
-Address = tuple[str, int]
 
 _EXAMPLE = "redis+cluster://user:password@host:7000,host:7001"
 _LOOK_PAUSE = 0.03
@@ -68,15 +66,7 @@ class ClusterOptions(Options):
 
     def node(self, address: Address) -> Options:
         """Return how to reach one node."""
-        host, port = address
-        return _NodeOptions(host, self.timeout, {**self.settings, "host": host, "port": port, "ssl": self.tls})
-
-
-class _NodeOptions(Options):
-    """How to reach one node."""
-
-    def _warn_of_listeners(self) -> None:
-        """Say nothing: it was said of the cluster."""
+        return NodeOptions(self, address)
 
 
 class ClusterTransport(Rooted):
@@ -95,6 +85,7 @@ class ClusterTransport(Rooted):
         self._nodes: dict[Address, Transport] = {}
         self._owners: list[Transport | None] = [None] * SLOTS
         self._primaries: tuple[Address, ...] = ()
+        self._replicas: dict[Transport, tuple[Address, ...]] = {}
         self._failed: dict[Address, float] = {}
         self._gone: set[Address] = set()
         self._looked = 0.0
@@ -176,10 +167,22 @@ class ClusterTransport(Rooted):
             raise NotConnected(f"no node of the cluster at {self._options.address} has slot {slot} at the moment")
         return found
 
+    async def replicas(
+        self, slot: int | None, *, anew: bool = False, suspects: Collection[Address] = ()
+    ) -> Sequence[Address]:
+        """Return where the replicas are of the node that has `slot`; `anew` to look, rather not through `suspects`.
+
+        Raises:
+            NotConnected: No node answers, or none has it.
+        """
+        if anew:
+            await self.look(suspects)
+        return () if slot is None else self._replicas.get(await self.owner_of(slot), ())
+
     # The layout.
 
-    async def look(self) -> None:
-        """Ask a node who has which slots, unless that was just done.
+    async def look(self, suspects: Collection[Address] = ()) -> None:
+        """Ask a node who has which slots, unless that was just done; the `suspects` only if no other answers.
 
         Raises:
             NotConnected: No node answers.
@@ -192,7 +195,8 @@ class ClusterTransport(Rooted):
                 return
             known = {*self._primaries, *self._nodes, *self._options.seeds}
             reason: Exception | None = None
-            for address in sorted(known, key=lambda each: (self._failed.get(each, 0.0), random.random())):  # noqa: S311
+            order = {each: (each in suspects, self._failed.get(each, 0.0), random.random()) for each in known}  # noqa: S311
+            for address in sorted(known, key=order.__getitem__):
                 try:
                     (reply,) = await self._node(address).roundtrip([("CLUSTER", "SLOTS")])
                 except (NotConnected, ConnectionLost) as error:
@@ -219,12 +223,14 @@ class ClusterTransport(Rooted):
     def _learn(self, ranges: Sequence[Any], asked: str) -> None:
         owners: list[Transport | None] = [None] * SLOTS
         primaries: dict[Address, None] = {}
-        for first, last, (host, port, *_), *_ in ranges:
-            name = host.decode() if isinstance(host, bytes) else (host or "")
-            address = (asked if name in ("", "?") else name, int(port))
+        replicas: dict[Transport, tuple[Address, ...]] = {}
+        for first, last, *rows in ranges:
+            address, *others = [_address(host, port, asked) for host, port, *_ in rows]
             primaries[address] = None
-            owners[first : last + 1] = [self._node(address)] * (last + 1 - first)
-        self._owners, self._primaries = owners, tuple(primaries)
+            owner = self._node(address)
+            owners[first : last + 1] = [owner] * (last + 1 - first)
+            replicas[owner] = tuple(others)
+        self._owners, self._primaries, self._replicas = owners, tuple(primaries), replicas
         if self._gone and not self._gone.intersection(primaries):  # whoever was lost is not needed any more
             self._gone.clear()
             self.states.opened(self._options.address, None)
@@ -324,6 +330,12 @@ class ClusterTransport(Rooted):
         self._gone.discard(address)
         if not self._gone:
             self.states.opened(f"{address[0]}:{address[1]}", server)
+
+
+def _address(host: bytes | str | None, port: Any, asked: str) -> Address:
+    """Return where a node is; one that does not know its own name is on the host that was asked."""
+    name = host.decode() if isinstance(host, bytes) else (host or "")
+    return (asked if name in ("", "?") else name, int(port))
 
 
 class _NodeStates(States):

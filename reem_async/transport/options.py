@@ -11,6 +11,7 @@ import os
 import ssl
 import sys
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import redis
@@ -19,9 +20,13 @@ import redis.exceptions
 from redis.asyncio.connection import parse_url
 
 from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
+from ..plan import Command
 from ..plan.replies import refusal
 
-__all__ = ["Options"]
+__all__ = ["Address", "NodeOptions", "Options", "connecting_by", "question", "question_here"]
+
+Address = tuple[str, int]
+"""Host and port."""
 
 _SCHEMES = ("redis://", "rediss://", "unix://")
 _TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
@@ -170,6 +175,55 @@ class Options:
         text = text.partition("with args beginning")[0]
         secret = self.settings.get("password")
         return "its answer quotes the password" if secret and str(secret) in text else text
+
+
+class NodeOptions(Options):
+    """How to reach one of several servers.
+
+    Args:
+        of: How to reach them all: the time limit and, if nothing else is given,
+        settings: the connection options.
+        address: Where this one is.
+    """
+
+    def __init__(self, of: Options, address: Address, settings: dict[str, Any] | None = None) -> None:
+        host, port = address
+        settings = of.settings if settings is None else settings
+        super().__init__(host, of.timeout, {**settings, "host": host, "port": port, "ssl": of.tls})
+
+    def _warn_of_listeners(self) -> None:
+        """Say nothing: it was said of them all."""
+
+
+def connecting_by(connection: Any, way: Callable[..., Any]) -> Any:
+    """Have a connection of redis-py connect by `way`, which is given the connection and its own way."""
+    connect = connection.connect
+    connection.connect = lambda: way(connection, connect)
+    return connection
+
+
+async def question(connection: Any, commands: Sequence[Command], check: Callable[[Any, Any], None]) -> None:
+    """Send `commands` on a new asyncio connection; `check` looks at the last reply. What is raised closes it."""
+    try:
+        for command in commands:
+            await connection.send_command(*command)
+            reply = await connection.read_response()
+        check(reply, connection)
+    except BaseException:
+        await connection.disconnect(nowait=True)
+        raise
+
+
+def question_here(connection: Any, commands: Sequence[Command], check: Callable[[Any, Any], None]) -> None:
+    """Do as `question`, on a blocking connection."""
+    try:
+        for command in commands:
+            connection.send_command(*command)
+            reply = connection.read_response()
+        check(reply, connection)
+    except BaseException:
+        connection.disconnect()
+        raise
 
 
 _CERTIFICATE = (

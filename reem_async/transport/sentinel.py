@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import threading
 import weakref
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
@@ -24,12 +24,12 @@ import redis.retry
 import redis.sentinel
 from redis.backoff import NoBackoff
 
-from ..errors import BadValue, ConnectionLost, NotConnected
+from ..errors import BadValue, ConnectionLost, NotConnected, Refused
 from ..plan import Command, Reply
 from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
-from .options import Options
+from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .rooted import Rooted
 
 if TYPE_CHECKING:
@@ -40,6 +40,9 @@ __all__ = ["SentinelOptions", "SentinelTransport"]
 
 _LOOK_PAUSE = 1.0
 """Seconds between questions to the sentinels."""
+_ROLE: Command = ("ROLE",)
+_UNFIT = (b"down", b"disconnected")
+"""What the sentinels' flags of a replica hold if it cannot be used: s_down, o_down, disconnected."""
 
 _EXAMPLE = "redis+sentinel://user:password@host:26379,host2:26379/mymaster"
 
@@ -74,7 +77,7 @@ class SentinelOptions(Options):
             f"{'/'.join([*parts[:3], *parts[4:]])}{mark}{query}"
             for parts, (_, mark, query) in zip(heads, urls, strict=True)
         ]
-        self.found: tuple[str, int] | None = None
+        self.found: Address | None = None
         self.changed: Callable[[], None] = _nothing
         self._sentinels = [address_of(one, 26379) for one in plain]
         super().__init__(plain[0], timeout, options)
@@ -93,11 +96,11 @@ class SentinelOptions(Options):
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection that will look for the primary when it connects."""
-        return _follow(super().asynchronous_connection(), self._connect_asynchronously)
+        return connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
 
     def blocking_connection(self) -> Any:
         """Return a fresh connection that will look for the primary when it connects."""
-        return _follow(super().blocking_connection(), self._connect)
+        return connecting_by(super().blocking_connection(), self._connect)
 
     async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
         asked: Any = redis.asyncio.sentinel.Sentinel(  # type: ignore[no-untyped-call]
@@ -111,30 +114,26 @@ class SentinelOptions(Options):
                     await each.aclose()
         self._note((connection.host, connection.port))
         await connect()
-        try:
-            await connection.send_command("ROLE")
-            _check_role(await connection.read_response(), connection)
-        except BaseException:
-            await connection.disconnect(nowait=True)
-            raise
+        await question(connection, [_ROLE], _check_role)
 
     def _connect(self, connection: Any, connect: Callable[[], None]) -> None:
         connection.host, connection.port = self.primary()
         self._note((connection.host, connection.port))
         connect()
-        try:
-            connection.send_command("ROLE")
-            _check_role(connection.read_response(), connection)
-        except BaseException:
-            connection.disconnect()
-            raise
+        question_here(connection, [_ROLE], _check_role)
 
-    def _note(self, address: tuple[str, int]) -> None:
+    def _note(self, address: Address) -> None:
         before, self.found = self.found, address
         if before not in (None, address):
             self.changed()
 
-    def primary(self) -> tuple[str, int]:
+    def sentinels(self) -> list[Options]:
+        """Return how to reach each of the sentinels."""
+        # No timeout of redis-py's own: see Options.asynchronous_connection.
+        settings = {name: value for name, value in self._asking.items() if name != "socket_timeout"}
+        return [NodeOptions(self, address, settings) for address in self._sentinels]
+
+    def primary(self) -> Address:
         """Ask the sentinels where the primary is; raises redis.exceptions.RedisError."""
         asked: Any = redis.sentinel.Sentinel(  # type: ignore[no-untyped-call]
             self._sentinels, sentinel_kwargs={**self._asking, "retry": redis.retry.Retry(NoBackoff(), 0)}
@@ -151,16 +150,15 @@ def _nothing() -> None:
     """Nobody wants to know."""
 
 
-def _follow(connection: Any, way: Callable[..., Any]) -> Any:
-    """Have `connection` connect by `way`."""
-    connect = connection.connect
-    connection.connect = lambda: way(connection, connect)
-    return connection
-
-
 def _check_role(role: Any, connection: Any) -> None:
     if not isinstance(role, list) or role[0] not in (b"master", "master"):
         raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
+
+
+def _is_up(row: dict[bytes, bytes]) -> bool:
+    """Return whether a replica is up, and hears from its primary, as far as the sentinel knows."""
+    flags = row.get(b"flags", b"")
+    return row.get(b"master-link-status") == b"ok" and not any(word in flags for word in _UNFIT)
 
 
 class SentinelTransport(Rooted):
@@ -182,6 +180,7 @@ class SentinelTransport(Rooted):
         self._listening: weakref.WeakSet[Wire] = weakref.WeakSet()
         self._lookout: _Lookout | None = None
         self._moved = False
+        self._replicas: tuple[Address, ...] = ()
 
     @property
     def states(self) -> States:
@@ -257,6 +256,29 @@ class SentinelTransport(Rooted):
     async def nodes(self) -> Sequence[Transport]:
         """Return the way to the primary alone."""
         return (self,)
+
+    async def replicas(
+        self, slot: int | None, *, anew: bool = False, suspects: Collection[Address] = ()
+    ) -> Sequence[Address]:
+        """Return where the replicas are that the sentinels said to be up; `anew` asks them once more."""
+        if anew:
+            self._replicas = await self._asked_for_replicas()
+        return self._replicas
+
+    async def _asked_for_replicas(self) -> tuple[Address, ...]:
+        for options in self._options.sentinels():
+            sentinel = self._new_transport(options)
+            try:
+                (reply,) = await sentinel.roundtrip([("SENTINEL", "REPLICAS", self._options.service)])
+            except (NotConnected, ConnectionLost):
+                continue
+            finally:
+                await sentinel.close()
+            if isinstance(reply, Refused):
+                raise reply.at(options.address)
+            if isinstance(reply, list):  # else it does not know the service, or is no sentinel
+                return tuple([(row[b"ip"].decode(), int(row[b"port"])) for row in reply if _is_up(row)])
+        return ()
 
     async def close(self) -> None:
         """Close all connections."""
