@@ -2,7 +2,8 @@
 
 A key that is found a moment after it was made would have been published to already. So publishers
 tell all nodes what they publish in their first seconds with a key, by a channel of the old kind, for
-which there are patterns; whoever hears of a key this way follows it from then on.
+which there are patterns; whoever hears of a key this way follows it from then on. A `Handover` for each key
+puts in one order what is heard in both ways.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ import asyncio
 import logging
 import re
 import weakref
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from .background import in_background
 from .errors import InterfaceClosed, RedisError
+from .handover import Handover
 from .plan.keys import keys_of
 from .plan.notices import Notice
 from .plan.scan import documents
@@ -23,7 +26,8 @@ from .transport import drive
 from .transport.wire import Wire
 
 if TYPE_CHECKING:
-    from .hub import Hub, Listener, Topic
+    from .audience import Listener, Topic
+    from .hub import Hub
 
 __all__ = ["Discovery"]
 
@@ -31,8 +35,10 @@ logger = logging.getLogger("reem.subscribe")
 
 _PAUSE = 1.0
 """Seconds between looks for new keys."""
+_MOMENT, _MOMENTS = 0.005, 200
 
 _MOST = 10_000
+"""Keys of which is remembered who published what: anybody may tell all nodes of any number of them."""
 
 _TAIL = "}:notices"
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
@@ -57,7 +63,7 @@ class Discovery:
         try:
             name = literal(_glob(listener))
             if name is not None:  # it need not be there yet
-                await self._found(listener, name.encode(), late=False)
+                await self._found(listener, [name.encode()], late=False)
                 return
             births = self._births[listener] = _Births(self, listener)
             await self._hub.follow_here(births)
@@ -78,14 +84,31 @@ class Discovery:
 
     def heard(self, listener: Listener, document: bytes) -> None:
         """Follow a key that was just heard of."""
-        if document not in self._branches.get(listener, {document: None}):
-            in_background(self._follow_quietly(listener, document), "reem discovery of a key")
+        births = self._births.get(listener)
+        if births is None or document in self._branches.get(listener, {document: None}):
+            return
+        births.fresh[document] = None
+        if not births.following:
+            births.following = True
+            in_background(self._follow_fresh(listener, births), "reem discovery of new keys")
 
-    async def _follow_quietly(self, listener: Listener, document: bytes) -> None:
+    async def _follow_fresh(self, listener: Listener, births: _Births) -> None:
+        """Follow what was heard of, and all that is heard of meanwhile at once."""
         try:
-            await self._found(listener, document, late=True)
+            while births.fresh:
+                found, births.fresh = list(births.fresh), {}
+                await self._found(listener, found, late=True)
         except (RedisError, OSError, InterfaceClosed) as error:
-            logger.debug("a new key is not followed yet: %s", error)
+            logger.debug("new keys are not followed yet: %s", error)
+        finally:
+            births.following = False
+
+    async def settled(self) -> None:
+        """Return when nothing that has arrived waits for something older, or after a second."""
+        for _ in range(_MOMENTS):
+            if not any(births.waits for births in list(self._births.values())):
+                return
+            await asyncio.sleep(_MOMENT)
 
     async def close(self) -> None:
         """Stop looking."""
@@ -113,20 +136,28 @@ class Discovery:
             cursor: Any = b"0"
             while True:
                 cursor, page = await drive(node, documents(glob, cursor))
-                for document in page:
-                    await self._found(listener, document, late=late)
+                await self._found(listener, page, late=late)
                 if cursor in (b"0", 0):
                     break
 
-    async def _found(self, listener: Listener, document: bytes, *, late: bool) -> None:
-        branches = self._branches.get(listener)
-        if branches is None or document in branches or b"{" in document:
+    async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
+        """Follow those that are not followed yet."""
+        branches, births = self._branches.get(listener), self._births.get(listener)
+        if branches is None:
             return
-        branch = branches[document] = _Branch(listener, document, self._births.get(listener) if late else None)
+        found = {
+            name: _Branch(listener, name, births) for name in documents if name not in branches and b"{" not in name
+        }
+        branches.update(found)
+        for branch in found.values():
+            if late and births is not None:
+                births.handover(branch.topic.name).late = True
         try:
-            await self._hub.follow(branch)
+            await self._hub.follow_all(list(found.values()))
         except BaseException:
-            branches.pop(document, None)
+            for name, branch in found.items():
+                if not branch.begun:
+                    branches.pop(name, None)
             raise
 
 
@@ -142,22 +173,29 @@ def literal(glob: str) -> str | None:
 
 
 class _Branch:
-    """One key of a pattern: a listener of the hub that hands everything on."""
+    """One key of a pattern: a listener of the hub that hands everything on.
+
+    Attributes:
+        begun: It is followed.
+    """
 
     def __init__(self, listener: Listener, document: bytes, births: _Births | None) -> None:
-        from .hub import Topic
+        from .audience import Topic
 
         self._listener = weakref.ref(listener)
-        self._births = births  # where its first notices came from, if it was found late
+        self._births = births  # where its first notices came from, or None if only this key is meant
+        self.begun = False
         self.topic: Topic = Topic(
             keys_of(document.decode(errors="surrogateescape")).channel.encode(errors="surrogateescape")
         )
         self.note: str | None = None
         self.ready: asyncio.Future[None] | None = None
+        self.patience = listener.patience
         self.mailboxes: list[Mailbox] = []
 
     def start(self, wire: Wire, kind: str) -> None:
         """Begin, and let the listener begin."""
+        self.begun = True
         listener = self._listener()
         if listener is not None:
             listener.start(wire, kind)
@@ -181,15 +219,11 @@ class _Branch:
             listener.doubt()
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Hand it on. Of a key that was found late, the first updates may be lost, unless all nodes were told."""
-        listener = self._listener()
-        if listener is None:
-            return
+        """Hand it on, behind what all nodes were told before."""
         if self._births is not None:
-            births, self._births = self._births, None
-            if notice.sequence > 1 and (notice.publisher, channel) not in births.heard:
-                listener.doubt()
-        listener.on_notice(notice, channel)
+            self._births.handover(channel).told_here(notice)
+        elif (listener := self._listener()) is not None:
+            listener.on_notice(notice, channel)
 
     def on_note(self, note: bytes | None) -> None:
         """Nothing to compare."""
@@ -199,7 +233,8 @@ class _Births:
     """What publishers tell all nodes: a listener of the hub.
 
     Attributes:
-        heard: Who published what first.
+        fresh: The keys that were just heard of, in their order, and
+        following: whether they are about to be followed.
     """
 
     def __init__(self, discovery: Discovery, listener: Listener) -> None:
@@ -208,8 +243,25 @@ class _Births:
         self.topic = listener.topic
         self.note: str | None = None
         self.ready: asyncio.Future[None] | None = None
+        self.patience = listener.patience
         self.mailboxes: list[Mailbox] = []
-        self.heard: set[tuple[str, bytes]] = set()
+        self.fresh: dict[bytes, None] = {}
+        self.following = False
+        self._handovers: dict[bytes, Handover] = {}
+
+    @property
+    def waits(self) -> bool:
+        """Whether something has come and is not handed on yet."""
+        return any(each.waits for each in self._handovers.values())
+
+    def handover(self, channel: bytes) -> Handover:
+        """Return what puts in order what is heard of a key."""
+        found = self._handovers.get(channel)
+        if found is None:
+            if len(self._handovers) >= _MOST:  # of a key that is forgotten, all is taken as it comes
+                del self._handovers[next(iter(self._handovers))]
+            found = self._handovers[channel] = Handover(self._listener, channel)
+        return found
 
     def start(self, wire: Wire, kind: str) -> None:
         """Begin."""
@@ -233,10 +285,7 @@ class _Births:
         """Hand it on, and see to it that the key is followed."""
         if (listener := self._listener()) is None:
             return
-        if len(self.heard) >= _MOST:
-            self.heard.clear()
-        self.heard.add((notice.publisher, channel))
-        listener.on_notice(notice, channel)
+        self.handover(channel).told_to_all(notice)
         self._discovery.heard(listener, channel.removeprefix(b"{").removesuffix(_TAIL.encode()))
 
     def on_note(self, note: bytes | None) -> None:

@@ -85,6 +85,7 @@ class Follower:
         tree: The local copy, never changed in place.
         mailboxes: Where each update goes.
         ready: Done when the first snapshot is there.
+        patience: Seconds that updates may wait for each other: none.
     """
 
     def __init__(self, keys: Keys, path: Path, ships: Ships, memory: Memory, transport: Transport) -> None:
@@ -96,6 +97,7 @@ class Follower:
         self.tree: Any = MISSING
         self.mailboxes: list[Mailbox] = []
         self.ready: asyncio.Future[None] | None = None
+        self.patience = 0.0
         self._ships = ships
         self._memory = memory
         self._transport = transport

@@ -8,20 +8,20 @@ node, with a gap.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import random
 import time
-import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
+from .audience import NOBODY, Audience, Listener, Topic, is_message
 from .background import in_background
 from .errors import BadData, ClusterNode, InterfaceClosed, NotConnected, RedisError
 from .plan import Reply, blamed
-from .plan.notices import Notice, decode
-from .policy import Mailbox
+from .plan.notices import decode
 from .ships.registry import Ships
 from .transport import Transport
 from .transport.redirects import is_moved, is_unapplied
@@ -42,74 +42,6 @@ _HEARTBEAT = 1.0
 """Seconds between looks at a subscribed connection; one that is dead shows a call's time limit later."""
 
 
-class Topic(NamedTuple):
-    """What to subscribe to.
-
-    Attributes:
-        name: A channel, or
-        pattern: if this is set, a glob pattern of channels.
-    """
-
-    name: bytes
-    pattern: bool = False
-
-
-class Listener(Protocol):
-    """Who is told of updates.
-
-    Attributes:
-        topic: What it subscribes to.
-        note: The key where the server keeps a note of the last update, None if there are many.
-        ready: Done when it has begun to follow.
-        mailboxes: Where each update goes.
-    """
-
-    topic: Topic
-    note: str | None
-    ready: asyncio.Future[None] | None
-    mailboxes: list[Mailbox]
-
-    def start(self, wire: Wire, kind: str) -> None:
-        """Begin over `wire`, which is subscribed; `kind` is "initial", or "gap" after a broken connection."""
-
-    def lost(self, reason: Exception) -> None:
-        """Note that the connection is gone."""
-
-    def doubt(self) -> None:
-        """Note that something was published that could not be read."""
-
-    def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Take one update."""
-
-    def on_note(self, note: bytes | None) -> None:
-        """Compare with the server's note of the last update; all before it has been handed over."""
-
-
-class _Audience:
-    """Who listens to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
-
-    __slots__ = ("_references",)
-
-    def __init__(self) -> None:
-        self._references: list[weakref.ref[Listener]] = []
-
-    def add(self, listener: Listener) -> None:
-        if listener not in self.present():
-            self._references.append(weakref.ref(listener, self._references.remove))
-
-    def discard(self, listener: Listener) -> None:
-        for reference in tuple(self._references):
-            if reference() is listener:
-                self._references.remove(reference)
-
-    def present(self) -> list[Listener]:
-        # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
-        return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
-
-
-_NOBODY = _Audience()
-
-
 class Hub:
     """The subscription connections of an interface in one event loop, and who listens, by topic.
 
@@ -121,13 +53,14 @@ class Hub:
         self.transport = transport
         self._ships = ships
         self._wires: dict[Transport, Wire] = {}
-        self._topics: dict[Topic, _Audience] = {}
+        self._topics: dict[Topic, Audience] = {}
         self._subscribed: dict[Topic, Wire] = {}
         self._unsure: set[Topic] = set()  # their keys are on their way to another node
         self._lock = asyncio.Lock()
         self._reconnecting: asyncio.Task[Any] | None = None
         self._beating: dict[Wire, asyncio.Task[Any]] = {}
         self._discovery: Discovery | None = None
+        self._pace = 0.0
         self._closed = False
         self._warned = False
         self.place = os.getpid(), asyncio.get_running_loop()
@@ -140,6 +73,26 @@ class Hub:
             await self._discover().follow(listener)
         else:
             await self.follow_here(listener)
+
+    async def follow_all(self, listeners: Sequence[Listener]) -> None:
+        """Follow many channels: one round trip for each node, and more only where a slot has moved."""
+        self.transport.check()
+        await self._ships.ready()
+        with contextlib.suppress(RedisError):  # what could not be subscribed now is tried one by one
+            async with self._lock:
+                await self._subscribe_all(listeners)
+        for listener in listeners:
+            await self.follow_here(listener)
+
+    async def _subscribe_all(self, listeners: Sequence[Listener]) -> None:
+        nodes: dict[Transport, list[Listener]] = {}
+        for listener in listeners:
+            if listener.topic not in self._subscribed:
+                nodes.setdefault(await self.transport.owner(listener.topic.name), []).append(listener)
+        for node, there in nodes.items():
+            for listener in there:
+                self._topics.setdefault(listener.topic, Audience()).add(listener)
+            await self._subscribe_at(node, [listener.topic for listener in there], there)
 
     async def follow_here(self, listener: Listener) -> None:
         """Follow what the servers themselves know as a topic."""
@@ -164,13 +117,16 @@ class Hub:
             async with self._lock:
                 if ready.done():
                     ready.result()
+                self._pace = min(self._pace, listener.patience) if self._topics else listener.patience
+                for each in self._wires.values():
+                    each.pace = self._pace
                 # Entered before the server confirms: a notice right behind the confirmation must find somebody.
-                self._topics.setdefault(listener.topic, _Audience()).add(listener)
+                self._topics.setdefault(listener.topic, Audience()).add(listener)
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
                     node = await self.transport.owner(listener.topic.name, anew=anew)
                     others = [topic for topic in self._missing() if await self.transport.owner(topic.name) is node]
-                    wire = await self._subscribe_at(node, others, listener)
+                    wire = await self._subscribe_at(node, others, [listener])
                 listener.start(wire, "initial")
             await ready
         except BaseException as error:
@@ -198,7 +154,11 @@ class Hub:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
         wire = self._wires.get(node)
         if wire is None or not wire.alive:
-            wire = self._wires[node] = await cast("AsyncTransport", node).listen(self._on_push, self._on_lost)
+            wire = await cast("AsyncTransport", node).listen(self._on_push, self._on_lost)
+            if self._closed:  # meanwhile: nobody else would close it
+                await wire.close()
+                raise InterfaceClosed("this RedisInterface was closed during the call")
+            self._wires[node], wire.pace = wire, self._pace
             self._beating[wire] = in_background(self._beat(wire), "reem heartbeat")
         return wire
 
@@ -235,7 +195,17 @@ class Hub:
 
     def _listeners(self, topics: Iterable[Topic] | None = None) -> list[Listener]:
         wanted = list(self._topics if topics is None else topics)
-        return [listener for topic in wanted for listener in self._topics.get(topic, _NOBODY).present()]
+        return [listener for topic in wanted for listener in self._topics.get(topic, NOBODY).present()]
+
+    async def fence(self) -> None:
+        """Return when all that was published before now to what is followed has been told; one round trip.
+
+        Raises:
+            ConnectionLost: A connection broke meanwhile.
+        """
+        await asyncio.gather(*[wire.roundtrip([("PING",)]) for wire in self._wires.values() if wire.alive])
+        if self._discovery is not None:
+            await self._discovery.settled()
 
     async def unfollow(self, listener: Listener) -> None:
         """Stop following. Idempotent."""
@@ -251,13 +221,13 @@ class Hub:
 
     def _drop(self, listener: Listener) -> None:
         listener.lost(InterfaceClosed("this subscription was closed before it began"))
-        audience = self._topics.get(listener.topic, _NOBODY)
+        audience = self._topics.get(listener.topic, NOBODY)
         if listener in audience.present():
             audience.discard(listener)
             self._forget_if_empty(listener.topic)
 
     def _forget_if_empty(self, topic: Topic) -> None:
-        if self._topics.get(topic, _NOBODY).present():
+        if self._topics.get(topic, NOBODY).present():
             return
         self._topics.pop(topic, None)
         self._unsure.discard(topic)
@@ -270,7 +240,7 @@ class Hub:
             wire.send([(f"{self._prefix(topic)}UNSUBSCRIBE", topic.name)], lambda _: None)
 
     def _on_push(self, message: list[Any]) -> None:
-        if not _is_message(message):
+        if not is_message(message):
             self._warn_unreadable(b"?", BadData(f"the server pushed {message!r:.60}"))
             return
         topic: Any = (message[1], message[0] == b"pmessage")  # equal to a Topic, and cheaper to make
@@ -278,7 +248,7 @@ class Hub:
             self._moved([Topic(*topic)], "its slot has moved to another node")
             return
         channel, payload = message[-2:]
-        listeners = self._topics.get(topic, _NOBODY).present()
+        listeners = self._topics.get(topic, NOBODY).present()
         if not listeners:  # all were dropped without closing
             self._forget_if_empty(Topic(*topic))
             return
@@ -405,16 +375,16 @@ class Hub:
         if failure is not None:
             raise failure
 
-    async def _subscribe_at(self, node: Transport, topics: list[Topic], beginner: Listener | None = None) -> Wire:
-        """Subscribe topics at `node` and have who listens begin anew, but for a beginner."""
-        wire = await self._connected(node)
+    async def _subscribe_at(self, node: Transport, topics: list[Topic], beginners: Sequence[Listener] = ()) -> Wire:
+        """Subscribe topics at `node` and have who listens begin anew, but for beginners."""
+        wire, first = await self._connected(node), {id(each) for each in beginners}
         try:
             await self._subscribe(wire, topics)
         finally:
             for topic in topics:
                 if self._subscribed.get(topic) is wire and wire.alive:
                     for listener in self._listeners([topic]):
-                        if listener is not beginner:
+                        if id(listener) not in first:
                             listener.start(wire, "gap")
         return wire
 
@@ -430,12 +400,3 @@ class Hub:
             await self.unfollow(listener)
         for wire in list(self._wires.values()):
             await wire.close()
-
-
-_LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
-
-
-def _is_message(message: list[Any]) -> bool:
-    """Return whether what was pushed is what a hub is told: its kind, the pattern if any, channel, and payload."""
-    length = _LENGTHS.get(message[0]) if message and type(message[0]) is bytes else None
-    return len(message) == length and all(type(part) is bytes for part in message[1:-1])

@@ -77,6 +77,9 @@ class Monitor(Stream[Event]):
         policy: What to keep for a loop that is slower than the updates; `Every(10_000)` if not given.
         namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
             `event.namespace` says which it was: the shortest that fits.
+        patience: Seconds that updates may wait here for each other, unless somebody else who follows something
+            through this interface is in a hurry. Whoever only notes what happens costs the publishers less so:
+            he is woken less often.
 
     In a cluster, whose servers have no patterns for what only one node is told, the keys are looked for, and
     publishers tell all nodes for the first seconds of a key.
@@ -93,12 +96,14 @@ class Monitor(Stream[Event]):
         policy: Policy | None = None,
         *,
         namespaces: str | None = None,
+        patience: float = 0.0,
     ) -> None:
         super().__init__(policy or Every(10_000))
         self._session = interface.session
         if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
             raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
         self._namespaces = None if namespaces is None else Pattern(namespaces)
+        self.patience = patience
         self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
         self._ears: list[_Ear] = []
         self._hub: Hub | None = None
@@ -199,6 +204,7 @@ class _Ear:
         self.note: str | None = None
         self.ready: asyncio.Future[None] | None = None
         self.mailboxes: list[Mailbox] = [monitor.mailbox]
+        self.patience = monitor.patience
 
     def start(self, wire: Wire, kind: str) -> None:
         """Begin: there is nothing to fetch."""

@@ -82,7 +82,6 @@ def server_url(request):
 ONE_SERVER = {
     "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",
     "test_all_subscribers_of_an_interface_share_one_connection": "counts connections: in a cluster, one for each node",
-    "test_monitor_brings_every_update_with_its_size_and_fetches_nothing": "counts commands: new keys are subscribed to",
 }
 """Tests of what only one server has, and why."""
 
@@ -397,14 +396,30 @@ def commands_run(raw):
     return counts
 
 
+LOOKING = {"scan", "ssubscribe", "cluster|slots"}
+"""What a monitor sends in a cluster to find keys and follow them. One server has patterns for that."""
+
+
+def _sent_since(raw, before):
+    return {name: count - before.get(name, 0) for name, count in commands_run(raw).items() if count != before.get(name)}
+
+
 @contextlib.contextmanager
 def nothing_sent(raw):
     """Fails if the server saw any command inside the block."""
     before = commands_run(raw)
     yield
-    after = commands_run(raw)
-    sent = {name: count - before.get(name, 0) for name, count in after.items() if count != before.get(name, 0)}
+    sent = _sent_since(raw, before)
     assert not sent, f"the server was sent {sent}"
+
+
+@contextlib.contextmanager
+def nothing_fetched(raw):
+    """As `nothing_sent`, but in a cluster keys may be looked for and followed."""
+    before = commands_run(raw)
+    yield
+    sent = _sent_since(raw, before)
+    assert not sent.keys() - (LOOKING if isinstance(raw, RawCluster) else set()), f"the server was sent {sent}"
 
 
 def keys_of(raw, top_key):
@@ -443,6 +458,11 @@ def subscribed(raw):
     """The ids of the connections that are subscribed to anything."""
     rows = raw.client_list()
     return {row["id"] for row in rows if any(int(row.get(kind, 0)) for kind in ("sub", "psub", "ssub"))}
+
+
+def subscriptions(raw):
+    """How many channels and patterns all connections together are subscribed to."""
+    return sum(int(row.get(kind, 0)) for row in raw.client_list() for kind in ("sub", "psub", "ssub"))
 
 
 # --- waiting and other processes -------------------------------------------------

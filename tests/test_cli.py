@@ -191,7 +191,7 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
     assert "reem up" in said
     assert "--url redis://host:port or REEM_URL" in said
     assert "hidden" not in said
-    said = cli.error(1, "ls", "--url", cli.url.replace("redis://", "redis://nobody:hidden-4711@"))
+    said = cli.error(1, "ls", "--url", cli.url.replace("//", "//nobody:hidden-4711@"))
     assert "does not take this user name and password" in said
     assert "hidden" not in said
 

@@ -11,8 +11,7 @@ import time
 
 import numpy as np
 import pytest
-import redis
-from conftest import eventually
+from conftest import RawCluster, eventually, subscribed, subscriptions
 from test_cli import CommandLine
 
 import reem as blocking
@@ -22,7 +21,7 @@ from reem_async.cli.windows import BANDWIDTH, DELAY, RATE, Window, spread
 from reem_async.connection import RedisInterface
 from reem_async.monitor import Event
 from reem_async.plan.keys import keys_of
-from reem_async.plan.notices import announce
+from reem_async.plan.notices import announce, published
 
 
 @pytest.fixture
@@ -38,28 +37,31 @@ def space(cli):
 
 @pytest.fixture
 def listening(cli, raw):
-    """Starts a live command and waits until it is subscribed."""
+    """Starts a live command and waits until it is subscribed to so many patterns, or keys of a cluster."""
 
     @contextlib.contextmanager
-    def start(*arguments):
-        before = raw.execute_command("PUBSUB", "NUMPAT")
+    def start(*arguments, topics=1):
+        before = subscriptions(raw)
         with cli.running(*arguments) as process:
-            eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") > before)
+            eventually(lambda: subscriptions(raw) >= before + topics)
             yield process
 
     return start
 
 
 @pytest.fixture
-def announced(cli):
-    """Publishes notices with numbers, times and sizes of the test's choice."""
-    with redis.Redis.from_url(cli.url) as client:
+def announced(cli, raw):
+    """Publishes notices with numbers, times and sizes of the test's choice, as a new publisher does."""
+    sharded = isinstance(raw, RawCluster)
+    database = 0 if sharded else raw.connection_pool.connection_kwargs.get("db", 0)
 
-        def publish(name, sequence, *, age=0.0, size=0, path=()):
-            channel = keys_of(name, cli.namespace, client.connection_pool.connection_kwargs.get("db", 0)).channel
-            client.publish(channel, announce("a-test", sequence, time.time() - age, path, size=size))
+    def publish(name, sequence, *, age=0.0, size=0, path=()):
+        keys = keys_of(name, cli.namespace, database, sharded)
+        notice = announce("a-test", sequence, time.time() - age, path, size=size)
+        for command in published(keys, "a-test", sequence, notice, everywhere=sharded):
+            raw.execute_command(*command)
 
-        yield publish
+    return publish
 
 
 def ended(process, number=signal.SIGINT):
@@ -74,7 +76,7 @@ def ended(process, number=signal.SIGINT):
 
 
 def test_echo_for_people(space, listening, announced):
-    with listening("echo", "foo", "bar.*.x") as process:
+    with listening("echo", "foo", "bar.*.x", topics=2) as process:
 
         def line():
             moment, path, what = process.stdout.readline().rstrip("\n").split("  ")
@@ -138,12 +140,11 @@ def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
     with listening("echo", "foo") as process:
         space["foo"] = 1
         assert process.stdout.readline().endswith("foo  1\n")
-        patterns = raw.execute_command("PUBSUB", "NUMPAT")
-        for row in raw.client_list():
-            if int(row.get("psub", 0)):
-                raw.client_kill_filter(_id=row["id"])
+        before = subscriptions(raw)
+        for connection in subscribed(raw):
+            raw.client_kill_filter(_id=connection)
         assert "made again" in process.stderr.readline()
-        eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") == patterns)
+        eventually(lambda: subscriptions(raw) == before)
         space["foo"] = 2
         assert process.stdout.readline() == "# a gap: the connection broke, or an update was unreadable\n"
         assert process.stdout.readline().endswith("foo  2\n")
@@ -257,10 +258,10 @@ def test_hz_reports_as_it_goes_and_at_the_end(listening, announced):
 @pytest.mark.parametrize("columns", [100, 50])
 def test_the_live_table_in_a_terminal(cli, columns, announced, raw):
     """A row for a path appears, Ctrl-C ends it, and the table stays on the screen."""
-    before, stop = raw.execute_command("PUBSUB", "NUMPAT"), threading.Event()
+    before, stop = subscriptions(raw), threading.Event()
 
     def publish():
-        eventually(lambda: raw.execute_command("PUBSUB", "NUMPAT") > before)
+        eventually(lambda: subscriptions(raw) > before)
         sequence = 0
         while not stop.wait(0.02):
             sequence += 1

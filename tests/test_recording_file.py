@@ -11,6 +11,7 @@ import sys
 import time
 
 import mcap.reader
+import mcap.writer
 import numpy as np
 import orjson
 import pytest
@@ -23,6 +24,9 @@ import reem.recording
 import reem_async
 from reem_async.errors import BadData, MissingKey
 from reem_async.recording import DamagedRecording, Recorder, RecordingFailed, open_log
+from reem_async.recording.output import Output
+from reem_async.recording.times import Arrivals
+from reem_async.recording.writer import Writer
 
 
 @pytest.fixture
@@ -59,6 +63,54 @@ def file_and_values(recorded):
 def names(recorded):
     """Makes the names in that file."""
     return lambda name: recorded[2] + name
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_what_is_written_is_what_the_library_reads(compression, tmp_path):
+    """Messages of any size, in chunks; with the index and without it, every checksum compared."""
+    file, rng = tmp_path / "written.mcap", random.Random(1)
+    sizes = [0, 1, 100, (1 << 16) - 1, 1 << 16, (1 << 16) + 1, 3 << 20, *(rng.randrange(3000) for _ in range(500))]
+    output = Output(file, overwrite=False)
+    writer = Writer(output, compression, "test")
+    schema = writer.register_schema("a schema", "jsonschema", b"{}")
+    channels = [writer.register_channel(f"/topic{n}", "json", schema, {"key": "ä"}) for n in range(3)]
+    sent = []
+    for number, size in enumerate(sizes):
+        data = rng.randbytes(size // 2) + bytes(size - size // 2)
+        sent.append((channels[number % 3], 1000 + number, data, number))
+        writer.add_message(channels[number % 3], 1000 + number, data, 7, number)
+        if number % 50 == 0:
+            writer.add_metadata(f"m{number}", {"a": "b"})
+            writer.flush()
+    whole_before_the_end = file.stat().st_size
+    writer.finish()
+    output.close()
+    with file.open("rb") as stream:
+        reader = mcap.reader.make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        found = [(m.channel_id, m.log_time, m.data, m.sequence) for _, _, m in reader.iter_messages()]
+        assert found == sent
+        assert {m.name: m.metadata for m in reader.iter_metadata()}["m0"] == {"a": "b"}
+    assert [channel.metadata for channel in summary.channels.values()] == [{"key": "ä"}] * 3
+    assert summary.statistics.message_count == len(sizes)
+    assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (1000, 999 + len(sizes))
+    assert sum(index.uncompressed_size for index in summary.chunk_indexes) > sum(sizes)
+    with file.open("rb") as stream:
+        plain = mcap.reader.NonSeekingReader(stream, validate_crcs=True)
+        assert [m.data for _, _, m in plain.iter_messages(log_time_order=False)] == [each[2] for each in sent]
+    assert compression == "none" or file.stat().st_size < sum(sizes) * 0.7 < whole_before_the_end * 2
+
+
+def test_arrivals_do_not_tell_that_updates_were_taken_together():
+    """Three arrive 1 ms apart and are taken at once; whatever the clocks, nothing is off by more than the patience."""
+    for offset in (0.0, 5.0, -5.0):
+        arrivals = Arrivals(0.004)
+        assert arrivals.of("p", 100.0 + offset, 100.0003) == pytest.approx(100.0003, abs=0.0004)
+        told = [arrivals.of("p", 101.0 + offset + n / 1000, 101.0025) for n in range(3)]
+        assert told == pytest.approx([101.0, 101.001, 101.002], abs=0.0005)
+        set_back = arrivals.of("p", 90.0, 102.0)
+        assert 101.996 <= set_back <= 102.0
+        assert arrivals.of("q", 200.0, 103.0) == 103.0
 
 
 def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values):

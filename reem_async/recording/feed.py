@@ -24,7 +24,7 @@ from ..session import Session
 from .fetch import fetch
 from .scribe import Operation, Scribe
 from .state import pruned
-from .times import AFTER, Clock
+from .times import AFTER, Arrivals, Clock
 
 __all__ = ["Collector", "Feed", "Item"]
 
@@ -66,6 +66,7 @@ class Collector(Protocol):
     session: Session
     scribe: Scribe
     clock: Clock
+    arrivals: Arrivals
     patterns: list[Pattern]
     fetching: asyncio.Semaphore
 
@@ -105,7 +106,8 @@ class Feed:
 
     def on_event(self, event: Event) -> None:
         """Take one update."""
-        stamp = self._collector.clock.stamp(event.received), round(event.time * 1e6) * 1000, event.sequence
+        arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
+        stamp = self._collector.clock.stamp(arrived), round(event.time * 1e6) * 1000, event.sequence
         self._heard[event.publisher] = event.sequence
         if len(self._heard) > 1000:
             del self._heard[next(iter(self._heard))]

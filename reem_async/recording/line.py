@@ -11,7 +11,10 @@ from ..policy import Mailbox
 from ..session import Session
 from ..transport.wire import Wire
 
-__all__ = ["Line"]
+__all__ = ["PATIENCE", "Line"]
+
+PATIENCE = 0.002
+"""Seconds that updates may wait to be recorded, several at once. The publisher's time in them is not touched."""
 
 
 class Told(Protocol):
@@ -42,6 +45,7 @@ class Line:
         self.note: str | None = None
         self.ready: asyncio.Future[None] | None = None
         self.mailboxes: list[Mailbox] = []
+        self.patience = PATIENCE
         self.wire: Wire | None = None
 
     def start(self, wire: Wire, kind: str) -> None:

@@ -26,11 +26,11 @@ from ..plan.patterns import Pattern, parse_pattern
 from ..policy import EMPTY, Ended, Last
 from .errors import RecordingFailed
 from .feed import Feed
-from .line import Line
+from .line import PATIENCE, Line
 from .sample import Sampler, samples_of
 from .scribe import Operation, Scribe
 from .sink import Sink
-from .times import Clock
+from .times import Arrivals, Clock
 
 __all__ = ["Recorder", "RecorderStatus"]
 
@@ -118,6 +118,7 @@ class Recorder:
         self.patterns: list[Pattern] = [parse_pattern(text) for text in patterns]
         self.session = interface.session
         self.clock = Clock()
+        self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes nobody at the very moment
         self.fetching = asyncio.Semaphore(_FETCHES)
         self._interface = interface
         self._samples = samples_of(sample)
@@ -130,7 +131,7 @@ class Recorder:
         self._feeds: dict[str, Feed] = {}
         tops = list(dict.fromkeys(pattern.top for pattern in self.patterns))
         self._tops = tops
-        self._monitor = Monitor(interface, tops, Last(_MAILBOX)) if tops else None
+        self._monitor = Monitor(interface, tops, Last(_MAILBOX), patience=PATIENCE) if tops else None
         self._line = Line(self) if tops else None
         self._sampler = Sampler(self.session, self._samples, self._sampled)
         self._tasks: list[asyncio.Task[None]] = []
@@ -196,14 +197,17 @@ class Recorder:
         self._tasks.append(asyncio.create_task(watched()))
 
     async def stop(self) -> None:
-        """End the recording: fetch what was announced, write the index, close the file. Idempotent.
+        """End the recording: take what was published until now, write the index, close the file. Idempotent.
 
         Raises:
             RecordingFailed: Writing ended before, for want of space or another reason.
         """
         if self._begun and not self._ended:
+            with contextlib.suppress(RedisError, OSError):  # no connection: what has arrived is all there is
+                await self.fence()
             self._pump()
             await self._settled(_PATIENCE)
+            await self._complete(time.monotonic() + _PATIENCE)
             self._keyframe_of_all()
         await self._end()
         self._check()
@@ -320,6 +324,15 @@ class Recorder:
         deadline = time.monotonic() + patience
         while (busy := [feed.busy for feed in self._feeds.values() if feed.busy]) and time.monotonic() < deadline:
             await asyncio.wait(busy, timeout=deadline - time.monotonic())
+
+    async def _complete(self, deadline: float) -> None:
+        """Read anew what was dropped at the last moment: the file is to end with what is there."""
+        while self.scribe.behind and self._line is not None and self._line.wire is not None:
+            if self.scribe.failure is not None or time.monotonic() > deadline:
+                return
+            self._catch_up()
+            await self._settled(deadline - time.monotonic())
+            await asyncio.sleep(_TICK / 10)
 
     # What is done from time to time.
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import hashlib
 import os
 import threading
 from collections.abc import Mapping
@@ -15,10 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..courtesy import give_way
 from ..plan.paths import Path, show
 from ..plan.trees import MISSING, CannotApply, get, removed, replaced
 from ..ships.numpy import NumpyShip
 from ..ships.registry import Ships
+from .gentle import digest
 from .layout import WRAPPER, Document, to_json
 from .messages import encode
 from .sink import FullError, Sink
@@ -185,6 +186,7 @@ class Scribe:
                 operation, size = self._queue.popleft()
             self._write(operation)
             del operation
+            give_way()
             self._sink.tick()
             with self._changed:
                 self._size -= size
@@ -231,7 +233,6 @@ class Scribe:
     def _write_state(self, it: Operation) -> None:
         name = str(it.path[0])
         before = self._trees.get(name, MISSING)
-        self.behind.discard(name)
         if it.value is MISSING:
             if before is not MISSING:
                 self._write_delete(it._replace(role="delete", kind="pub"))
@@ -295,7 +296,5 @@ def _described(label: str, path: Path, at: int, data: Any) -> Stored:
     if isinstance(data, np.ndarray):
         size, summary = _NUMPY.describe(data)
         head, body = _NUMPY.pack(data)
-        digest = hashlib.blake2b(body, digest_size=16, salt=hashlib.blake2b(head, digest_size=16).digest()).digest()
-        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, digest)
-    digest = hashlib.blake2b(data, digest_size=16).digest()
-    return Stored(label, path, at, len(data), label, digest=digest)
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, digest(head, body))
+    return Stored(label, path, at, len(data), label, digest=digest(b"", data))

@@ -14,8 +14,6 @@ One channel per path, role and shape of message. A channel's metadata says what 
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 import zlib
 from collections.abc import Mapping
@@ -23,23 +21,22 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import orjson
-from mcap.writer import CompressionType, Writer
 
 from ..errors import BadValue
 from ..plan.paths import Path, show
 from .errors import RecordingFailed
 from .layout import Document, topic_of
 from .messages import Encoded, schema_bytes
+from .output import Output
 from .schema import OPEN, Signature, fits, schema_text, signature
+from .writer import COMPRESSIONS, Writer
 
-__all__ = ["COMPRESSIONS", "FLUSH_SECONDS", "FORMAT", "FullError", "Output", "Sink"]
+__all__ = ["FLUSH_SECONDS", "FORMAT", "FullError", "Sink"]
 
 FORMAT = "1"
 FLUSH_SECONDS = 0.5
 """Seconds after which a chunk is closed and given to the operating system, however small it is."""
 
-COMPRESSIONS = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-_CHUNK = 1 << 20
 _MOST_CHANNELS = 60_000
 """MCAP numbers them with 16 bits."""
 _MOST_SCHEMAS = 8
@@ -55,57 +52,6 @@ _SHARED_TOPICS = {"state": KEYFRAMES, "keyframe": KEYFRAMES, "delete": OPERATION
 
 class FullError(Exception):
     """There are as many channels as MCAP can have."""
-
-
-class Output:
-    """A file that is either extended by a whole piece or left as it was.
-
-    What is written has been handed to the operating system: it survives the end of the program, however
-    it ends, but not a power cut in the next half minute.
-    """
-
-    def __init__(self, path: FilePath, *, overwrite: bool) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
-        try:
-            self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
-        except FileExistsError:
-            raise BadValue(f"{path} is there already; choose another name, or say --force (overwrite=True)") from None
-        except OSError as error:
-            raise BadValue(f"{path} cannot be written: {error.strerror}") from None
-        self._pieces: list[bytes] = []
-        self._written = 0
-        self._waiting = 0
-
-    def write(self, data: bytes) -> int:
-        """Take a piece; it is written by `flush`."""
-        self._pieces.append(data)
-        self._waiting += len(data)
-        if self._waiting >= _CHUNK:
-            self.flush()
-        return len(data)
-
-    def tell(self) -> int:
-        """Return where the next piece will be."""
-        return self._written + self._waiting
-
-    def flush(self) -> None:
-        """Write all pieces; if that fails, the file ends where it did before, and OSError is raised."""
-        data, self._pieces, self._waiting = memoryview(b"".join(self._pieces)), [], 0
-        done = 0
-        try:
-            while done < len(data):
-                done += os.write(self._file, data[done:])
-        except OSError:
-            with contextlib.suppress(OSError):  # a device has no length
-                os.ftruncate(self._file, self._written)
-            raise
-        self._written += done
-
-    def close(self) -> None:
-        """Close the file. Idempotent."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
 
 
 class Sink:
@@ -126,9 +72,7 @@ class Sink:
         if compression not in COMPRESSIONS:
             raise BadValue(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
         self.output = Output(path, overwrite=overwrite)
-        stream: Any = self.output
-        self._writer: Any = Writer(stream, _CHUNK, COMPRESSIONS[compression])
-        self._writer.start(profile="", library=f"reem/{metadata.get('version', '')}")
+        self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
         self._writer.add_metadata("reem", dict(metadata))
         try:
             self.output.flush()
@@ -205,13 +149,13 @@ class Sink:
 
     def _register(self, topic: str, encoding: str, schema: tuple[int, str], metadata: dict[str, str]) -> int:
         metadata["reem.version"] = FORMAT
-        number: int = self._writer.register_channel(topic, encoding, schema[0], metadata)
+        number = self._writer.register_channel(topic, encoding, schema[0], metadata)
         self._new.append([number, topic, encoding, schema[1], metadata])
         return number
 
     def _message(self, channel: int, data: bytes, stamp: tuple[int, int, int]) -> int:
         log_time, publish_time, number = stamp
-        self._writer.add_message(channel, log_time, data, max(publish_time, 0), number & 0xFFFFFFFF)
+        self._writer.add_message(channel, log_time, data, max(publish_time, 0), number)
         self._open += 1
         return len(data)
 

@@ -11,13 +11,17 @@ import numpy as np
 from ..errors import BadType, BadValue
 from ..plan.paths import shorten
 
-__all__ = ["AFTER", "STEP", "Clock", "Instant", "nanoseconds", "seconds"]
+__all__ = ["AFTER", "STEP", "Arrivals", "Clock", "Instant", "nanoseconds", "seconds"]
 
 Instant = float | np.datetime64
 """A point in time: seconds since 1970, or a numpy datetime64."""
 
 STEP = 2000
 """Nanoseconds between two log times at least: whole microseconds, which seconds as float tell apart until 2100."""
+
+_MOST_PUBLISHERS = 10_000
+_FORGET = 1e-4
+"""How much of a longer way each update makes the least one longer: clocks drift."""
 
 AFTER = 1000
 """Nanoseconds after an update at which a state that includes it is put."""
@@ -57,3 +61,29 @@ class Clock:
         now = time.monotonic_ns() + self._offset - int(ago * 1e9)
         self._last = max(now // STEP * STEP, self._last + STEP)
         return self._last
+
+
+class Arrivals:
+    """Tells when updates arrived that were taken a little later, several at once.
+
+    The least time from a publisher's stamp to receiving is that of an update that did not wait; by as much as
+    another took longer, it has waited. Clocks that differ do no harm: what is told is never over `patience`
+    before the update was taken, and never after.
+
+    Args:
+        patience: Seconds that updates may have waited.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self._patience = patience
+        self._least: dict[str, float] = {}
+
+    def of(self, publisher: str, published: float, received: float) -> float:
+        """Return when an update arrived that was `received` now; all in seconds since 1970."""
+        took = received - published
+        if publisher not in self._least and len(self._least) >= _MOST_PUBLISHERS:
+            self._least.clear()
+        # A first update that took hardly longer than it may have waited comes from a clock like this one.
+        least = self._least.get(publisher, 0.0 if 0.0 <= took <= 2 * self._patience else took)
+        self._least[publisher] = min(took, least + _FORGET * (took - least))
+        return min(received, max(received - self._patience, published + least))

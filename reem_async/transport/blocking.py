@@ -18,6 +18,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
 from typing import Any
 
+from ..courtesy import give_way
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..state import States
@@ -31,6 +32,8 @@ __all__ = ["BlockingTransport"]
 
 _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
+_SLICE = 1 << 18
+"""Bytes of a large value that are sent before giving way."""
 _LOOKS = 40
 """How many times per time limit to look whether a large value is moving."""
 
@@ -132,13 +135,14 @@ class _Line:
         self._moved, self._left = time.monotonic(), 0
         for piece in pieces:
             view, sent = memoryview(piece), 0
-            step = _RECORD if self._tls else len(view)  # over TLS, nothing is said of a part that was sent
+            step = _RECORD if self._tls else _SLICE  # over TLS, nothing is said of a part that was sent
             while sent < len(view):
                 try:
                     sent += self._socket.send(view[sent : sent + step])
                     self._moved = time.monotonic()
                 except (BlockingIOError, TimeoutError):
                     self._check_moved(limit)
+                give_way()
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""

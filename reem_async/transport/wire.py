@@ -72,6 +72,9 @@ class Wire(asyncio.BufferedProtocol):
         reader: Parses what is received.
         on_push: Called with each message the server sends unasked.
         on_lost: Called once when the connection is gone, with the reason.
+
+    Attributes:
+        pace: Seconds for which nothing more is read after something was: what comes meanwhile is taken together.
     """
 
     def __init__(
@@ -81,6 +84,7 @@ class Wire(asyncio.BufferedProtocol):
         on_push: Callable[[list[Any]], None] | None = None,
         on_lost: Callable[[Wire, Exception], None] | None = None,
     ) -> None:
+        self.pace = 0.0
         self._timeout = timeout
         self._on_push = on_push
         self._on_lost = on_lost
@@ -240,6 +244,15 @@ class Wire(asyncio.BufferedProtocol):
                 self._take(reply)
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
+        if self.pace and self.alive:
+            assert self._transport is not None
+            self._transport.pause_reading()
+            self._loop.call_later(self.pace, self._read_on)
+
+    def _read_on(self) -> None:
+        if self.alive:
+            assert self._transport is not None
+            self._transport.resume_reading()
 
     def eof_received(self) -> None:
         """Close: the server will not answer any more."""

@@ -1,0 +1,268 @@
+"""What is heard of a key of a cluster in two ways: in one order, nothing lost, nothing told twice."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import weakref
+
+import hypothesis.strategies as st
+import pytest
+from clusterkit import owner
+from conftest import Keys, aeventually
+from hypothesis import given, settings
+
+import reem_async
+from reem_async import handover
+from reem_async.errors import InterfaceClosed
+from reem_async.handover import Handover
+from reem_async.monitor import Monitor
+from reem_async.plan.notices import Notice
+
+CHANNEL = b"{key}:notices"
+
+
+@pytest.fixture
+def key():
+    return Keys()
+
+
+@pytest.fixture
+async def pair(cluster):
+    """Who publishes, and who listens."""
+    async with reem_async.RedisInterface(cluster) as one, reem_async.RedisInterface(cluster) as two:
+        yield reem_async.PublishSpace(one), two
+
+
+def notice(sequence, publisher="p"):
+    return Notice(publisher, sequence, 0.0, (), False, sequence)
+
+
+class Ear:
+    """A listener that writes down what it is told."""
+
+    def __init__(self):
+        self.told = []
+
+    def on_notice(self, it, channel):
+        assert channel == CHANNEL
+        self.told.append((it.publisher, it.sequence))
+
+    def doubt(self):
+        self.told.append("doubt")
+
+    def numbers(self, publisher="p"):
+        return [each[1] for each in self.told if each[0] == publisher]
+
+
+def handed(ear, *, late=True):
+    made = Handover(weakref.ref(ear), CHANNEL)
+    made.late = late
+    return made
+
+
+def interleaved(draw, streams):
+    """The items of several streams, those of each in their order."""
+    left = [list(each) for each in streams]
+    while any(left):
+        which = draw(st.sampled_from([place for place, each in enumerate(left) if each]))
+        yield which, left[which].pop(0)
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_however_the_two_ways_interleave_each_update_is_told_once_and_in_order(data):
+    """All nodes are told the first of two publishers' updates, and the key is followed from some instant on."""
+    count = data.draw(st.integers(1, 20))
+    streams, first = [], {}
+    for publisher in "pq":
+        followed = data.draw(st.integers(1, count + 1))
+        until = data.draw(st.integers(followed - 1, count))
+        streams.append([(publisher, number) for number in range(1, until + 1)])
+        streams.append([(publisher, number) for number in range(followed, count + 1)])
+        first[publisher] = followed
+
+    async def play():
+        ear = Ear()
+        made = handed(ear, late=data.draw(st.booleans()) or max(first.values()) > 1)
+        for which, (publisher, number) in interleaved(data.draw, streams):
+            (made.told_here if which % 2 else made.told_to_all)(notice(number, publisher))
+        assert not made.waits
+        return ear
+
+    ear = asyncio.run(play())
+    for publisher in "pq":
+        assert ear.numbers(publisher) == list(range(1, count + 1))
+    assert "doubt" not in ear.told
+
+
+@settings(max_examples=300, deadline=None)
+@given(data=st.data())
+def test_what_neither_way_brings_is_a_hole_in_the_numbers_and_all_else_is_told_once(data):
+    """Any of those that all nodes are told may be missing: what the receiver did not get must be what was lost."""
+    count = data.draw(st.integers(1, 15))
+    followed = data.draw(st.integers(2, count + 1))
+    heard = sorted({1, *data.draw(st.sets(st.integers(1, count)))})
+    streams = [[("p", number) for number in heard], [("p", number) for number in range(followed, count + 1)]]
+
+    async def play():
+        ear = Ear()
+        made = handed(ear)
+        for which, (_, number) in interleaved(data.draw, streams):
+            (made.told_here if which else made.told_to_all)(notice(number))
+        if made.waits:
+            await aeventually(lambda: not made.waits)
+        return ear.numbers()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(handover, "_PATIENCE", 0.001)
+        numbers = asyncio.run(play())
+    assert numbers == sorted({*numbers})
+    assert {*numbers} >= {number for number in heard if number < followed}
+    assert {*numbers} <= {*heard, *range(followed, count + 1)}
+    assert count < followed or numbers[-1] == count
+
+
+async def test_what_does_not_come_is_not_waited_for_for_ever(monkeypatch):
+    """What is missing shows in the numbers; of somebody nothing is known of, it is said that there may be more."""
+    monkeypatch.setattr(handover, "_PATIENCE", 0.01)
+    ear = Ear()
+    made = handed(ear)
+    made.told_to_all(notice(1))
+    made.told_here(notice(4))
+    made.told_here(notice(5))
+    made.told_here(notice(7, "stranger"))
+    assert ear.told == [("p", 1)]
+    assert made.waits
+    await aeventually(lambda: not made.waits)
+    made.told_here(notice(6))
+    made.told_to_all(notice(3))
+    assert ear.told == [("p", 1), ("p", 4), ("p", 5), "doubt", ("stranger", 7), ("p", 6)]
+
+
+async def test_who_follows_from_the_beginning_waits_for_nobody():
+    """A key that was there already: others may have published to it for long."""
+    ear = Ear()
+    made = handed(ear, late=False)
+    made.told_here(notice(70))
+    made.told_to_all(notice(69))
+    made.told_here(notice(71))
+    assert ear.numbers() == [70, 71]
+
+
+async def test_a_crowd_of_publishers_is_forgotten_and_taken_as_it_comes(monkeypatch):
+    """Nobody can make it remember without end."""
+    monkeypatch.setattr(handover, "_MOST_PUBLISHERS", 3)
+    ear = Ear()
+    made = handed(ear)
+    for number in range(10):
+        made.told_here(notice(1, f"p{number}"))
+    made.told_here(notice(2, "p0"))
+    assert len(made._senders) <= 3
+    assert len(ear.told) == 11
+
+
+async def test_a_listener_that_is_gone_is_told_nothing():
+    """It was dropped without closing."""
+    ear = Ear()
+    made = handed(ear)
+    del ear
+    made.told_to_all(notice(1))
+    made.told_here(notice(2))
+    made.told_here(notice(9, "q"))
+    made._give_up(made._senders["q"])
+    assert not made.waits
+
+
+# --- on a real cluster -------------------------------------------------
+
+
+def on_each_node(cluster, key, count):
+    """So many new names for each node."""
+    found = {node.port: [] for node in cluster.nodes}
+    numbers = itertools.count()
+    while min(map(len, found.values())) < count:
+        name = key(f"k{next(numbers)}")
+        there = found[owner(cluster, name).port]
+        if len(there) < count:
+            there.append(name)
+    return [name for names in found.values() for name in names]
+
+
+@contextlib.asynccontextmanager
+async def hearing(interface, pattern):
+    """A monitor, and the events it has had, taken as they come."""
+    events = []
+
+    async def take(monitor):
+        async for event in monitor:
+            events.append(event)  # noqa: PERF401
+
+    async with Monitor(interface, [pattern]) as monitor:
+        task = asyncio.create_task(take(monitor))
+        yield events
+        task.cancel()
+
+
+async def test_a_fast_publisher_of_new_keys_is_heard_from_the_first_update_on_without_a_gap(cluster, pair, key):
+    """Nodes pass on up to 50 ms late what all are told, so the ways are far apart."""
+    space, other = pair
+    names = on_each_node(cluster, key, 3)
+    async with hearing(other, key("*")) as events:
+        for name in names:
+            for number in range(1, 61):
+                await space[name].write(number)
+                await asyncio.sleep(0.0005)
+        await aeventually(lambda: len(events) >= 60 * len(names))
+    assert not [event for event in events if event.gap or event.missed]
+    for name in names:
+        assert [event.sequence for event in events if event.name == name] == list(range(1, 61))
+
+
+async def test_hundreds_of_keys_that_begin_at_once_are_all_followed_and_nothing_is_lost(cluster, pair, key):
+    """They are followed together, not one after the other, while what all nodes are told still comes."""
+    space, other = pair
+    names = [key(f"k{number}") for number in range(300)]
+    async with hearing(other, key("*")) as events:
+        for number in range(1, 4):
+            await asyncio.gather(*[space[name].write(number) for name in names])
+        await aeventually(lambda: len(events) >= 3 * len(names))
+        discovery = other.session.hub._discovery
+        branches = [branch for each in discovery._branches.values() for branch in each.values()]
+        await aeventually(lambda: len(branches) == len(names) and all(branch.begun for branch in branches))
+    assert not [event for event in events if event.gap or event.missed]
+    assert sorted((event.name, event.value) for event in events) == sorted(
+        (name, number) for name in names for number in range(1, 4)
+    )
+
+
+async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pair, key):
+    """As a recorder needs it that is told to end."""
+    space, other = pair
+    names = on_each_node(cluster, key, 1)
+    for name in names:
+        await space[name].write(0)
+    async with Monitor(other, [key("*")]) as monitor:
+        for number in range(1, 101):
+            for name in names:
+                await space[name].write(number)
+        await other.session.hub.fence()
+        waiting = [monitor.mailbox.take() for _ in range(len(monitor.mailbox._items))]
+    for name in names:
+        assert [event.value for event in waiting if event.name == name][-100:] == list(range(1, 101))
+
+
+async def test_a_connection_that_is_made_while_the_interface_closes_is_closed_too(server_url, key):
+    """Nobody else would close it."""
+    async with reem_async.RedisInterface(server_url) as interface:
+        hub = interface.session.hub
+        following = asyncio.create_task(reem_async.SilentSubscriber(key(), interface).listen())
+        node = await interface.session.transport.owner(key().encode())
+        opening = asyncio.create_task(hub._connected(node))
+        await asyncio.sleep(0)
+        await hub.close()
+        for each in (following, opening):
+            with pytest.raises(InterfaceClosed):
+                await each
+        assert not [wire for wire in hub._wires.values() if wire.alive]
