@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test modes fuzz coverage check chaos bench scale clean
+.PHONY: demo test modes fuzz coverage check chaos mcap bench scale clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -35,6 +35,10 @@ $(VENV)/ready: pyproject.toml
 
 chaos: $(VENV)/ready  ## the reliability scoreboard, under 20 minutes; CHAOS="--rows 1,9 --seed 7"
 	$(BIN)/python -m tests.chaos $(CHAOS)
+
+mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCAP that Foxglove uses; needs npm
+	npm install --silent --no-fund --no-audit --no-package-lock --prefix tests/mcapcheck
+	$(BIN)/python -m tests.mcapcheck
 
 bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick for about one
 	.venv-bench/bin/python -m benchmarks $(BENCH)
