@@ -196,8 +196,9 @@ class _Branch:
     def start(self, wire: Wire, kind: str) -> None:
         """Begin, and let the listener begin."""
         self.begun = True
-        listener = self._listener()
-        if listener is not None:
+        if self._births is not None:
+            self._births.begin(wire, kind)
+        elif (listener := self._listener()) is not None:
             listener.start(wire, kind)
         if self.ready is not None and not self.ready.done():
             self.ready.set_result(None)
@@ -247,6 +248,7 @@ class _Births:
         self.mailboxes: list[Mailbox] = []
         self.fresh: dict[bytes, None] = {}
         self.following = False
+        self._telling = False  # of a gap, in this turn of the event loop
         self._handovers: dict[bytes, Handover] = {}
 
     @property
@@ -264,9 +266,24 @@ class _Births:
         return found
 
     def start(self, wire: Wire, kind: str) -> None:
-        """Begin."""
+        """Begin, and let the listener begin."""
+        self.begin(wire, kind)
         if self.ready is not None and not self.ready.done():
             self.ready.set_result(None)
+
+    def begin(self, wire: Wire, kind: str) -> None:
+        """Let the listener begin. One broken connection is one gap, however many keys begin anew over the next."""
+        if kind == "gap":
+            if self._telling:
+                kind = "initial"
+            else:
+                self._telling = True
+                asyncio.get_running_loop().call_soon(self._told)
+        if (listener := self._listener()) is not None:
+            listener.start(wire, kind)
+
+    def _told(self) -> None:
+        self._telling = False
 
     def lost(self, reason: Exception) -> None:
         """Hand it on, if this had begun."""

@@ -91,7 +91,7 @@ class Hub:
                 nodes.setdefault(await self.transport.owner(listener.topic.name), []).append(listener)
         for node, there in nodes.items():
             for listener in there:
-                self._topics.setdefault(listener.topic, Audience()).add(listener)
+                self._enter(listener)
             await self._subscribe_at(node, [listener.topic for listener in there], there)
 
     async def follow_here(self, listener: Listener) -> None:
@@ -117,11 +117,7 @@ class Hub:
             async with self._lock:
                 if ready.done():
                     ready.result()
-                self._pace = min(self._pace, listener.patience) if self._topics else listener.patience
-                for each in self._wires.values():
-                    each.pace = self._pace
-                # Entered before the server confirms: a notice right behind the confirmation must find somebody.
-                self._topics.setdefault(listener.topic, Audience()).add(listener)
+                self._enter(listener)
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
                     node = await self.transport.owner(listener.topic.name, anew=anew)
@@ -138,6 +134,13 @@ class Hub:
             listener.ready = None
             if ready.done() and not ready.cancelled():
                 ready.exception()  # it was raised, or is overtaken by a cancellation
+
+    def _enter(self, listener: Listener) -> None:
+        """Note who listens, before the server confirms: a notice right behind that must find somebody."""
+        self._pace = min(self._pace, listener.patience) if self._topics else listener.patience
+        for wire in self._wires.values():
+            wire.pace = self._pace
+        self._topics.setdefault(listener.topic, Audience()).add(listener)
 
     def _discover(self) -> Discovery:
         if self._closed:

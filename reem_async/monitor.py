@@ -81,8 +81,9 @@ class Monitor(Stream[Event]):
             through this interface is in a hurry. Whoever only notes what happens costs the publishers less so:
             he is woken less often.
 
-    In a cluster, whose servers have no patterns for what only one node is told, the keys are looked for, and
-    publishers tell all nodes for the first seconds of a key.
+    A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
+    other: they come from different nodes. There, whose servers have no patterns for what only one node is told,
+    the keys are looked for, and publishers tell all nodes for the first seconds of a key.
 
     Raises:
         BadKey: Not a pattern.

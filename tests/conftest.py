@@ -119,6 +119,11 @@ class RawCluster(redis.RedisCluster):
         node, number = _id.split(" ")
         return super().client_kill_filter(_id=number, target_nodes=self.get_node(node_name=node), **options)
 
+    def execute_command(self, *words, **options):
+        if words[0] == "ACL":
+            options.setdefault("target_nodes", redis.RedisCluster.PRIMARIES)
+        return super().execute_command(*words, **options)
+
     def pubsub_numpat(self):
         return sum(node.redis_connection.pubsub_numpat() for node in self.get_primaries())
 
@@ -136,6 +141,12 @@ def raw(server_url):
         return
     with redis.Redis.from_url(server_url, decode_responses=True) as client:
         yield client
+
+
+def url_of_user(url, name, password):
+    """The address of the server for another user."""
+    scheme, _, rest = url.partition("://")
+    return f"{scheme}://{name}:{password}@{rest.rpartition('@')[2]}"
 
 
 class Keys:
@@ -458,6 +469,11 @@ def subscribed(raw):
     """The ids of the connections that are subscribed to anything."""
     rows = raw.client_list()
     return {row["id"] for row in rows if any(int(row.get(kind, 0)) for kind in ("sub", "psub", "ssub"))}
+
+
+def homes(raw, names):
+    """On how many servers these top-level keys are: whoever follows all of them has one connection to each."""
+    return len({raw.get_node_from_key(name).name for name in names}) if isinstance(raw, RawCluster) else 1
 
 
 def subscriptions(raw):

@@ -9,7 +9,7 @@ import weakref
 
 import hypothesis.strategies as st
 import pytest
-from clusterkit import owner
+from clusterkit import owner, raw_of
 from conftest import Keys, aeventually
 from hypothesis import given, settings
 
@@ -19,6 +19,8 @@ from reem_async.errors import InterfaceClosed
 from reem_async.handover import Handover
 from reem_async.monitor import Monitor
 from reem_async.plan.notices import Notice
+from reem_async.plan.patterns import parse_pattern
+from reem_async.recording.line import Line
 
 CHANNEL = b"{key}:notices"
 
@@ -251,6 +253,36 @@ async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pai
         waiting = [monitor.mailbox.take() for _ in range(len(monitor.mailbox._items))]
     for name in names:
         assert [event.value for event in waiting if event.name == name][-100:] == list(range(1, 101))
+
+
+class Recorder:
+    """Who counts how often it is said that updates were lost."""
+
+    def __init__(self, session, name):
+        self.session, self.patterns, self.count = session, [parse_pattern(name)], 0
+
+    def lost(self):
+        self.count += 1
+
+
+async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_followed_over_it(cluster, pair, key):
+    """And nobody listens less afterwards."""
+    space, other = pair
+    names = on_each_node(cluster, key, 5)
+    for name in names:
+        await space[name].write(0)
+    recorder = Recorder(other.session, key("*"))
+    line, hub = Line(recorder), other.session.hub
+    await hub.follow(line)
+    for node in cluster.nodes:
+        before, count = {*hub._wires.values()}, recorder.count
+        with raw_of(node) as raw:
+            raw.client_kill_filter(_type="pubsub")
+        await aeventually(lambda before=before: len({*hub._wires.values()} - before) == 1)
+        await aeventually(lambda: not hub._missing() and line.wire is not None)
+        assert recorder.count == count + 1
+    assert len(hub._subscribed) == len(names) + 1
+    await hub.unfollow(line)
 
 
 async def test_a_connection_that_is_made_while_the_interface_closes_is_closed_too(server_url, key):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import re
 
 import numpy as np
@@ -179,3 +180,23 @@ def test_what_cannot_be_a_pattern_is_refused():
 
 def test_escaping_leaves_no_pattern():
     assert re.sub(r"\\(.)", r"\1", escaped("a*?[b]\\^")) == "a*?[b]\\^"
+
+
+async def test_a_patient_monitor_is_woken_seldom_unless_somebody_else_is_in_a_hurry(key, server_url, apspace):
+    """Updates that wait for each other are all there, in order, and told together."""
+
+    async def batches(*, hurried):
+        async with reem_async.RedisInterface(server_url) as own, Monitor(own, [key("n")], patience=0.05) as monitor:
+            if hurried:
+                mirror = reem_async.SilentSubscriber(key("n"), own)
+                await mirror.listen()
+            await apspace[key("n")].write(-1)
+            for number in range(40):
+                await apspace[key("n")].write(number)
+                await asyncio.sleep(0.005)
+            events = [await anext(monitor) for _ in range(41)]
+            assert [event.value for event in events] == list(range(-1, 40))
+            assert not any(event.gap for event in events)
+            return 1 + sum(b.received - a.received > 0.003 for a, b in itertools.pairwise(events))
+
+    assert await batches(hurried=False) <= 15 < await batches(hurried=True)

@@ -24,7 +24,8 @@ Url = Annotated[
         envvar="REEM_URL",
         metavar="URL",
         rich_help_panel=_SERVER,
-        help="Where the server is: redis://user:password@host:port/db, rediss://... for TLS, unix://path. "
+        help="Where the server is: redis://user:password@host:port/db, rediss://... for TLS, unix://path; "
+        "redis+cluster://host:port,host:port; redis+sentinel://host:port,host:port/name. "
         "Other users of this machine can see it in the list of processes, unlike the variable.",
     ),
 ]
