@@ -77,8 +77,8 @@ class Monitor(Stream[Event]):
         policy: What to keep for a loop that is slower than the updates; `Every(10_000)` if not given.
         namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
             `event.namespace` says which it was: the shortest that fits.
-        patience: Seconds that updates may wait here for each other, unless somebody else who follows something
-            through this interface is in a hurry. Whoever only notes what happens costs the publishers less so:
+        patience: Seconds that updates may wait here for each other while many come, unless somebody who follows
+            something through this interface is in a hurry. Who only notes what happens costs publishers less so:
             he is woken less often.
 
     A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each

@@ -30,6 +30,9 @@ __all__ = ["Wire", "open_wire"]
 _LOOKS = 40
 """How many times per time limit to look whether a large value is moving."""
 
+_BUSY = 2.5
+"""Three reads within so many times the pace are much."""
+
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
 
@@ -74,7 +77,7 @@ class Wire(asyncio.BufferedProtocol):
         on_lost: Called once when the connection is gone, with the reason.
 
     Attributes:
-        pace: Seconds for which nothing more is read after something was: what comes meanwhile is taken together.
+        pace: Seconds for which nothing more is read after something was, if much comes: it is taken together.
     """
 
     def __init__(
@@ -98,7 +101,7 @@ class Wire(asyncio.BufferedProtocol):
         self._tls = False
         self._goal = 0  # over TLS: how many bytes the other side has confirmed when it has all of what was written
         self._watch: asyncio.TimerHandle | None = None
-        self._last_byte = 0.0
+        self._last_byte = self._read_before = 0.0
         self._unsent = 0  # bytes of large values that were on their way up when last looked at
         self._reason: Exception | None = None
         self._gone = self._loop.create_future()
@@ -237,14 +240,14 @@ class Wire(asyncio.BufferedProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         """Parse what was received and hand it out."""
-        self._last_byte = self._loop.time()
+        before, self._read_before, self._last_byte = self._read_before, self._last_byte, self._loop.time()
         try:
             self._reader.received(nbytes)
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
-        if self.pace and self.alive:
+        if self._last_byte - before < _BUSY * self.pace and self.alive:
             assert self._transport is not None
             self._transport.pause_reading()
             self._loop.call_later(self.pace, self._read_on)
