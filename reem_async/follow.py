@@ -111,6 +111,7 @@ class Follower:
         self._doubtful: list[Notice] = []  # arrived while a large one was: it has the first of them
         self._later: list[tuple[Notice, str]] = []  # arrived after a snapshot that ships are still opening
         self._heard = Sequences()
+        self._losses: dict[tuple[str, int], int | None] = {}  # before notices that were not told of yet
         self._kind = "initial"
 
     def start(self, wire: Wire, kind: str) -> None:
@@ -120,6 +121,7 @@ class Follower:
         self._covered.clear()
         self._doubtful.clear()
         self._later.clear()
+        self._losses.clear()
         self._read()
 
     def lost(self, reason: Exception) -> None:
@@ -150,11 +152,14 @@ class Follower:
     def _take(self, notice: Notice, order: str) -> None:
         if order == "again" or self._wire is None:
             return
+        self._recall(notice)
         if self._settling:
+            self._defer(notice)
             self._later.append((notice, order))
         elif not _concerns(notice, self.path):
             pass
         elif self._reading:
+            self._defer(notice)
             self._covered.append(notice)
         elif self._behind or order == "late" or not _is_whole(notice, self.path, self.tree):
             self._fetch(notice)
@@ -172,8 +177,20 @@ class Follower:
             self._emit(notice)
 
     def _fetch(self, notice: Notice) -> None:
+        self._defer(notice)
         self._covered.append(notice)
         self._read()
+
+    def _defer(self, notice: Notice) -> None:
+        """Keep what was lost before a notice with it: others, that came before the loss, are told of first."""
+        lost, missed = self._heard.lost()
+        if lost:
+            self._losses[notice.publisher, notice.sequence] = missed
+
+    def _recall(self, notice: Notice) -> None:
+        """Count what was lost before a notice as lost before what is told of next."""
+        if self._losses:
+            self._heard.lose(self._losses.pop((notice.publisher, notice.sequence), 0))
 
     def _read(self) -> None:
         self._last_reading += 1
@@ -306,18 +323,21 @@ class Follower:
         for notice, order in later:
             self._take(notice, order)
 
-    def _emit_covered(self, covered: Iterable[Notice]) -> None:
+    def _emit_covered(self, covered: list[Notice]) -> None:
         """Tell of the newest update of each path that a snapshot holds; the older ones are skipped."""
-        newest: dict[Path, Notice] = {}
+        newest = {notice.path: notice for notice in covered}
         for notice in covered:
-            if newest.pop(notice.path, None) is not None:
-                for mailbox in self.mailboxes:
-                    mailbox.skip()
-            newest[notice.path] = notice
-        for notice in newest.values():
-            self._emit(notice)
+            if newest[notice.path] is notice:
+                self._emit(notice)
+                continue
+            self._recall(notice)
+            for mailbox in self.mailboxes:
+                mailbox.skip()
 
     def _emit_snapshot(self, *, initial: bool) -> None:
+        for kept in self._losses.values():
+            self._heard.lose(kept)
+        self._losses.clear()
         missed = 0 if initial else self._heard.lost()[1]
         for mailbox in self.mailboxes:
             data, value = self.value(), self.value()
@@ -325,6 +345,7 @@ class Follower:
             mailbox.put(Update(path, data, value, initial=initial, gap=not initial, missed=missed))
 
     def _emit(self, notice: Notice) -> None:
+        self._recall(notice)
         path, (gap, missed) = show((self.keys.name, *notice.path)), self._heard.lost()
         stamp = notice.time, notice.publisher, notice.sequence
         for mailbox in self.mailboxes:
