@@ -24,7 +24,7 @@ from .wire import Wire, open_wire
 __all__ = ["AsyncTransport"]
 
 _BULK = 1 << 16
-_SPARE = 16
+_SPARE = 4
 
 
 class AsyncTransport:
