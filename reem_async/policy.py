@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -83,11 +84,21 @@ class Mailbox:
             if self._end is not None:
                 return
             if len(self._items) >= self._policy.bound and self._skip():
-                self._items.popleft()
+                update = self._without_oldest(update)
             if self._end is None:
                 self._items.append(update)
             self._changed.notify()
         self.wake()
+
+    def _without_oldest(self, update: Any) -> Any:
+        """Drop the oldest; return `update`. A gap before what is dropped is one before what comes next."""
+        gone = self._items.popleft()
+        if not getattr(gone, "gap", False):
+            return update
+        if not self._items:
+            return _after_gap(update, gone)
+        self._items[0] = _after_gap(self._items[0], gone)
+        return update
 
     def skip(self) -> None:
         """Note that an update will never come: a newer one of the same path has taken its place."""
@@ -132,3 +143,9 @@ class Mailbox:
                 self._end = Ended()
             self._changed.notify_all()
         self.wake()
+
+
+def _after_gap(update: Any, gone: Any) -> Any:
+    """Return `update` with what was lost before one that is dropped."""
+    missed = None if gone.missed is None or update.missed is None else gone.missed + update.missed
+    return dataclasses.replace(update, gap=True, missed=missed)
