@@ -49,7 +49,7 @@ def there_and_back(value):
 
     def load(stored):
         label, encoded = kept[stored.path]
-        return decode(encoded.schema, encoded.channels, label, encoded.data, SHIPS)
+        return decode(encoded.schema, encoded.channels, label, b"".join(encoded.pieces), SHIPS)
 
     return resolve(from_json(document.text, wrapped=document.wrapped), load)
 
@@ -151,12 +151,12 @@ def test_pictures_are_foxglove_s(encoding):
     picture = PICTURES[encoding]
     encoded = encode("numpy", picture, "cam.image", TIME)
     assert encoded.schema == "foxglove.RawImage"
-    image = RawImage.FromString(encoded.data)
+    image = RawImage.FromString(b"".join(encoded.pieces))
     assert (image.height, image.width, image.encoding, image.frame_id) == (20, 30, encoding, "cam.image")
     assert image.step * image.height == len(image.data) == picture.nbytes
     assert image.timestamp.seconds * 10**9 + image.timestamp.nanos == TIME
     assert image.data == picture.tobytes()
-    assert_same(decode(encoded.schema, encoded.channels, "numpy", encoded.data, SHIPS), picture)
+    assert_same(decode(encoded.schema, encoded.channels, "numpy", b"".join(encoded.pieces), SHIPS), picture)
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_pictures_are_foxglove_s(encoding):
 def test_pictures_of_other_layouts_keep_their_shape(array):
     encoded = encode("numpy", array, "cam", TIME)
     assert encoded.schema == "foxglove.RawImage"
-    assert_same(decode(encoded.schema, encoded.channels, "numpy", encoded.data, SHIPS), array)
+    assert_same(decode(encoded.schema, encoded.channels, "numpy", b"".join(encoded.pieces), SHIPS), array)
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_pictures_of_other_layouts_keep_their_shape(array):
 )
 def test_compressed_pictures_are_foxglove_s(data, name):
     encoded = encode("bytes", data, "cam", TIME)
-    image = CompressedImage.FromString(encoded.data)
+    image = CompressedImage.FromString(b"".join(encoded.pieces))
     assert (encoded.schema, image.format, image.data) == ("foxglove.CompressedImage", name, data)
 
 
@@ -191,7 +191,7 @@ def test_other_arrays_carry_their_schema():
     pool = DescriptorPool()
     for file in files.file:
         pool.Add(file)
-    message = factory.GetMessageClass(pool.FindMessageTypeByName("reem.NdArray")).FromString(encoded.data)
+    message = factory.GetMessageClass(pool.FindMessageTypeByName("reem.NdArray")).FromString(b"".join(encoded.pieces))
     assert (list(message.shape), message.dtype, message.min, message.max, message.mean) == ([3], "float64", 1, 6, 3)
     assert message.npy.startswith(b"\x93NUMPY")
 
@@ -215,7 +215,7 @@ def test_damaged_messages_are_refused(schema, data):
 def test_a_value_of_an_unknown_ship_names_it():
     encoded = encode("pose", b"abc", "a", TIME)
     with pytest.raises(BadData, match="'pose'"):
-        decode(encoded.schema, "", "pose", encoded.data, SHIPS)
+        decode(encoded.schema, "", "pose", b"".join(encoded.pieces), SHIPS)
 
 
 def test_a_schema_fits_until_a_type_changes():

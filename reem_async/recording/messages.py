@@ -44,12 +44,12 @@ class Encoded(NamedTuple):
     Attributes:
         schema: The name of its schema: "foxglove.RawImage", ...
         channels: For a picture, the last axis of its shape, or "" if it has only two axes; else "".
-        data: The message.
+        pieces: The message, in pieces that belong one behind the other: a large value is not copied.
     """
 
     schema: str
     channels: str
-    data: bytes
+    pieces: list[Any]
 
 
 def _messages() -> tuple[type[Message], type[Message]]:
@@ -139,11 +139,11 @@ def encode(label: str, value: Any, frame: str, time: int) -> Encoded:
 
 
 def _encoded(schema: str, channels: str, head: Any, time: int, pieces: list[Any]) -> Encoded:
-    """Return the message `head` with its data field put behind it, which saves protobuf two copies of the data."""
+    """Return the message `head` with its data field put behind it, which saves copies of the data."""
     head.timestamp.seconds, head.timestamp.nanos = divmod(time, 1_000_000_000)
     number = head.DESCRIPTOR.fields_by_name[_DATA_FIELD[schema]].number
     tag = bytes([number << 3 | 2]) + _varint(sum([len(piece) for piece in pieces]))
-    return Encoded(schema, channels, b"".join([head.SerializeToString(), tag, *pieces]))
+    return Encoded(schema, channels, [head.SerializeToString() + tag, *pieces])
 
 
 def _varint(number: int) -> bytes:

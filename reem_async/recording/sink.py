@@ -97,7 +97,7 @@ class Sink:
             if len(self._matched) >= _MOST_CHANNELS:
                 self._matched.clear()
             channel = self._matched[key] = self._json_channel(path, role, kind, document.wrapped, found)
-        return self._message(channel, document.text, stamp)
+        return self._message(channel, [document.text], stamp)
 
     def _json_channel(self, path: Path, role: str, kind: str, wrapped: bool, found: Signature) -> int:
         known = self._known.setdefault((path, role, kind, wrapped), [])
@@ -122,7 +122,7 @@ class Sink:
             schema = self._schema(encoded.schema, "protobuf", None)
             extra = {"reem.ship": label, **({"reem.channels": encoded.channels} if encoded.channels else {})}
             channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
-        return self._message(channel, encoded.data, stamp)
+        return self._message(channel, encoded.pieces, stamp)
 
     def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
         """Write figures on the recording itself."""
@@ -130,7 +130,7 @@ class Sink:
         if "statistics" not in self._channels:
             schema = self._schema("reem.stats", "jsonschema", signature(document.tree))
             self._channels["statistics"] = self._register(STATISTICS, "json", schema, {})
-        self._message(self._channels["statistics"], document.text, stamp)
+        self._message(self._channels["statistics"], [document.text], stamp)
 
     def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
         """Return the number and the name of a schema."""
@@ -153,11 +153,10 @@ class Sink:
         self._new.append([number, topic, encoding, schema[1], metadata])
         return number
 
-    def _message(self, channel: int, data: bytes, stamp: tuple[int, int, int]) -> int:
+    def _message(self, channel: int, pieces: list[Any], stamp: tuple[int, int, int]) -> int:
         log_time, publish_time, number = stamp
-        self._writer.add_message(channel, log_time, data, max(publish_time, 0), number)
         self._open += 1
-        return len(data)
+        return self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
 
     def tick(self, *, now: bool = False) -> None:
         """Close the chunk if it is time, so that it can be read whatever happens."""

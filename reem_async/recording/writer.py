@@ -78,7 +78,7 @@ class _Chunk:
         pieces: Their records, and those of the schemas and channels that are new.
         size: Bytes of these.
         index: Of each channel, the log time and the place of each message.
-        times: The log times.
+        first, last: The least and the greatest log time.
     """
 
     def __init__(self) -> None:
@@ -135,15 +135,20 @@ class Writer:
         self._chunk.put(_record(channel))
         return channel.id
 
-    def add_message(self, channel: int, log_time: int, data: bytes, publish_time: int, number: int) -> None:
-        """Put a message into the chunk, and close that if it is large enough. Times are in ns."""
+    def add_message(self, channel: int, log_time: int, pieces: list[Any], publish_time: int, number: int) -> int:
+        """Put a message into the chunk, and close that if it is large enough; returns its bytes. Times are in ns.
+
+        Pieces are bytes, or views of bytes that nobody changes.
+        """
+        size = sum(map(len, pieces))
         head = _MESSAGE.pack(
-            Opcode.MESSAGE, _MESSAGE_FIELDS + len(data), channel, number & 0xFFFFFFFF, log_time, publish_time
+            Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel, number & 0xFFFFFFFF, log_time, publish_time
         )
-        self._chunk.put_message(channel, log_time, head, data)
+        self._chunk.put_message(channel, log_time, head, *pieces)
         self._counts[channel] += 1
         if self._chunk.size > _CHUNK_BYTES:
             self._close_chunk()
+        return size
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
         """Write a metadata record, behind the chunks closed so far."""
