@@ -7,10 +7,13 @@ a millisecond should therefore give way himself now and then: a set point may be
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 
-__all__ = ["give_way"]
+__all__ = ["come_second", "give_way", "stand_back"]
+
+_NICER, _NICEST = 5, 19
 
 
 def give_way() -> None:
@@ -19,3 +22,23 @@ def give_way() -> None:
         os.sched_yield()
     else:
         time.sleep(0)
+
+
+def come_second() -> None:
+    """Come a little after others for the processor from now on, with all threads begun later, where that can be."""
+    with contextlib.suppress(AttributeError, OSError):
+        os.nice(_NICER)
+
+
+def stand_back() -> None:
+    """Take only processor time that nobody else wants from now on, with all threads begun later: perhaps none.
+
+    There is no way back without rights. Where there is no SCHED_IDLE (not Linux), it is niceness 19.
+
+    Raises:
+        AttributeError, OSError: This system has neither, or does not allow it.
+    """
+    if hasattr(os, "SCHED_IDLE"):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    else:
+        os.nice(_NICEST)

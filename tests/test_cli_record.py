@@ -81,6 +81,26 @@ def recorded(key, server_url, pspace, tmp_path):
     return file, [json.loads(line) for line in out.splitlines()]
 
 
+@pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="only Linux has a scheduling class for what can wait")
+@pytest.mark.parametrize("background", [True, False])
+def test_in_the_background_it_takes_only_what_nobody_else_wants(background, key, server_url, pspace, tmp_path):
+    """What reads and what writes; without --background it is only a little nicer than others."""
+    pspace[key("a")] = 1
+    file = tmp_path / "run.mcap"
+    option = ["--background"] if background else []
+    with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
+        eventually(lambda: is_recording(file))
+        threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
+        policies = [os.sched_getscheduler(thread) for thread in threads]
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=10)
+    assert process.returncode == 0
+    idle = policies.count(os.SCHED_IDLE)  # numpy's own threads, which have nothing to do, began before
+    assert idle >= 2 if background else idle == 0
+    with open_log(file) as log:
+        assert log[key("a")].at(log.end) == 1
+
+
 def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
     file, said = recorded
     assert said[-1]["ended"] is True

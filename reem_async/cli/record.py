@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import sys
 import time
@@ -14,7 +13,8 @@ import typer
 
 from reem_async.cli.options import DEFAULT_URL, AsJson, Namespace, Patterns, Url
 from reem_async.cli.output import clean, cut, emit, emit_json, size_text, width
-from reem_async.cli.running import prepared, run
+from reem_async.cli.running import Refused, prepared, run
+from reem_async.courtesy import come_second, stand_back
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["record"]
 
 _SHOWN_EVERY = 0.5
-_NICER = 5
 _TOOLS = "recordings need {}: pip install 'reem[tools]'"
 
 
@@ -42,6 +41,9 @@ def record(
     ] = 5.0,
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it is there already.")] = False,
+    background: Annotated[
+        bool, typer.Option("--background", help="Take only processor time that nobody else wants.")
+    ] = False,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -53,16 +55,22 @@ def record(
     no pattern, only the samples are recorded. Ctrl-C ends the recording and completes the file; if it is
     killed, all but the last second can be read.
 
+    The programs that are recorded come first. With --background they notice the recorder least, but where
+    they need every processor wholly, updates are missing from the recording; it says how many.
+
     Examples:
         reem record -o run.mcap
         reem record arm 'cam_*' --duration 60
+        reem record --background            beside a tight control loop
         reem record --sample keys.csv       its lines: arm.joint, 0.01
     """
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
-        with contextlib.suppress(AttributeError, OSError):  # the programs that are recorded come first
-            os.nice(_NICER)
+        if background:
+            _stand_back()
+        else:
+            come_second()
         recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
         try:
             async with recorder:
@@ -76,6 +84,13 @@ def record(
         return 0
 
     run("record", work, url, namespace, live=True)
+
+
+def _stand_back() -> None:
+    try:
+        stand_back()
+    except (AttributeError, OSError) as error:
+        raise Refused(f"this system has nothing like --background ({error}); leave it out") from None
 
 
 def _recorder(
@@ -96,8 +111,6 @@ def _recorder(
 
 def tools(name: str) -> Any:
     """Return a name of `reem_async.recording`; Refused if what that needs is not installed."""
-    from reem_async.cli.running import Refused
-
     try:
         from reem_async import recording
     except ModuleNotFoundError as error:
