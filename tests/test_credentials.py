@@ -159,3 +159,21 @@ def test_the_warning_can_be_silenced(unwarned):
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=reem.InsecureConnection)
         reem.RedisInterface("robot.example")
+
+
+@pytest.mark.filterwarnings("ignore::reem.InsecureConnection")
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        ("redis://u:secret@localhost:7/3", "redis://localhost:7/3"),
+        ("rediss://u:secret@robot:7", "rediss://robot:7"),
+        ("unix://u:secret@/tmp/x.sock?db=2", "unix:///tmp/x.sock?db=2"),
+        ("redis+cluster://u:secret@a:1,b:2", "redis+cluster://a:1,b:2"),
+        ("rediss+sentinel://u:secret@a:1,b:2/main/3", "rediss+sentinel://a:1,b:2/main/3"),
+    ],
+)
+def test_the_address_that_is_shown_to_be_copied_leads_there_without_the_password(given, shown):
+    options = reem.RedisInterface(given)._core.session.options
+    assert options.url == shown
+    again = reem.RedisInterface(shown)._core.session.options
+    assert (again.url, again.address, again.database) == (shown, options.address, options.database)

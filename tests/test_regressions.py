@@ -9,12 +9,11 @@ import secrets
 import socket
 import time
 import traceback
-import urllib.parse
 import zlib
 
 import numpy as np
 import pytest
-from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent
+from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent, url_of_user
 
 import reem
 import reem_async
@@ -145,13 +144,14 @@ def test_a_static_write_by_a_ship_that_appends_is_not_doubled(open_front, key):
 def test_a_client_that_may_not_read_the_document_removes_no_array_of_it(server_url, kvs, key, raw):
     """Without JSON.GET it cannot know which arrays are still referred to."""
     name = f"u{secrets.token_hex(4)}"
-    commands = "json.set json.type set sadd srem smembers unlink multi exec watch unwatch hello auth select ping"
+    commands = (
+        "json.set json.type set sadd srem smembers unlink multi exec watch unwatch hello auth select ping cluster|slots"
+    )
     rules = ["on", ">pw", "~*", "&*", "-@all", "+client|setinfo", *(f"+{word}" for word in commands.split())]
     raw.execute_command("ACL", "SETUSER", name, *rules)
     try:
         kvs[key()] = {"t": [A, A + 1]}
-        parts = urllib.parse.urlsplit(server_url)
-        with reem.RedisInterface(f"redis://{name}:pw@{parts.hostname}:{parts.port}{parts.path}") as limited:
+        with reem.RedisInterface(url_of_user(server_url, name, "pw")) as limited:
             reem.KeyValueStore(limited)[key()]["t"][0] = 5
         assert_same(kvs[key()].read(), {"t": [5, A + 1]})
         kvs[key()]["t"][0] = 6  # whoever may read cleans up

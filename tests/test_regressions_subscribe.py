@@ -13,7 +13,7 @@ import time
 import numpy as np
 import orjson
 import pytest
-from conftest import PATIENCE, aeventually, assert_same, python, subscribed
+from conftest import PATIENCE, aeventually, assert_same, homes, python, subscribed
 
 import reem
 import reem_async
@@ -337,11 +337,16 @@ async def test_who_begins_to_follow_in_an_outage_misses_nothing_and_no_connectio
 ):
     """Beginning to follow and reconnecting make one connection between them."""
     space = PublishSpace(aother)
-    await space[key()].write(-1)
+    for name in (key(), key("0"), key("2"), key("4")):
+        await space[name].write(-1)
     others, before = subscribed(raw), connections(raw)
     async with RedisInterface(server_url) as interface:
         first = Mirror(key(), interface)
         await first.listen()
+        for number in range(0, 5, 2):  # in a cluster: now there are connections to all nodes that will be needed
+            early = Mirror(key(str(number)), interface)
+            await early.listen()
+            await early.close()
         base = len(connections(raw))
         for number in range(5):
             await cut(raw, others)
@@ -353,7 +358,7 @@ async def test_who_begins_to_follow_in_an_outage_misses_nothing_and_no_connectio
             await space[key()].write(number)
             await aeventually(lambda number=number: first.value() == number, 1.0)
             await asyncio.sleep(0.07)  # by now a second attempt to reconnect would have been made
-            assert len(subscribed(raw) - others) == 1
+            assert len(subscribed(raw) - others) == homes(raw, {key(), channel})
             await space[channel].write(100 + number)
             await aeventually(lambda mirror=mirror, number=number: mirror.value() == 100 + number, 1.0)
         assert len(connections(raw)) <= base

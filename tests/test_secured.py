@@ -372,3 +372,54 @@ def test_options_that_would_only_fail_later_are_refused_at_once(certificates, tm
         reem.RedisInterface("rediss://localhost", ssl_cert_reqs="never")
     with pytest.raises(reem.BadValue, match="options"):
         reem.RedisInterface("localhost", port="abc")
+
+
+@pytest.fixture(scope="module")
+def guarded_cluster(certificates):
+    """Two primaries, each behind TLS that asks for certificates; yields the URL of the cluster."""
+    with contextlib.ExitStack() as stack:
+        nodes, relays = [], []
+        for _ in range(2):
+            node = stack.enter_context(own_server("cluster-enabled yes", "cluster-announce-ip 127.0.0.1"))
+            context = context_for(certificates.server, certificates.ca)
+            relay = stack.enter_context(contextlib.closing(Relay(node.socket_path, context)))
+            nodes.append(stack.enter_context(node.admin()))
+            nodes[-1].config_set("cluster-announce-port", relay.port)
+            nodes[-1].config_set("cluster-announce-bus-port", node.port + 10000)
+            relays.append((relay.port, node.port))
+        nodes[0].execute_command("CLUSTER", "ADDSLOTSRANGE", 0, 8191)
+        nodes[1].execute_command("CLUSTER", "ADDSLOTSRANGE", 8192, 16383)
+        nodes[0].execute_command("CLUSTER", "MEET", HOST, relays[1][1], relays[1][1] + 10000)
+        for node in nodes:
+            eventually(lambda node=node: "cluster_state:ok" in str(node.execute_command("CLUSTER", "INFO")))
+            eventually(lambda node=node: len(node.execute_command("CLUSTER", "SLOTS")) == 2)
+        yield f"rediss+cluster://localhost:{relays[0][0]}"
+
+
+@both
+def test_a_cluster_over_tls(guarded_cluster, certificates, name):
+    """All nodes, though only one is named; keys, arrays of 8 MB, and updates."""
+    with contextlib.closing(FRONTS[name](guarded_cluster, **full_options(certificates))) as front:
+        image = np.random.default_rng(1).random(LARGE)
+        for number in range(20):
+            front.write([f"k{number}"], {"n": number, "image": image[: LARGE >> number]})
+        for number in range(20):
+            assert_same(front.read([f"k{number}"]), {"n": number, "image": image[: LARGE >> number]})
+            front.delete([f"k{number}"])
+
+
+def test_updates_through_a_cluster_over_tls(guarded_cluster, certificates):
+    with reem.RedisInterface(guarded_cluster, **full_options(certificates)) as interface:
+        space = reem.PublishSpace(interface)
+        mirrors = [reem.SilentSubscriber(f"k{number}", interface) for number in range(6)]
+        for number, mirror in enumerate(mirrors):
+            mirror.listen()
+            space[f"k{number}"] = {"n": number, "a": np.arange(100_000)}
+        for number, mirror in enumerate(mirrors):
+            eventually(lambda mirror=mirror, number=number: mirror.value() and mirror.value()["n"] == number)
+            assert_same(mirror.value()["a"], np.arange(100_000))
+
+
+@both
+def test_a_cluster_over_tls_refuses_whoever_has_no_certificate(guarded_cluster, certificates, name):
+    assert_refused(name, guarded_cluster, ssl_ca_certs=certificates.ca)

@@ -84,7 +84,7 @@ async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
         interface.on_state(changes.append)
         store = reem_async.KeyValueStore(interface)
         async with store["robot"].watch() as updates:
-            assert (await anext(updates)).initial
+            await anext(updates)  # the initial value, or the writer was faster: only the newest is kept
             old = await asyncio.to_thread(watched.primary)
             os.kill(watched.pid(old), signal.SIGKILL)
             await aeventually(lambda: interface.state == "reconnecting")

@@ -79,10 +79,7 @@ class LiveSource:
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
         """Return Python that reads a path, for both fronts."""
-        options = self.interface.session.options
-        scheme = "rediss" if options.tls else "redis"
-        url = f"unix://{options.socket_path}" if options.socket_path else f"{scheme}://{options.address}"
-        return snippets(path, f"{url}/{options.database}" if options.database else url, self.interface.namespace)
+        return snippets(path, self.interface.session.options.url, self.interface.namespace)
 
     # --- the tree
 

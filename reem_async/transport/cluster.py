@@ -19,7 +19,7 @@ from typing import Any
 
 import redis.exceptions
 
-from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected
+from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected, TlsRefused
 from ..plan import Command, Reply
 from ..state import States
 from . import Held, Transport
@@ -63,6 +63,11 @@ class ClusterOptions(Options):
     def address(self) -> str:
         """Where the nodes are that were named, for messages."""
         return ",".join(f"{host}:{port}" for host, port in self.seeds)
+
+    @property
+    def url(self) -> str:
+        """What to write to get there, without user and password."""
+        return f"{'rediss' if self.tls else 'redis'}+cluster://{self.address}"
 
     def node(self, address: Address) -> Options:
         """Return how to reach one node."""
@@ -208,7 +213,8 @@ class ClusterTransport(Rooted):
                 self._learn(reply, address[0])
                 self._looked = time.monotonic()
                 return
-        raise NotConnected(f"no node of the cluster answers; the last one tried: {reason}") from reason
+        kind = TlsRefused if isinstance(reason, TlsRefused) else NotConnected
+        raise kind(f"no node of the cluster answers; the last one tried: {reason}") from reason
 
     def _no_layout(self, address: Address, reply: Exception) -> Exception:
         where = f"{address[0]}:{address[1]}"

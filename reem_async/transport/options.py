@@ -116,6 +116,13 @@ class Options:
         """Where the server is, for messages: never a password."""
         return self.socket_path or f"{self.settings.get('host', 'localhost')}:{self.settings.get('port', 6379)}"
 
+    @property
+    def url(self) -> str:
+        """What to write to get there, without user and password."""
+        if self.socket_path is not None:
+            return f"unix://{self.socket_path}" + (f"?db={self.database}" if self.database else "")
+        return f"{'rediss' if self.tls else 'redis'}://{self.address}" + (f"/{self.database}" if self.database else "")
+
     def __repr__(self) -> str:
         return f"<Options for {self.address}>"
 

@@ -19,13 +19,12 @@ import redis.exceptions
 
 from ..errors import ConnectionLost, NotAllowed, NotConnected, ServerNotReady
 from ..plan import Command, Reply
-from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .patience import timeout
 from .redirects import Ask, Moved, refusal, slot_of
-from .rooted import Rooted
+from .rooted import Standing
 
 __all__ = ["Readers", "ReplicaOptions", "Replicated"]
 
@@ -93,7 +92,7 @@ def _check_standing(said: Any, connection: Any) -> None:
         raise redis.exceptions.ConnectionError(f"{where} is no replica, or not in touch with its primary")
 
 
-class Readers(Rooted):
+class Readers(Standing):
     """Sends what only reads to replicas. It keeps to one replica of each primary as long as that one answers.
 
     Args:
@@ -115,15 +114,6 @@ class Readers(Rooted):
         self._ranks: dict[Address, float] = {}
         self._left: dict[Address, float] = {}
         self._asked = -_REST
-
-    @property
-    def states(self) -> States:
-        """What the interface's user gets to know of the connections to primaries; those to replicas do not count."""
-        return self._root.states
-
-    @states.setter
-    def states(self, states: States) -> None:
-        self._root.states = states
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands`, which only read, to a replica, and to the primary if that does not answer them.

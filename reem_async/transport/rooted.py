@@ -7,9 +7,10 @@ from collections.abc import Awaitable, Callable, Coroutine, Iterable
 from contextlib import AbstractAsyncContextManager
 from typing import Any
 
+from ..state import States
 from . import Transport
 
-__all__ = ["Rooted"]
+__all__ = ["Rooted", "Standing"]
 
 
 class Rooted(ABC):
@@ -60,3 +61,16 @@ class Rooted(ABC):
         """Close all connections. Idempotent."""
         for each in self._all():
             await each.close()
+
+
+class Standing(Rooted):
+    """A transport that stands for its root: what users get to know of connections is about the root's."""
+
+    @property
+    def states(self) -> States:
+        """What the interface's user gets to know of the connections; others than the root's do not count."""
+        return self._root.states
+
+    @states.setter
+    def states(self, states: States) -> None:
+        self._root.states = states

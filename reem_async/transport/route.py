@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from ..errors import ConnectionLost, NotConnected
+from ..errors import ConnectionLost, NotConnected, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, publishes, refusal, slot_of
@@ -72,11 +72,12 @@ class Route:
 
     async def contended(self) -> None:
         """Try once more at once: somebody else wrote to the same key; raise NotConnected if time is over."""
-        self._check_time("other programs kept writing to the same key")
+        self._check_time("other programs kept writing to the same key", NotConnected)
 
     async def refused(self, problem: Exception) -> None:
         """Note why nothing was applied, and wait if need be; raise NotConnected if time is over."""
-        self._check_time(str(problem))
+        # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.
+        self._check_time(str(problem), TlsRefused if isinstance(problem, TlsRefused) else NotConnected)
         asked, self._node, self.asking = self._node, None, False
         pause = _PAUSES[min(self._tries, len(_PAUSES) - 1)]
         self._tries += 1
@@ -87,12 +88,12 @@ class Route:
         if pause:
             await self._cluster.pause(pause)
 
-    def _check_time(self, reason: str) -> None:
+    def _check_time(self, reason: str, kind: type[NotConnected]) -> None:
         now = time.monotonic()
         if not self._deadline:
             self._deadline = now + self._cluster.timeout
         if now > self._deadline:
-            raise NotConnected(
+            raise kind(
                 f"the cluster did not take the call within {self._cluster.timeout:g} s ({reason}); "
                 "nothing was applied: call again, or give it longer with timeout="
             )

@@ -26,11 +26,10 @@ from redis.backoff import NoBackoff
 
 from ..errors import BadValue, ConnectionLost, NotConnected, Refused
 from ..plan import Command, Reply
-from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
-from .rooted import Rooted
+from .rooted import Standing
 
 if TYPE_CHECKING:
     from .aio import AsyncTransport
@@ -93,6 +92,13 @@ class SentinelOptions(Options):
     def address(self) -> str:
         """What is watched and by whom, for messages."""
         return f"{self.service} (sentinels {','.join(f'{host}:{port}' for host, port in self._sentinels)})"
+
+    @property
+    def url(self) -> str:
+        """What to write to get there, without user and password."""
+        hosts = ",".join(f"{host}:{port}" for host, port in self._sentinels)
+        database = f"/{self.database}" if self.database else ""
+        return f"{'rediss' if self.tls else 'redis'}+sentinel://{hosts}/{self.service}{database}"
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection that will look for the primary when it connects."""
@@ -161,7 +167,7 @@ def _is_up(row: dict[bytes, bytes]) -> bool:
     return row.get(b"master-link-status") == b"ok" and not any(word in flags for word in _UNFIT)
 
 
-class SentinelTransport(Rooted):
+class SentinelTransport(Standing):
     """Connections to the primary of the moment.
 
     Attributes:
@@ -181,15 +187,6 @@ class SentinelTransport(Rooted):
         self._lookout: _Lookout | None = None
         self._moved = False
         self._replicas: tuple[Address, ...] = ()
-
-    @property
-    def states(self) -> States:
-        """What the interface's user gets to know of the connections."""
-        return self._root.states
-
-    @states.setter
-    def states(self, states: States) -> None:
-        self._root.states = states
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` to the primary and return their replies.
