@@ -52,8 +52,11 @@ class DocumentReader:
         at = self.session.readers
         if counts_from_end(path):
             path, at = await self._resolved(path)
+        session = self.session
+        if session.ships.asynchronous:
+            await session.ships.ready()
         try:
-            sealed = await self.sealed(path, at)
+            sealed = await session.run(read(self.keys, path, session.ships, session.memory), at)
             return await opened(sealed) if sealed.crates else sealed.holder[0]
         except BadData:
             if at is self.session.transport:
@@ -158,7 +161,8 @@ class DocumentWriter:
         await self._set(path, encoded, loaded)
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
-        await self._check_place(path, loaded)
+        if loaded:
+            await self._check_place(path, loaded)
         await self._change(set_change(self.keys, path, encoded.text, loaded))
 
     async def delete(self, path: Path) -> None:
@@ -273,13 +277,19 @@ class DocumentWriter:
             return suffix(path + inner) + (f"~{unique}" if unique else "")
 
         encoded = encode(value, (self.name, *path), fits, name)
-        return encoded, tuple([await self._load(parcel) for parcel in encoded.parcels])
+        loaded = [
+            self._packed(parcel) if parcel.ship.blob is not None else await self._recorded(parcel)
+            for parcel in encoded.parcels
+        ]
+        return encoded, tuple(loaded)
 
-    async def _load(self, parcel: Parcel) -> Loaded:
+    def _packed(self, parcel: Parcel) -> Loaded:
+        blob = parcel.ship.blob.pack(parcel.value)
+        command = ("SET", self.keys.tag + parcel.suffix, blob)
+        return Loaded(parcel.suffix, parcel.ship.label, (command,), blob)
+
+    async def _recorded(self, parcel: Parcel) -> Loaded:
         key, ship = self.keys.tag + parcel.suffix, parcel.ship
-        if ship.blob is not None:
-            blob = ship.blob.pack(parcel.value)
-            return Loaded(parcel.suffix, ship.label, (("SET", key, blob),), blob)
         recorder = self.session.ships.new_recorder()
         result = ship.ship.write(key, parcel.value, recorder)
         if inspect.isawaitable(result):

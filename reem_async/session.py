@@ -6,11 +6,11 @@ import asyncio
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-from .errors import BadType, ClusterReply, NotAllowed, Refused, WrongKind, turned_down
+from .errors import BadType, ClusterReply, NotAllowed, Refused, turned_down
 from .plan import Plan
 from .plan.keys import Keys, keys_of
 from .plan.memory import Memory
@@ -91,16 +91,12 @@ class Session:
         """Return the server-side names of the top-level key `name`; raises BadKey."""
         return keys_of(check_top_key(name), self.namespace, self.options.database, self.transport.sharded)
 
-    async def run(self, plan: Plan, at: Transport | None = None) -> Any:
-        """Send a plan's commands, and those that follow from the replies; return the result.
+    def run(self, plan: Plan, at: Transport | None = None) -> Coroutine[Any, Any, Any]:
+        """Send a plan's commands, and those that follow from the replies; awaited, it is the result.
 
         They go `at` one server, or where their keys are.
         """
-        try:
-            return await drive(at or self.transport, plan)
-        except WrongKind as error:
-            (kind,) = await self.transport.roundtrip([("TYPE", error.key)])
-            raise WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?") from None
+        return drive(at or self.transport, plan)
 
     def stamp(self, keys: Keys) -> tuple[str, int]:
         """Return who publishes, and the number of this publisher's next update of a top-level key."""

@@ -66,6 +66,7 @@ _REFUSALS: dict[str, tuple[type[Refused], str]] = {
 }
 _NO_JSON = re.compile(r"ERR unknown command [`'\"]?JSON\.", re.IGNORECASE)
 _LONGEST_QUOTE = 120
+_NO_MEMBERS: frozenset[bytes] = frozenset()
 
 
 def refusal(text: str) -> Refused | None:
@@ -140,6 +141,8 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
 
 def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
     """Return what the registry of ships' keys holds, from a reply to SMEMBERS; raises BadData if it is none."""
+    if reply == []:
+        return _NO_MEMBERS
     members = checked(reply, keys, ())
     if not isinstance(members, list | set) or not all(type(member) is bytes for member in members):
         raise BadData(f"{keys.name}: the server sent {members!r:.60} where the members of {keys.registry} were due")

@@ -160,8 +160,10 @@ def change(it: Change, memory: Memory) -> Plan:
 def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
     """Plan the transaction; if the connection is `held`, it watches keys, and `given_up` is next if one changed."""
     memory.forget_numbers(it.keys.document)
-    stale = _stale(it, memory)
-    _expect(it, memory, stale)
+    known = memory.members(it.keys.document)
+    stale = _stale(it, known)
+    if it.loaded or stale:
+        _expect(it, memory, known, stale)
     before = _clearing(it, stale)
     writes = [command for each in it.loaded for command in each.commands]
     after: list[Command] = []
@@ -184,11 +186,13 @@ def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callabl
 
 def _moves(it: Change, memory: Memory) -> bool:
     """Return whether it may replace something that has moved from the place after which it is named."""
+    known = memory.members(it.keys.document)
     return (
-        it.replaces
+        bool(known)
+        and it.replaces
         and it.looks
         and any(isinstance(key, int) for key in it.path)
-        and any(may_hold(it.path, _place(member)) for member in memory.members(it.keys.document))
+        and any(may_hold(it.path, _place(member)) for member in known)
     )
 
 
@@ -204,22 +208,21 @@ def _change_exactly(it: Change, memory: Memory) -> Plan:
     return Plan([watch(it.keys), *survey(it.keys, it.path)], look, held=True)
 
 
-def _stale(it: Change, memory: Memory) -> list[bytes]:
+def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
     """Return the known keys that only what is replaced can refer to, and that are not written again."""
-    if not it.replaces or not it.looks:
+    if not it.replaces or not it.looks or not (known or it.gone):
         return []
     written = {each.suffix.encode() for each in it.loaded}
     if it.gone is not None:
         return [member for member in it.gone if member not in written]
     if any(isinstance(key, int) for key in it.path):
         return []
-    known = memory.members(it.keys.document)
     return [member for member in known if member not in written and below(_place(member), it.path)]
 
 
-def _expect(it: Change, memory: Memory, stale: list[bytes]) -> None:
+def _expect(it: Change, memory: Memory, known: frozenset[bytes], stale: list[bytes]) -> None:
     """Note what may exist from now on: the reply that tells may be lost."""
-    known, written = memory.members(it.keys.document), frozenset([each.suffix.encode() for each in it.loaded])
+    written = frozenset([each.suffix.encode() for each in it.loaded])
     if it.looks and (stale or not written <= known):
         memory.expects_members(it.keys.document, known | written)
 
@@ -234,9 +237,11 @@ def _place(member: bytes) -> Path:
 
 def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
     """Return the commands that make room: no leftovers, and no foreign type under a ship's key."""
+    if not stale and not it.loaded:
+        return []
     tag = it.keys.tag.encode()
     gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.loaded]
-    commands: list[Command] = [("UNLINK", *gone)] if gone else []
+    commands: list[Command] = [("UNLINK", *gone)]
     if stale:
         commands.append(("SREM", it.keys.registry, *stale))
     return commands
@@ -279,13 +284,9 @@ class _Outcome:
         reply = self.replies[self.main]
         if isinstance(reply, Exception):
             return explained(reply, self.it.keys, self.it.path)
-        failed = [
-            (command, other)
-            for command, other in zip(self.commands, self.replies, strict=True)
-            if isinstance(other, Exception)
-        ]
-        if failed:
-            return self._partial(*failed[0])
+        for command, other in zip(self.commands, self.replies, strict=True):
+            if isinstance(other, Exception):
+                return self._partial(command, other)
         try:
             return self.it.judge(reply)
         except Exception as error:
@@ -305,15 +306,13 @@ class _Outcome:
 
     def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
         """Return whether a key may exist that the document does not refer to."""
-        written = {each.suffix.encode() for each in self.it.loaded}
         if judged is REFUSED or isinstance(judged, Exception):
             # Of nothing that was not there to be deleted, or appended to, there can be leftovers of a broken call.
-            return bool(written) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
-        return (
-            self.it.replaces
-            and self.it.gone is None
-            and any(member not in written and may_hold(self.it.path, _place(member)) for member in members)
-        )
+            return bool(self.it.loaded) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
+        if not members or not self.it.replaces or self.it.gone is not None:
+            return False
+        written = {each.suffix.encode() for each in self.it.loaded}
+        return any(member not in written and may_hold(self.it.path, _place(member)) for member in members)
 
     def _finish(self, judged: Any) -> Any:
         if judged is REFUSED:

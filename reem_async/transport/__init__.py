@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
-from ..errors import BadData, ReemError
+from ..errors import BadData, ReemError, WrongKind
 from ..plan import Command, Plan, Reply, wire_commands
 from ..plan.replies import decoded
 from ..state import States
@@ -23,7 +23,7 @@ _UNWATCH: Command = ("UNWATCH",)
 class Held(Protocol):
     """One connection for one caller: what WATCH needs."""
 
-    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+    def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         """Send `commands` in one go and return their replies; error replies are returned, not raised."""
         ...
 
@@ -89,17 +89,26 @@ async def drive(transport: Transport, plan: Plan) -> Any:
     Suspends only where `transport` does: over a blocking transport it runs through at the first step.
     """
     while True:
-        if plan.held:
-            async with transport.hold() as held:
-                outcome = await _drive_held(held, plan)
-            if isinstance(outcome, _Raised):
-                raise outcome.error
-        else:
-            replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
-            outcome = decoded(plan, replies)
+        try:
+            if plan.held:
+                async with transport.hold() as held:
+                    outcome = await _drive_held(held, plan)
+                if isinstance(outcome, _Raised):
+                    raise outcome.error
+            else:
+                replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
+                outcome = decoded(plan, replies)
+        except WrongKind as error:
+            raise await _named(transport, error) from None
         if type(outcome) is not Plan:
             return outcome
         plan = outcome
+
+
+async def _named(transport: Transport, error: WrongKind) -> WrongKind:
+    """Return the error with the type that is there."""
+    (kind,) = await transport.roundtrip([("TYPE", error.key)])
+    return WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?")
 
 
 class _Raised(NamedTuple):

@@ -51,12 +51,16 @@ class AsyncTransport:
         self.at_end: Callable[[], Awaitable[None]] = self.release
         self._farewell: AsyncGenerator[None, None] | None = None
 
-    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` on the shared wire, or on the one for large values, and return the replies."""
+    def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
+        """Send `commands` on the shared wire, or on the one for large values; awaited, it is the replies."""
         bulk = bulk or _is_bulk(commands)
         wire = self._lanes.get(bulk)
         if wire is None or not wire.alive or self._loop is not asyncio.get_running_loop() or self._closed:
-            wire = await self._lane(bulk)
+            return self._connected(commands, bulk)
+        return wire.roundtrip(commands)
+
+    async def _connected(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+        wire = await self._lane(bulk)
         return await wire.roundtrip(commands)
 
     async def _lane(self, bulk: bool) -> Wire:

@@ -196,8 +196,8 @@ class Wire(asyncio.BufferedProtocol):
         if start < len(pieces):
             self._transport.write(pieces[start] if len(pieces) - start == 1 else b"".join(pieces[start:]))
 
-    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` and return their replies. Cancelling leaves the connection usable."""
+    def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> asyncio.Future[list[Reply]]:
+        """Send `commands`; awaited, it is their replies. Cancelling leaves the connection usable."""
         answer: asyncio.Future[list[Reply]] = self._loop.create_future()
 
         def done(outcome: list[Reply] | Exception) -> None:
@@ -209,7 +209,7 @@ class Wire(asyncio.BufferedProtocol):
                 answer.set_result(outcome)
 
         self.send(commands, done)
-        return await answer
+        return answer
 
     def abort(self, reason: Exception) -> None:
         """Break the connection; whoever waits gets `reason`."""
