@@ -12,7 +12,7 @@ from .errors import MissingKey
 from .plan import Plan, Reply
 from .plan.paths import Path, check_top_key, counts_from_end, parse, show
 from .plan.patterns import escaped, parse_pattern
-from .plan.placeholders import MARK_BYTES, Placeholder, find
+from .plan.placeholders import Placeholder, find, marked
 from .plan.reads import get_command, present
 from .plan.replies import loads
 from .plan.scan import documents
@@ -100,7 +100,7 @@ async def outline(interface: RedisInterface, path: str | Path) -> Outline:
     def decode(replies: Sequence[Reply]) -> Outline:
         text = present(replies[0], reader.keys, below)
         holder = loads(text, reader.keys)
-        if MARK_BYTES in text:
+        if marked(text):
             for crate in find(holder, reader.name):
                 crate.container[crate.key] = crate.placeholder
         return _outlined(holder[0], (reader.name, *below))

@@ -110,7 +110,7 @@ async def opened(sealed: Sealed) -> Any:
     """Return the value a read brought, everything the ships hold put in its place."""
     for crate, ship, reply in sealed.crates:
         value = interpret(sealed.name, crate, ship, reply)
-        crate.container[crate.key] = await value if inspect.isawaitable(value) else value
+        crate.container[crate.key] = await value if ship.blob is None and inspect.isawaitable(value) else value
     return sealed.holder[0]
 
 
@@ -285,7 +285,7 @@ class DocumentWriter:
 
     def _packed(self, parcel: Parcel) -> Loaded:
         blob = parcel.ship.blob.pack(parcel.value)
-        command = ("SET", self.keys.tag + parcel.suffix, blob)
+        command = ("SET", self.keys.tag + parcel.suffix, blob[0] if len(blob) == 1 else blob)
         return Loaded(parcel.suffix, parcel.ship.label, (command,), blob)
 
     async def _recorded(self, parcel: Parcel) -> Loaded:

@@ -12,7 +12,7 @@ import orjson
 from ..catalog import Outline
 from ..errors import BadData
 from ..plan.paths import Path
-from ..plan.placeholders import MARK_BYTES, find
+from ..plan.placeholders import find, marked
 from ..plan.trees import MISSING, CannotApply, removed, replaced
 from ..ships.numpy import NumpyShip
 
@@ -59,7 +59,7 @@ def tree_of(text: bytes, name: str) -> Any:
         holder = [orjson.loads(text)]
     except orjson.JSONDecodeError as error:  # nested too deep, or not from RedisJSON
         raise BadData(f"{name}: what the server sent is not JSON: {error}") from None
-    for crate in find(holder, name) if MARK_BYTES in text else ():
+    for crate in find(holder, name) if marked(text) else ():
         it = crate.placeholder
         crate.container[crate.key] = Leaf(it.label, it.summary, it.size)
     return holder[0]

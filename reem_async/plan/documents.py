@@ -122,7 +122,7 @@ def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
     """
     return (
         (b"u" in text and b"null" in text)
-        or (b"$" in text and placeholders.MARK_BYTES in text)
+        or placeholders.marked(text)
         or may_lose(text)
         or _may_be_deep(text, value, DEEPEST - above)
         or not _only_plain_types(value)

@@ -17,7 +17,7 @@ from ..ships.registry import Ships
 from . import Command
 from .keys import Keys
 from .paths import Path
-from .placeholders import MARK_BYTES, find
+from .placeholders import find, marked
 from .writes import Loaded
 
 __all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "published", "with_value"]
@@ -141,7 +141,7 @@ def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships
             position += length
             replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([blob])
         holder = [orjson.loads(text)]
-        for crate in find(holder, "a notice: ") if MARK_BYTES in text else ():
+        for crate in find(holder, "a notice: ") if marked(text) else ():
             crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]
     except Exception as error:  # a ship may raise anything over bytes that are not its own
         raise BadData(f"a notice holds a value that cannot be rebuilt: {error}") from None

@@ -16,7 +16,7 @@ from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
 from .paths import Path, show, to_jsonpath
-from .placeholders import MARK_BYTES, Crate, Placeholder, find
+from .placeholders import Crate, Placeholder, find, marked
 from .replies import checked, explained, full, loads, missing, type_name
 
 __all__ = ["BULK", "Sealed", "length", "read", "type_of"]
@@ -93,7 +93,7 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory, also: tuple[Comma
     def decode(replies: Sequence[Reply]) -> Any:
         text = present(replies[0], keys, path)
         holder = loads(text, keys)
-        crates = find(holder, keys.name) if MARK_BYTES in text else []
+        crates = find(holder, keys.name) if marked(text) else []
         if not crates:
             return Sealed(holder, keys.name, [], (command,), (text,))
         met = tuple(crate.placeholder for crate in crates)

@@ -11,7 +11,7 @@ from ..plan import Plan, Reply
 from ..plan.keys import Keys
 from ..plan.memory import Memory
 from ..plan.paths import Path
-from ..plan.placeholders import MARK_BYTES, find
+from ..plan.placeholders import find, marked
 from ..plan.reads import Sealed, get_command, present, read
 from ..plan.replies import loads
 from ..plan.trees import MISSING
@@ -50,7 +50,7 @@ def _snapshot(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
     def decode(replies: Sequence[Reply]) -> Any:
         text = present(replies[0], keys, path)
         holder = loads(text, keys)
-        crates = find(holder, keys.name) if MARK_BYTES in text else []
+        crates = find(holder, keys.name) if marked(text) else []
         if crates:
             memory.saw_layout(keys.document, path, tuple([crate.placeholder for crate in crates]))
             return read(keys, path, ships, memory, (note,))

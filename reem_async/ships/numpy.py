@@ -40,6 +40,8 @@ _HEADER = re.compile(
 _QUOTED = re.compile(r"""'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\"""")
 _DEEPEST = 64
 _SHORT = 1 << 9
+_SMALL = 1 << 12
+"""Bytes of data up to which copying them costs less than handling two pieces."""
 
 
 class NumpyShip(BlobShip):
@@ -66,19 +68,19 @@ class NumpyShip(BlobShip):
             raise BadType(
                 "a masked array would lose its mask; store {'data': a.filled(0), 'mask': np.ma.getmaskarray(a)}"
             )
-        _header(value.dtype, value.shape)
-        return value.nbytes, f"{_dtype_name(value.dtype)}[{','.join(map(str, value.shape))}]"
+        return value.nbytes, _summary(value.dtype, value.shape)
 
     def pack(self, value: np.ndarray[Any, Any]) -> tuple[Any, ...]:
-        """Return an .npy file in two pieces: its header, and the data, shared with a contiguous array."""
-        return _header(value.dtype, value.shape), flat(value)
+        """Return an .npy file: small in one piece, else the header and the data, shared with a contiguous array."""
+        header = _header(value.dtype, value.shape)
+        return (header + value.tobytes(),) if value.nbytes <= _SMALL else (header, flat(value))
 
     def unpack(self, blob: Any) -> np.ndarray[Any, Any]:
         """Return the array, read-only, sharing memory with `blob`."""
         if blob is None:
             raise BadData("the array's bytes are gone from the server (evicted, or removed by a program without REEM)")
         view = memoryview(blob)
-        size = _header_size(view)
+        size = _header_size(bytes(view[:12]), len(view))
         dtype, shape = _header_parser(size)(bytes(view[:size]))
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
@@ -116,7 +118,13 @@ def flat_buffer(word: Any) -> Any:
     return word
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=1024)
+def _summary(dtype: np.dtype[Any], shape: tuple[int, ...]) -> str:
+    """Return text such as `float64[640,480,3]`; raise BadType for what cannot be carried."""
+    _header(dtype, shape)
+    return f"{_dtype_name(dtype)}[{','.join(map(str, shape))}]"
+
+
 def _dtype_name(dtype: np.dtype[Any]) -> str:
     if dtype.names is None:
         return str(dtype)
@@ -152,13 +160,13 @@ def _descr(dtype: np.dtype[Any]) -> Any:
     return descr
 
 
-def _header_size(view: memoryview) -> int:
-    """Return how many bytes come before the data."""
-    if len(view) < 10 or bytes(view[:6]) != _MAGIC or view[6] not in (1, 2, 3) or view[7] != 0:
-        raise BadData(f"an array begins with {bytes(view[:16])!r}; REEM did not write it")
-    before = 10 if view[6] == 1 else 12
-    size = before + int.from_bytes(view[8:before], "little")
-    if size > len(view) or size > _LARGEST_HEADER:
+def _header_size(start: bytes, length: int) -> int:
+    """Return how many bytes come before the data, of an .npy file of `length` bytes that begins with `start`."""
+    if len(start) < 10 or not start.startswith(_MAGIC) or start[6] not in (1, 2, 3) or start[7] != 0:
+        raise BadData(f"an array begins with {start!r}; REEM did not write it")
+    before = 10 if start[6] == 1 else 12
+    size = before + int.from_bytes(start[8:before], "little")
+    if size > length or size > _LARGEST_HEADER:
         raise BadData("an array's header is longer than the array; REEM did not write it")
     return size
 

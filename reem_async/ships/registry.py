@@ -33,7 +33,8 @@ def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
 def _is_plain_blob(ship: BlobShip) -> bool:
     """Return whether `pack` and `unpack` are all there is to it."""
     kind = type(ship)
-    return all(getattr(kind, name) is getattr(BlobShip, name) for name in ("write", "read", "interpret_read"))
+    plain = all(getattr(kind, name) is getattr(BlobShip, name) for name in ("write", "read", "interpret_read"))
+    return plain and not inspect.iscoroutinefunction(kind.unpack)
 
 
 class Registered:
@@ -59,7 +60,7 @@ class Registered:
 
     def read_command(self, key: str) -> Command:
         """Return the command that fetches what is stored under `key`."""
-        return tuple(word.replace(_STAND_IN, key) if isinstance(word, str) else word for word in self._read)
+        return tuple([word.replace(_STAND_IN, key) if isinstance(word, str) else word for word in self._read])
 
 
 class Ships:

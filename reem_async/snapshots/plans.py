@@ -10,7 +10,7 @@ from ..errors import BadData, Conflict, PartialWrite, WrongKind
 from ..plan import Command, Plan, Reply
 from ..plan.keys import Keys
 from ..plan.memory import Memory
-from ..plan.placeholders import MARK_BYTES, find
+from ..plan.placeholders import find, marked
 from ..plan.reads import get_command
 from ..plan.replies import checked, loads
 from .values import Entry, Value, kind_of, settable
@@ -138,7 +138,7 @@ class _Dump:
 
     def _placed(self, text: bytes) -> set[str]:
         """Return the suffixes that the document refers to: all of them are in the registry, unless it was damaged."""
-        if MARK_BYTES not in text:
+        if not marked(text):
             return set()
         try:
             return {crate.placeholder.suffix for crate in find(loads(text, self.keys), self.keys.name)}

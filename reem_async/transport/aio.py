@@ -17,13 +17,12 @@ from ..plan import Command, Reply
 from ..state import States
 from .identity import WHO, who
 from .options import Options
-from .packing import size_of_largest
+from .packing import LARGE, size_of_largest
 from .patience import patience
 from .wire import Wire, open_wire
 
 __all__ = ["AsyncTransport"]
 
-_BULK = 1 << 16
 _SPARE = 4
 
 
@@ -213,6 +212,6 @@ class AsyncTransport:
 def _is_bulk(commands: Sequence[Command]) -> bool:
     """Return whether so much is sent that others should not wait behind it."""
     for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
-        if size_of_largest(command) >= _BULK:
+        if size_of_largest(command) >= LARGE:
             return True
     return False

@@ -18,8 +18,8 @@ __all__ = ["LARGE", "Piece", "pack", "size_of_largest"]
 
 Piece = bytes | memoryview
 
-LARGE = 8192
-"""Bytes from which a buffer becomes a piece of its own."""
+LARGE = 1 << 16
+"""Bytes from which a buffer becomes a piece of its own, on a connection where nobody waits behind it."""
 
 
 def pack(commands: Sequence[Command]) -> list[Piece]:
@@ -43,12 +43,17 @@ def size_of_largest(command: Command) -> int:
     largest = 0
     for word in command:
         kind = type(word)
+        if kind is str:
+            continue
+        size = 0
         if kind is bytes:
-            largest = max(largest, len(word))
+            size = len(word)
         elif kind is memoryview:
-            largest = max(largest, word.nbytes)
+            size = word.nbytes
         elif kind is tuple:
-            largest = max(largest, sum(map(len, word)))
+            size = sum(map(len, word))
+        if size > largest:
+            largest = size
     return largest
 
 
