@@ -35,7 +35,7 @@ def slices(pieces: Iterable[Any]) -> Iterator[Any]:
         give_way()
 
 
-def digest(head: bytes, body: Any) -> bytes:
+def digest(head: bytes, body: Any = b"") -> bytes:
     """Return 16 bytes that tell what `head` and `body` are from anything else."""
     total = hashlib.blake2b(digest_size=16, salt=hashlib.blake2b(head, digest_size=16).digest())
     for part in slices([body]):

@@ -295,6 +295,6 @@ class Scribe:
 def _described(label: str, path: Path, at: int, data: Any) -> Stored:
     if isinstance(data, np.ndarray):
         size, summary = _NUMPY.describe(data)
-        head, body = _NUMPY.pack(data)
-        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, digest(head, body))
+        unlike = digest(*_NUMPY.pack(data))
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, unlike)
     return Stored(label, path, at, len(data), label, digest=digest(b"", data))
