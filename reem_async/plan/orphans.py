@@ -13,13 +13,14 @@ from .paths import Path
 from .placeholders import find
 from .reads import get_command
 from .replies import explained, loads, registered
+from .staging import Staged
 
 __all__ = ["clean", "survey", "unreferred", "watch"]
 
 
-def watch(keys: Keys) -> Command:
-    """Return the command after which a transaction fails if document or registry have changed."""
-    return ("WATCH", keys.document, keys.registry)
+def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
+    """Return the command after which a transaction fails if document or registry, or what is coming, has changed."""
+    return ("WATCH", keys.document, keys.registry, *(each.name for each in coming))
 
 
 def survey(keys: Keys, path: Path) -> tuple[Command, ...]:

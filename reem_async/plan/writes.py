@@ -20,6 +20,7 @@ from .memory import Memory
 from .orphans import clean, survey, unreferred, watch
 from .paths import Path, below, may_hold, parse_suffix, show, to_jsonpath
 from .replies import checked, diagnose, explained, full, registered, settable, type_name
+from .staging import Staged, are_missing, looks_at, stage
 
 __all__ = [
     "Change",
@@ -196,16 +197,48 @@ def _moves(it: Change, memory: Memory) -> bool:
     )
 
 
-def _change_exactly(it: Change, memory: Memory) -> Plan:
+def _change_exactly(it: Change, memory: Memory, coming: Sequence[Staged] = ()) -> Plan:
     """Plan to look first, and then to remove with what is replaced whatever nothing refers to any more."""
 
     def look(replies: Sequence[Reply]) -> Plan:
-        gone = unreferred(replies[1:], it.keys)
+        if are_missing(replies[4:]):
+            return _unwatched(lambda: _send(it, coming, lambda: _change_exactly(it, memory, coming)))
+        gone = unreferred(replies[1:4], it.keys)
         if gone is None:
-            return Plan([("UNWATCH",)], lambda _: _change(it, memory), held=True)
-        return _change(it._replace(gone=gone), memory, held=True, given_up=lambda: _change_exactly(it, memory))
+            return _unwatched(lambda: _change(it, memory))
+        exact = it._replace(gone=gone)
+        return _change(exact, memory, held=True, given_up=lambda: _again(it, coming, attempt))
 
-    return Plan([watch(it.keys), *survey(it.keys, it.path)], look, held=True)
+    def attempt(it: Change, coming: Sequence[Staged]) -> Plan:
+        return _change_exactly(it, memory, coming)
+
+    return Plan([watch(it.keys, coming), *survey(it.keys, it.path), *looks_at(coming)], look, held=True)
+
+
+def _unwatched(then: Callable[[], Plan]) -> Plan:
+    return Plan([("UNWATCH",)], lambda _: then(), held=True)
+
+
+def _again(it: Change, coming: Sequence[Staged], attempt: Callable[[Change, Sequence[Staged]], Plan]) -> Plan:
+    """Plan the next attempt, somebody else having written meanwhile; what is large is sent before it, once."""
+    if coming:
+        return attempt(it, coming)
+    loaded = []
+    for each in it.loaded:
+        commands, sent = stage(each.commands, it.keys.tag, each.suffix)
+        coming = [*coming, *sent]
+        loaded.append(each._replace(commands=tuple(commands)))
+    moved = it._replace(loaded=tuple(loaded))
+    return _send(moved, coming, lambda: attempt(moved, coming)) if coming else attempt(it, ())
+
+
+def _send(it: Change, coming: Sequence[Staged], then: Callable[[], Plan]) -> Plan:
+    def decode(replies: Sequence[Reply]) -> Plan:
+        for reply in replies:
+            checked(reply, it.keys, it.path)
+        return then()
+
+    return Plan([each.upload for each in coming], decode)
 
 
 def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
@@ -334,18 +367,29 @@ def make_parents(keys: Keys, path: Path) -> Plan:
     return Plan(commands, decode)
 
 
-def exchange(it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory) -> Plan:
+def exchange(
+    it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory, coming: Sequence[Staged] = ()
+) -> Plan:
     """Plan a change that is made only if what `reads` fetch is still `before`.
 
     Raises (in decode):
         Conflict: It is not; nothing was written.
     """
     where = show(full(it.keys, it.path))
+    end = 4 + len(reads)
 
     def compare(replies: Sequence[Reply]) -> Any:
-        if tuple(replies[4:]) == before:
-            exact = it._replace(gone=unreferred(replies[1:4], it.keys))
-            return _change(exact, memory, held=True, given_up=lambda: exchange(it, reads, before, memory))
-        raise Conflict(f"{where} was changed by somebody else while it was edited; nothing was written: edit it again")
+        if tuple(replies[4:end]) != before:
+            raise Conflict(
+                f"{where} was changed by somebody else while it was edited; nothing was written: edit it again"
+            )
+        if are_missing(replies[end:]):
+            return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
+        exact = it._replace(gone=unreferred(replies[1:4], it.keys))
+        return _change(exact, memory, held=True, given_up=lambda: _again(it, coming, attempt))
 
-    return Plan([watch(it.keys), *survey(it.keys, it.path), *reads], compare, held=True)
+    def attempt(it: Change, coming: Sequence[Staged]) -> Plan:
+        return exchange(it, reads, before, memory, coming)
+
+    commands = [watch(it.keys, coming), *survey(it.keys, it.path), *reads, *looks_at(coming)]
+    return Plan(commands, compare, held=True)

@@ -9,6 +9,7 @@ from contextlib import suppress
 from ..errors import BadKey
 from ..plan.paths import check_top_key
 from ..plan.patterns import Pattern, escaped
+from ..plan.staging import STAGED
 from ..session import Session
 from .plans import DOCUMENT, scan, shown, strangers, types
 from .values import Entry
@@ -16,6 +17,7 @@ from .values import Entry
 __all__ = ["Survey", "matcher", "survey"]
 
 _OF_KEY = {b":ships", b":last"}
+_COMING = STAGED.encode()
 _TAGGED = re.compile(rb"\{([^{}]*)\}(.*)", re.DOTALL)
 
 Wanted = Callable[[str], bool]
@@ -44,7 +46,8 @@ class Survey:
         """Return the keys that are not REEM's, each with its type. One round trip for each tag in question."""
         found, documents = list(self._foreign), set(self.names)
         for name, suffixes in sorted(self._tagged.items()):
-            if name not in documents or suffixes - _OF_KEY:
+            suffixes = {suffix for suffix in suffixes if not suffix.startswith(_COMING)}
+            if suffixes and (name not in documents or suffixes - _OF_KEY):
                 found += await session.run(strangers(session.keys(name), sorted(suffixes)))
         return found
 

@@ -6,7 +6,8 @@ little later, within the call's time limit. A connection that breaks after sendi
 
 One transaction is guarded besides: one that publishes. Servers look at a transaction's keys before
 they run it, but not if it holds a PUBLISH of any kind: while a slot is moving they would then write
-to a key that has left already. So its keys are watched first, which takes one more round trip.
+to a key that has left already. So its keys are watched first, which takes one more round trip, and
+another where there is something large, which is sent before: see `plan.staging`.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from ..state import States
 from . import Held, Transport
 from .endpoints import NewTransport, address_of, listed
 from .options import Address, NodeOptions, Options
-from .redirects import Moved, key_slot, keys_in, publishes, refusal, slot_of, slots_of
+from .publication import Publication
+from .redirects import Moved, key_slot, publishes, refusal, slot_of, slots_of
 from .rooted import Rooted
-from .route import HeldAcross, Route, asked_of, places_refused, watched
+from .route import HeldAcross, Route, asked_of, places_refused
 
 __all__ = ["ClusterOptions", "ClusterTransport"]
 
@@ -305,22 +307,20 @@ class ClusterTransport(Rooted):
         return answers
 
     async def _publish(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        """Send a transaction that publishes, over a connection that watches its keys."""
+        """Send a transaction that publishes, over a connection that watches its keys; what is large goes before it."""
         slot = slot_of(commands)
         assert slot is not None  # there is a notice, so there is a key
-        route = Route(self, slot)
+        route, publication = Route(self, slot), Publication(commands)
         async with self._root.ordered(f"publishing {slot % _PUBLISHING}"):
             while True:
-                problem: Exception | None = None
                 try:
                     node = await route.node()
-                    async with node.hold() as held:
-                        problem = await watched(held, keys_in(commands), route.asking)
-                        if problem is None:
-                            replies = await asked_of(held, commands, route.asking, bulk)
-                            problem = refusal(replies)
-                            if problem is None and replies[-1] is not None:
-                                return replies
+                    problem, replies = await publication.send_ahead(node, route.asking)
+                    if problem is None and replies is None:
+                        async with node.hold() as held:
+                            problem, replies = await publication.publish(held, route.asking, bulk)
+                    if replies is not None:
+                        return replies
                 except NotConnected as error:
                     problem = error
                 await (route.contended() if problem is None else route.refused(problem))

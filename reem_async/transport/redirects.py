@@ -81,7 +81,7 @@ def keys_in(commands: Sequence[Command]) -> list[bytes]:
     """Return all keys of a transaction, its channel left out, each once."""
     found: dict[bytes, None] = {}
     for command in commands:
-        if command[0] == "UNLINK":
+        if command[0] in ("UNLINK", "RENAME"):
             found.update(dict.fromkeys(word if type(word) is bytes else str(word).encode() for word in command[1:]))
         elif command[0] not in _NO_KEYS_IN_TRANSACTIONS and (key := key_of(command)) is not None:
             found[key] = None

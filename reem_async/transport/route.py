@@ -137,7 +137,7 @@ class HeldAcross:
     async def _end(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         """Send a transaction. If its keys are moving it is given up, as after a change of what is watched."""
         assert self._held is not None
-        problem = await watched(self._held, keys_in(commands), self._asking) if publishes(commands) else None
+        problem = (await watched(self._held, keys_in(commands), self._asking))[0] if publishes(commands) else None
         if problem is None:
             replies = await asked_of(self._held, commands, self._asking, bulk)
             problem = refusal(replies)
@@ -188,23 +188,25 @@ def _one_by_one(command: Command) -> list[Command]:
     return [(command[0], key) for key in command[1:]] if command[0] == "WATCH" else [command]
 
 
-async def watched(held: Held, keys: Sequence[bytes], asking: bool) -> Exception | None:
-    """Watch all keys, so that none can leave unnoticed; return why that does not help, or None.
+async def watched(
+    held: Held, keys: Sequence[bytes], asking: bool, looks: Sequence[Command] = ()
+) -> tuple[Exception | None, list[Reply]]:
+    """Watch all keys, so that none can leave unnoticed; return why that does not help, or None, and what `looks` see.
 
     Raises:
         NotConnected: The connection broke, before anything was sent that matters.
         redis.exceptions.RedisError: This user may not.
     """
     try:
-        (reply,) = await asked_of(held, [("WATCH", *keys)], asking, bulk=False)
+        reply, *seen = replies = await asked_of(held, [("WATCH", *keys), *looks], asking, bulk=False)
     except ConnectionLost as error:
         raise NotConnected(f"{error}; nothing was sent but a look at the keys, so nothing was applied") from error
-    problem = refusal([reply])
+    problem = refusal(replies)
     if problem is None and isinstance(reply, Exception):
         raise reply
     if problem is not None:
         await held.roundtrip([_UNWATCH])
-    return problem
+    return problem, seen
 
 
 def places_refused(answers: Sequence[Reply]) -> list[int]:

@@ -1,0 +1,77 @@
+"""Large values that are sent before the transaction that puts them in place.
+
+A transaction under WATCH is given up if anybody writes to the same top-level key between the look and its end. An
+array of 8 MB takes longer to arrive than a robot's other programs wait between two writes: as part of the transaction
+it would never get through. So it is sent first, under a name that nothing refers to, and the transaction renames it.
+Should its sender die in between, the server forgets it after a minute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from . import Command, Reply
+
+__all__ = ["STAGED", "Staged", "are_missing", "is_large", "looks_at", "stage"]
+
+STAGED = ":staged:"
+"""Follows the tag of a top-level key in the names of what was sent and not yet put in place."""
+
+_LARGE = 1 << 16
+_KEPT = 60
+"""Seconds."""
+
+
+class Staged(NamedTuple):
+    """A value on its way.
+
+    Attributes:
+        name: Where it waits.
+        upload: What sends it there.
+    """
+
+    name: str
+    upload: Command
+
+
+def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Command], list[Staged]]:
+    """Return commands that put large values in place by renaming, and what has to be sent before.
+
+    Args:
+        commands: Those that would send the values themselves.
+        tag: Of the top-level key.
+        unique: Makes the names of what is on its way.
+    """
+    coming: list[Staged] = []
+    moving: list[Command] = []
+    for command in commands:
+        if is_large(command):
+            _, key, blob = command
+            name = f"{tag}{STAGED}{unique}.{len(coming)}"
+            coming.append(Staged(name, ("SET", name, blob, "EX", _KEPT)))
+            moving += [("PERSIST", name), ("RENAME", name, key)]
+        else:
+            moving.append(command)
+    return moving, coming
+
+
+def is_large(command: Command) -> bool:
+    """Return whether a command stores a value that takes long to arrive."""
+    return len(command) == 3 and command[0] == "SET" and _size(command[2]) >= _LARGE
+
+
+def _size(word: Any) -> int:
+    if isinstance(word, tuple):
+        return sum(map(len, word))
+    return len(word) if isinstance(word, bytes | memoryview) else 0
+
+
+def looks_at(coming: Sequence[Staged]) -> list[Command]:
+    """Return the commands that tell, once the names are watched, whether all that was sent is there."""
+    return [("TYPE", each.name) for each in coming]
+
+
+def are_missing(replies: Sequence[Reply]) -> bool:
+    """Return whether replies to `looks_at` say that something must be sent again: it was forgotten, or left behind."""
+    return b"none" in replies
