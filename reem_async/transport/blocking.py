@@ -32,7 +32,7 @@ __all__ = ["BlockingTransport"]
 
 _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
-_SLICE = 1 << 18
+_SLICE = 1 << 19
 """Bytes of a large value that are sent before giving way."""
 _LOOKS = 40
 """How many times per time limit to look whether a large value is moving."""
