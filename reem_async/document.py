@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from .plan.writes import (
     takes,
 )
 from .session import Session
+from .transport.packing import LARGE, has_large
 
 if TYPE_CHECKING:
     from .plan.arithmetic import Operation
@@ -158,7 +159,16 @@ class DocumentWriter:
             path = await resolved(self, path, PathRefused)
         unique = "" if _is_fixed(path) else _unique()
         encoded, loaded = await self._prepared(path, value, unique)
-        await self._set(path, encoded, loaded)
+        await self._in_turn(lambda: self._set(path, encoded, loaded), [encoded.text], loaded)
+
+    async def _in_turn(
+        self, call: Callable[[], Coroutine[Any, Any, None]], texts: Sequence[bytes], loaded: Sequence[Loaded]
+    ) -> None:
+        """Make a change that no later one overtakes, even if the caller is cancelled."""
+        transport, document = self.session.transport, self.keys.document
+        await transport.settled(document)
+        # A large value goes over another connection than a small one, and on its way up cannot be taken back.
+        await (transport.whole(document, call()) if _are_large(texts, loaded) else call())
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         if loaded:
@@ -169,7 +179,7 @@ class DocumentWriter:
         """Remove what is at `path`."""
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
-        await self._delete(path)
+        await self._in_turn(lambda: self._delete(path), (), ())
         self.session.memory.forget_shapes(self.keys.document)
 
     async def _delete(self, path: Path) -> None:
@@ -187,7 +197,7 @@ class DocumentWriter:
             texts.append(encoded.text)
             loaded.extend(parcels)
         if texts:
-            await self._append(path, texts, tuple(loaded))
+            await self._in_turn(lambda: self._append(path, texts, tuple(loaded)), texts, loaded)
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         await self._check_list(path, loaded)
@@ -230,6 +240,7 @@ class DocumentWriter:
         return await self._calculated(plan(lambda: ()))
 
     async def _calculated(self, plan: Plan) -> Any:
+        await self.session.transport.settled(self.keys.document)
         try:
             return await self.session.run(plan)
         except BaseException:  # it may have been applied or not
@@ -239,7 +250,8 @@ class DocumentWriter:
     async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
         encoded, loaded = await self._prepared(path, value, _unique())
-        await self._exchange(set_change(self.keys, path, encoded.text, loaded), before)
+        it = set_change(self.keys, path, encoded.text, loaded)
+        await self._in_turn(lambda: self._exchange(it, before), [encoded.text], loaded)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         gone = tuple(crate.placeholder.suffix.encode() for crate, _, _ in before.crates)
@@ -296,6 +308,11 @@ class DocumentWriter:
             await result
         commands: tuple[Command, ...] = tuple(recorder.commands)
         return Loaded(parcel.suffix, ship.label, commands)
+
+
+def _are_large(texts: Sequence[bytes], loaded: Sequence[Loaded]) -> bool:
+    """Return whether so much is sent that it goes over the connection for large values."""
+    return any(len(text) >= LARGE for text in texts) or any(has_large(each.commands) for each in loaded)
 
 
 def _is_fixed(path: Path) -> bool:

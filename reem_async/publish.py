@@ -29,11 +29,6 @@ class DocumentPublisher(DocumentWriter):
     """
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
-        call = self._set_in_order(path, encoded, loaded)
-        # A large value goes another way than a small one: it must have arrived before the next may start.
-        await (self.session.transport.whole(call) if loaded else call)
-
-    async def _set_in_order(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             await self._check_place(path, loaded)
             stamp = self._stamp(path)
@@ -49,10 +44,6 @@ class DocumentPublisher(DocumentWriter):
             await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
-        call = self._append_in_order(path, texts, loaded)
-        await (self.session.transport.whole(call) if loaded else call)
-
-    async def _append_in_order(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             await self._check_list(path, loaded)
             it = append_change(self.keys, path, texts, loaded, notices=self._announced(path))

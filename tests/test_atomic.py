@@ -419,3 +419,38 @@ async def test_a_cancelled_write_is_whole_or_absent(akvs, key, raw):
     await akvs[key()].write(frame(99, SMALL))
     assert_same(await akvs[key()].read(), frame(99, SMALL))
     assert_no_orphans(raw, key())
+
+
+LARGE_WRITES = {
+    "array": lambda place: place.write({"n": "old", "image": np.zeros(1_000_000)}),
+    "text": lambda place: place.write({"n": "old", "text": "x" * 3_000_000}),
+    "items": lambda place: place["list"].extend([np.zeros(1_000_000)]),
+}
+LATER = {
+    "write": (lambda place: place["n"].write("new"), lambda value: value["n"] == "new"),
+    "delete": (lambda place: place["n"].delete(), lambda value: "n" not in value),
+    "whole": (lambda place: place.write("new"), lambda value: value == "new"),
+    "add": (lambda place: place["count"].add(1), lambda value: value["count"] == 1),
+}
+
+
+@pytest.mark.parametrize("later", LATER)
+@pytest.mark.parametrize("large", LARGE_WRITES)
+@pytest.mark.parametrize("publishes", [False, True])
+async def test_nothing_overtakes_a_cancelled_large_write(akvs, apspace, key, publishes, large, later):
+    """Though a small one takes another connection: what the program did last is what is there."""
+    place = (apspace if publishes else akvs)[key()]
+    change, is_there = LATER[later]
+    for number in range(12):
+        await akvs[key()].write({"n": "old", "count": 0, "list": [np.zeros(3)]})
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(LARGE_WRITES[large](place), 0.0004 * number)
+        try:
+            await change(place)
+        except (MissingKey, PathRefused):
+            assert large != "items"  # the large write took away what was to be changed
+            continue
+        after = await akvs[key()].read()
+        assert is_there(after)
+        await asyncio.sleep(0.02)
+        assert_same(await akvs[key()].read(), after)

@@ -347,6 +347,7 @@ async def test_who_begins_to_follow_in_an_outage_misses_nothing_and_no_connectio
             early = Mirror(key(str(number)), interface)
             await early.listen()
             await early.close()
+        await KeyValueStore(interface).keys()  # and to any that may be asked who has what
         base = len(connections(raw))
         for number in range(5):
             await cut(raw, others)

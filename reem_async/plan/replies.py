@@ -141,7 +141,7 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
 
 def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
     """Return what the registry of ships' keys holds, from a reply to SMEMBERS; raises BadData if it is none."""
-    if reply == []:
+    if not reply and type(reply) in (list, set):
         return _NO_MEMBERS
     members = checked(reply, keys, ())
     if not isinstance(members, list | set) or not all(type(member) is bytes for member in members):

@@ -267,7 +267,7 @@ async def _put(session: Session, keys: Keys, entry: Entry, done: list[str], *, r
     )
     async with session.transport.ordered(keys.channel):
         try:
-            await session.transport.whole(session.run(plan))
+            await session.transport.whole(keys.document, session.run(plan))
         except (Conflict, WrongKind) as error:
             if not done:
                 raise

@@ -62,8 +62,12 @@ class Transport(Held, Protocol):
         """Wait."""
         ...
 
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled; return its result."""
+    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call`, which writes to the top-level `key`, to its end even if the caller is cancelled."""
+        ...
+
+    async def settled(self, key: str) -> None:
+        """Wait for what cancelled callers have left to run: what they wrote to `key` must not come later than this."""
         ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:

@@ -17,7 +17,7 @@ from ..plan import Command, Reply
 from ..state import States
 from .identity import WHO, who
 from .options import Options
-from .packing import LARGE, size_of_largest
+from .packing import has_large
 from .patience import patience
 from .wire import Wire, open_wire
 
@@ -46,13 +46,14 @@ class AsyncTransport:
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
         self._orders: dict[str, anyio.Lock] = {}
+        self._left: dict[str, set[asyncio.Task[Any]]] = {}
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
         self._farewell: AsyncGenerator[None, None] | None = None
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         """Send `commands` on the shared wire, or on the one for large values; awaited, it is the replies."""
-        bulk = bulk or _is_bulk(commands)
+        bulk = bulk or has_large(commands)
         wire = self._lanes.get(bulk)
         if wire is None or not wire.alive or self._loop is not asyncio.get_running_loop() or self._closed:
             return self._connected(commands, bulk)
@@ -135,6 +136,7 @@ class AsyncTransport:
         self._opening.clear()
         self._spare.clear()
         self._orders.clear()
+        self._left.clear()
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[Wire]:
@@ -170,14 +172,32 @@ class AsyncTransport:
         """Wait."""
         await asyncio.sleep(seconds)
 
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled: what comes after it must not overtake it."""
+    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
+        """Run `call` to its end even if the caller is cancelled: what comes after it must not overtake it.
+
+        A large value goes over another connection than a small one.
+        """
         task = asyncio.get_running_loop().create_task(call)
         try:
             return await asyncio.shield(task)
         except asyncio.CancelledError:
-            task.add_done_callback(lambda done: done.cancelled() or done.exception())
+            left = self._left.setdefault(key, set())
+            left.add(task)
+            task.add_done_callback(lambda done: self._end_of_left(key, done))
             raise
+
+    def _end_of_left(self, key: str, done: asyncio.Task[Any]) -> None:
+        if not done.cancelled():
+            done.exception()  # nobody is left to hear of it
+        left = self._left.get(key, set())
+        left.discard(done)
+        if not left:
+            self._left.pop(key, None)
+
+    async def settled(self, key: str) -> None:
+        """Wait for what cancelled callers have left to run."""
+        while left := self._left.get(key):
+            await asyncio.wait(left)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
@@ -207,11 +227,3 @@ class AsyncTransport:
         self._forget()
         for wire in wires:
             await wire.close()
-
-
-def _is_bulk(commands: Sequence[Command]) -> bool:
-    """Return whether so much is sent that others should not wait behind it."""
-    for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
-        if size_of_largest(command) >= LARGE:
-            return True
-    return False

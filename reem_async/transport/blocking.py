@@ -24,7 +24,7 @@ from ..plan import Command, Reply
 from ..state import States
 from .identity import WHO, who
 from .options import Options
-from .packing import Piece, pack
+from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import patience, unsent
 
@@ -89,7 +89,7 @@ class _Line:
             self._set_limit(limit)
         try:
             receive = self._socket.recv_into
-            if len(pieces) == 1:
+            if len(pieces) == 1 and len(pieces[0]) < SLOW:
                 self._socket.sendall(pieces[0])
             else:
                 self._send_large(pieces, limit)
@@ -275,9 +275,12 @@ class BlockingTransport:
         """Wait, and the thread with it."""
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
 
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
         """Run `call`; nothing can cancel it half way."""
         return await call
+
+    async def settled(self, key: str) -> None:
+        """Return: nobody can leave a call to run."""
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""

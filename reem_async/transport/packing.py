@@ -14,12 +14,15 @@ import hiredis
 
 from ..plan import Command
 
-__all__ = ["LARGE", "Piece", "pack", "size_of_largest"]
+__all__ = ["LARGE", "SLOW", "Piece", "has_large", "pack"]
 
 Piece = bytes | memoryview
 
 LARGE = 1 << 16
 """Bytes from which a buffer becomes a piece of its own, on a connection where nobody waits behind it."""
+
+SLOW = 1 << 13
+"""Bytes that may take longer on a slow link than a call has: as long as they move, it is not given up."""
 
 
 def pack(commands: Sequence[Command]) -> list[Piece]:
@@ -36,6 +39,14 @@ def pack(commands: Sequence[Command]) -> list[Piece]:
     if small:
         pieces.append(b"".join(small))
     return pieces
+
+
+def has_large(commands: Sequence[Command]) -> bool:
+    """Return whether so much is sent that others should not wait behind it."""
+    for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
+        if size_of_largest(command) >= LARGE:
+            return True
+    return False
 
 
 def size_of_largest(command: Command) -> int:

@@ -26,9 +26,13 @@ class Rooted(ABC):
         """Wait."""
         await self._root.pause(seconds)
 
-    async def whole(self, call: Coroutine[Any, Any, Any]) -> Any:
+    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
         """Run `call` to its end even if the caller is cancelled; return its result."""
-        return await self._root.whole(call)
+        return await self._root.whole(key, call)
+
+    async def settled(self, key: str) -> None:
+        """Wait for what cancelled callers have left to run."""
+        await self._root.settled(key)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""

@@ -21,7 +21,7 @@ import hiredis
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from .options import Options
-from .packing import LARGE, Piece, pack
+from .packing import LARGE, SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import confirmed, patience, unsent
 
@@ -149,7 +149,7 @@ class Wire(asyncio.BufferedProtocol):
         self._watch_until(now + limit)
         if idle and not self._outbox:
             self._write(pieces)
-            if len(pieces) > 1:
+            if len(pieces) > 1 or len(pieces[0]) >= SLOW:
                 self._watch_upload(limit)
             return
         # Others wait already: what is sent in the same turn of the loop goes out in one system call.
@@ -179,7 +179,7 @@ class Wire(asyncio.BufferedProtocol):
         pieces, self._outbox = self._outbox, []
         if self._reason is None:
             self._write(pieces)
-            if sum(map(len, pieces)) >= LARGE:
+            if sum(map(len, pieces)) >= SLOW:
                 self._watch_upload(self._timeout)
 
     def _write(self, pieces: list[Piece]) -> None:
