@@ -35,6 +35,9 @@ if TYPE_CHECKING:
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
 
 
+Call = Callable[[], Coroutine[Any, Any, None]]
+
+
 class DocumentReader:
     """Reads one top-level key.
 
@@ -159,16 +162,28 @@ class DocumentWriter:
             path = await resolved(self, path, PathRefused)
         unique = "" if _is_fixed(path) else _unique()
         encoded, loaded = await self._prepared(path, value, unique)
-        await self._in_turn(lambda: self._set(path, encoded, loaded), [encoded.text], loaded)
+        await self._in_turn(lambda: self._set(path, encoded, loaded), len(encoded.text), loaded)
 
-    async def _in_turn(
-        self, call: Callable[[], Coroutine[Any, Any, None]], texts: Sequence[bytes], loaded: Sequence[Loaded]
-    ) -> None:
-        """Make a change that no later one overtakes, even if the caller is cancelled."""
-        transport, document = self.session.transport, self.keys.document
-        await transport.settled(document)
-        # A large value goes over another connection than a small one, and on its way up cannot be taken back.
-        await (transport.whole(document, call()) if _are_large(texts, loaded) else call())
+    def _in_turn(self, call: Call, size: int = 0, loaded: Sequence[Loaded] = ()) -> Coroutine[Any, Any, None]:
+        """Make a change, whose longest text has `size` bytes, that no later one overtakes, cancelled or not.
+
+        A large value goes over another connection than a small one, and on its way up cannot be taken back.
+        """
+        if size >= LARGE or (loaded and any(has_large(each.commands) for each in loaded)):
+            return self._whole(call)
+        return call() if self.session.transport.is_settled(self.keys.document) else self._after_others(call)
+
+    async def _whole(self, call: Call) -> None:
+        await self._settled()
+        await self.session.transport.whole(self.keys.document, call())
+
+    async def _after_others(self, call: Call) -> None:
+        await self._settled()
+        await call()
+
+    async def _settled(self) -> None:
+        while not self.session.transport.is_settled(self.keys.document):
+            await self.session.transport.settle(self.keys.document)
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         if loaded:
@@ -179,7 +194,7 @@ class DocumentWriter:
         """Remove what is at `path`."""
         if counts_from_end(path):
             path = await resolved(self, path, MissingKey)
-        await self._in_turn(lambda: self._delete(path), (), ())
+        await self._in_turn(lambda: self._delete(path))
         self.session.memory.forget_shapes(self.keys.document)
 
     async def _delete(self, path: Path) -> None:
@@ -197,7 +212,8 @@ class DocumentWriter:
             texts.append(encoded.text)
             loaded.extend(parcels)
         if texts:
-            await self._in_turn(lambda: self._append(path, texts, tuple(loaded)), texts, loaded)
+            longest = max(map(len, texts))
+            await self._in_turn(lambda: self._append(path, texts, tuple(loaded)), longest, loaded)
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         await self._check_list(path, loaded)
@@ -240,7 +256,7 @@ class DocumentWriter:
         return await self._calculated(plan(lambda: ()))
 
     async def _calculated(self, plan: Plan) -> Any:
-        await self.session.transport.settled(self.keys.document)
+        await self._settled()
         try:
             return await self.session.run(plan)
         except BaseException:  # it may have been applied or not
@@ -251,7 +267,7 @@ class DocumentWriter:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
         encoded, loaded = await self._prepared(path, value, _unique())
         it = set_change(self.keys, path, encoded.text, loaded)
-        await self._in_turn(lambda: self._exchange(it, before), [encoded.text], loaded)
+        await self._in_turn(lambda: self._exchange(it, before), len(encoded.text), loaded)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         gone = tuple(crate.placeholder.suffix.encode() for crate, _, _ in before.crates)
@@ -308,11 +324,6 @@ class DocumentWriter:
             await result
         commands: tuple[Command, ...] = tuple(recorder.commands)
         return Loaded(parcel.suffix, ship.label, commands)
-
-
-def _are_large(texts: Sequence[bytes], loaded: Sequence[Loaded]) -> bool:
-    """Return whether so much is sent that it goes over the connection for large values."""
-    return any(len(text) >= LARGE for text in texts) or any(has_large(each.commands) for each in loaded)
 
 
 def _is_fixed(path: Path) -> bool:

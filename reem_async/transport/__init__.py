@@ -66,8 +66,12 @@ class Transport(Held, Protocol):
         """Run `call`, which writes to the top-level `key`, to its end even if the caller is cancelled."""
         ...
 
-    async def settled(self, key: str) -> None:
-        """Wait for what cancelled callers have left to run: what they wrote to `key` must not come later than this."""
+    def is_settled(self, key: str) -> bool:
+        """Return whether cancelled callers have left nothing to run that writes to `key`."""
+        ...
+
+    async def settle(self, key: str) -> None:
+        """Wait for what cancelled callers have left to run: it must not come after what is written next."""
         ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:

@@ -194,10 +194,13 @@ class AsyncTransport:
         if not left:
             self._left.pop(key, None)
 
-    async def settled(self, key: str) -> None:
+    def is_settled(self, key: str) -> bool:
+        """Return whether cancelled callers have left nothing to run that writes to `key`."""
+        return key not in self._left
+
+    async def settle(self, key: str) -> None:
         """Wait for what cancelled callers have left to run."""
-        while left := self._left.get(key):
-            await asyncio.wait(left)
+        await asyncio.wait(self._left[key])
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""

@@ -279,8 +279,12 @@ class BlockingTransport:
         """Run `call`; nothing can cancel it half way."""
         return await call
 
-    async def settled(self, key: str) -> None:
-        """Return: nobody can leave a call to run."""
+    def is_settled(self, key: str) -> bool:
+        """Return True: nobody can leave a call to run."""
+        return True
+
+    async def settle(self, key: str) -> None:
+        """Return: there is nothing to wait for."""
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""

@@ -30,9 +30,13 @@ class Rooted(ABC):
         """Run `call` to its end even if the caller is cancelled; return its result."""
         return await self._root.whole(key, call)
 
-    async def settled(self, key: str) -> None:
+    def is_settled(self, key: str) -> bool:
+        """Return whether cancelled callers have left nothing to run that writes to `key`."""
+        return self._root.is_settled(key)
+
+    async def settle(self, key: str) -> None:
         """Wait for what cancelled callers have left to run."""
-        await self._root.settled(key)
+        await self._root.settle(key)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""
