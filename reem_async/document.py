@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import secrets
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,16 +26,12 @@ from .plan.writes import (
     takes,
 )
 from .session import Session
-from .transport.packing import LARGE, has_large
 
 if TYPE_CHECKING:
     from .plan.arithmetic import Operation
     from .transport import Transport
 
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
-
-
-Call = Callable[[], Coroutine[Any, Any, None]]
 
 
 class DocumentReader:
@@ -159,33 +155,22 @@ class DocumentWriter:
     async def set(self, path: Path, value: Any) -> None:
         """Store `value` at `path`: one transaction."""
         if counts_from_end(path):
-            path = await resolved(self, path, PathRefused)
+            path = await self._from_front(path, PathRefused)
         unique = "" if _is_fixed(path) else _unique()
         encoded, loaded = await self._prepared(path, value, unique)
-        await self._in_turn(lambda: self._set(path, encoded, loaded), len(encoded.text), loaded)
-
-    def _in_turn(self, call: Call, size: int = 0, loaded: Sequence[Loaded] = ()) -> Coroutine[Any, Any, None]:
-        """Make a change, whose longest text has `size` bytes, that no later one overtakes, cancelled or not.
-
-        A large value goes over another connection than a small one, and on its way up cannot be taken back.
-        """
-        if size >= LARGE or (loaded and any(has_large(each.commands) for each in loaded)):
-            return self._whole(call)
-        return call() if self.session.transport.is_settled(self.keys.document) else self._after_others(call)
-
-    async def _whole(self, call: Call) -> None:
-        await self._settled()
-        await self.session.transport.whole(self.keys.document, call())
-
-    async def _after_others(self, call: Call) -> None:
-        await self._settled()
-        await call()
+        await self._set(path, encoded, loaded)
 
     async def _settled(self) -> None:
-        while not self.session.transport.is_settled(self.keys.document):
+        """Wait for large values that cancelled calls have left on their way, over another connection."""
+        if not self.session.transport.is_settled(self.keys.document):
             await self.session.transport.settle(self.keys.document)
 
+    async def _from_front(self, path: Path, error: type[Exception]) -> Path:
+        await self._settled()
+        return await resolved(self, path, error)
+
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+        await self._settled()
         if loaded:
             await self._check_place(path, loaded)
         await self._change(set_change(self.keys, path, encoded.text, loaded))
@@ -193,17 +178,18 @@ class DocumentWriter:
     async def delete(self, path: Path) -> None:
         """Remove what is at `path`."""
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
-        await self._in_turn(lambda: self._delete(path))
+            path = await self._from_front(path, MissingKey)
+        await self._delete(path)
         self.session.memory.forget_shapes(self.keys.document)
 
     async def _delete(self, path: Path) -> None:
+        await self._settled()
         await self.session.run(change(delete_change(self.keys, path), self.session.memory))
 
     async def extend(self, path: Path, values: Sequence[Any]) -> None:
         """Append `values` to the list at `path`, all or none."""
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
+            path = await self._from_front(path, MissingKey)
         unique = _unique()
         texts: list[bytes] = []
         loaded: list[Loaded] = []
@@ -212,10 +198,10 @@ class DocumentWriter:
             texts.append(encoded.text)
             loaded.extend(parcels)
         if texts:
-            longest = max(map(len, texts))
-            await self._in_turn(lambda: self._append(path, texts, tuple(loaded)), longest, loaded)
+            await self._append(path, texts, tuple(loaded))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
+        await self._settled()
         await self._check_list(path, loaded)
         await self.session.run(change(append_change(self.keys, path, texts, loaded), self.session.memory))
 
@@ -235,7 +221,7 @@ class DocumentWriter:
         from .plan.arithmetic import calculate
 
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
+            path = await self._from_front(path, MissingKey)
         text = number_text(operand, (self.name, *path))
         if isinstance(operand, np.generic):
             operand = operand.item()
@@ -249,7 +235,7 @@ class DocumentWriter:
         from .plan.arithmetic import compute
 
         if counts_from_end(path):
-            path = await resolved(self, path, MissingKey)
+            path = await self._from_front(path, MissingKey)
         return await self._run(path, lambda notices: compute(self.keys, path, function, notices, self.session.memory))
 
     async def _run(self, path: Path, plan: Callable[[Callable[[], Sequence[Command]]], Plan]) -> Any:
@@ -267,9 +253,10 @@ class DocumentWriter:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
         encoded, loaded = await self._prepared(path, value, _unique())
         it = set_change(self.keys, path, encoded.text, loaded)
-        await self._in_turn(lambda: self._exchange(it, before), len(encoded.text), loaded)
+        await self._exchange(it, before)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
+        await self._settled()
         gone = tuple(crate.placeholder.suffix.encode() for crate, _, _ in before.crates)
         it = it._replace(gone=gone)
         await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))

@@ -30,6 +30,7 @@ class DocumentPublisher(DocumentWriter):
 
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            await self._settled()
             await self._check_place(path, loaded)
             stamp = self._stamp(path)
             notices = self._notice(stamp, with_value(*stamp, encoded.text, loaded))
@@ -40,11 +41,13 @@ class DocumentPublisher(DocumentWriter):
 
     async def _delete(self, path: Path) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            await self._settled()
             it = delete_change(self.keys, path, notices=self._announced(path, deleted=True))
             await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
+            await self._settled()
             await self._check_list(path, loaded)
             it = append_change(self.keys, path, texts, loaded, notices=self._announced(path))
             await self.session.run(change(it, self.session.memory))

@@ -230,6 +230,38 @@ def test_a_publisher_waits_for_keys_that_are_here_and_there(cluster, moving):
         assert moving.name not in moving.left()
 
 
+LARGE = np.full((100, 1000), 7.0)
+
+
+@pytest.mark.parametrize("gone", ["nothing", "array", "document", "all"])
+def test_a_large_array_is_published_to_a_moving_slot_or_refused(cluster, key, gone):
+    """Whatever of the key has left: all of it is where it was or went, or nothing is applied."""
+    name = key()
+    together = gone in ("nothing", "all")
+    with reem.RedisInterface(cluster, timeout=0.3) as interface:
+        kvs, space = reem.KeyValueStore(interface), reem.PublishSpace(interface)
+        space[name] = {"n": 1, "image": LARGE - 1}
+        move = Move(cluster, name).begin()
+        array = f"{{{name}}}.image"
+        move.take(*{"nothing": [], "array": [array], "document": [name], "all": move.all_keys()}[gone])
+        before = move.left()
+        for write in (
+            lambda: space[name].write({"n": 2, "image": LARGE}),
+            lambda: space[name]["image"].write(LARGE + 1),
+        ):
+            if together:
+                write()
+            else:
+                with pytest.raises(NotConnected, match="nothing was applied"):
+                    write()
+            assert move.left() == before
+        move.finish()
+        value = kvs[name].read()
+        n, image = (2, LARGE + 1) if together else (1, LARGE - 1)
+        assert value["n"] == n
+        assert np.array_equal(value["image"], image)
+
+
 def test_a_new_key_of_a_moving_slot_is_made_where_the_slot_goes(front, cluster, key):
     """As nothing of it is here."""
     name = key()

@@ -11,8 +11,11 @@ import pytest
 from conftest import Keys, RawCluster, assert_no_orphans, assert_same, keys_of
 
 import reem
-from reem_async.errors import NotAllowed
+from reem_async.errors import Conflict, NotAllowed
+from reem_async.plan.keys import keys_of as keys_of_name
+from reem_async.plan.memory import Memory
 from reem_async.plan.staging import STAGED, are_missing, looks_at, stage
+from reem_async.plan.writes import exchange, set_change
 
 SHAPE = (1000, 1000)
 TIMES = 5
@@ -155,11 +158,12 @@ def test_what_was_lost_before_it_was_put_in_its_place_is_sent_again(place, write
     place.assert_in_order()
 
 
-def test_a_user_who_may_not_rename_is_told(cluster):
+@pytest.mark.parametrize("right", ["rename", "persist"])
+def test_a_user_who_may_not_put_it_in_its_place_is_told(cluster, right):
     """The way of a large array through a cluster needs it; nothing is applied."""
     place = Keys()("robot")
     admins = cluster.nodes
-    rules = ["on", ">pw", "~*", "&*", "+@all", "-rename"]
+    rules = ["on", ">pw", "~*", "&*", "+@all", f"-{right}"]
     try:
         for node in admins:
             node.say("ACL", "SETUSER", "narrow", *rules)
@@ -167,7 +171,7 @@ def test_a_user_who_may_not_rename_is_told(cluster):
         with reem.RedisInterface(url) as interface:
             space, kvs = reem.PublishSpace(interface), reem.KeyValueStore(interface)
             space[place] = {"image": np.zeros(3)}
-            with pytest.raises(NotAllowed, match="rename"):
+            with pytest.raises(NotAllowed, match=right):
                 space[place]["image"] = np.zeros(SHAPE)
             assert_same(kvs[place].read(), {"image": np.zeros(3)})
             del kvs[place]
@@ -188,6 +192,17 @@ def test_only_large_values_go_first():
     assert it.upload[:3] == ("SET", it.name, large[2])
     assert it.upload[3] == "EX"
     assert moving == [small, ("PERSIST", it.name), ("RENAME", it.name, "{a}.l"), other]
+
+
+def test_an_edit_that_meets_a_conflict_leaves_nothing_on_the_server():
+    keys, memory = keys_of_name("a"), Memory()
+    _, coming = stage([("SET", "{a}[0]", bytes(70_000))], "{a}", "u")
+    it = set_change(keys, (0,), b"1", ())
+    plan = exchange(it, [("JSON.GET", "a", "$[0]")], (b"[1]",), memory, coming)
+    after = plan.decode([b"OK", b"[[1]]", b"[1]", [], b"[2]", b"string"])
+    assert after.commands == [("UNLINK", coming[0].name)]
+    with pytest.raises(Conflict):
+        after.decode([1])
 
 
 def test_nothing_large_changes_nothing():

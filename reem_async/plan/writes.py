@@ -378,11 +378,12 @@ def exchange(
     where = show(full(it.keys, it.path))
     end = 4 + len(reads)
 
-    def compare(replies: Sequence[Reply]) -> Any:
+    def refuse(_: Sequence[Reply]) -> Plan:
+        raise Conflict(f"{where} was changed by somebody else while it was edited; nothing was written: edit it again")
+
+    def compare(replies: Sequence[Reply]) -> Plan:
         if tuple(replies[4:end]) != before:
-            raise Conflict(
-                f"{where} was changed by somebody else while it was edited; nothing was written: edit it again"
-            )
+            return Plan([("UNLINK", *(each.name for each in coming))], refuse, held=True) if coming else refuse(())
         if are_missing(replies[end:]):
             return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
         exact = it._replace(gone=unreferred(replies[1:4], it.keys))

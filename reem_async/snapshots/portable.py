@@ -266,8 +266,9 @@ async def _put(session: Session, keys: Keys, entry: Entry, done: list[str], *, r
         lambda: put(keys, entry, session.memory, replace=replace, notices=notices)
     )
     async with session.transport.ordered(keys.channel):
+        await session.transport.settle(keys.document)
         try:
-            await session.transport.whole(keys.document, session.run(plan))
+            await session.run(plan)
         except (Conflict, WrongKind) as error:
             if not done:
                 raise

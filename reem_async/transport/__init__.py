@@ -6,7 +6,7 @@ event loop, `BlockingTransport` a plain thread; both are handed the same plans b
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 
@@ -62,16 +62,12 @@ class Transport(Held, Protocol):
         """Wait."""
         ...
 
-    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call`, which writes to the top-level `key`, to its end even if the caller is cancelled."""
+    def is_settled(self, document: str) -> bool:
+        """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
         ...
 
-    def is_settled(self, key: str) -> bool:
-        """Return whether cancelled callers have left nothing to run that writes to `key`."""
-        ...
-
-    async def settle(self, key: str) -> None:
-        """Wait for what cancelled callers have left to run: it must not come after what is written next."""
+    async def settle(self, document: str) -> None:
+        """Wait until it has arrived: it must not come after what is written next."""
         ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:

@@ -5,16 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
 import anyio
 
 from ..background import in_background
-from ..errors import InterfaceClosed, WrongLoop
+from ..errors import InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..state import States
+from . import Held
 from .identity import WHO, who
 from .options import Options
 from .packing import has_large
@@ -24,6 +25,7 @@ from .wire import Wire, open_wire
 __all__ = ["AsyncTransport"]
 
 _SPARE = 4
+_PING: Command = ("PING",)
 
 
 class AsyncTransport:
@@ -45,23 +47,45 @@ class AsyncTransport:
         self._lanes: dict[bool, Wire] = {}
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
+        self._leaving: set[Wire] = set()
         self._orders: dict[str, anyio.Lock] = {}
-        self._left: dict[str, set[asyncio.Task[Any]]] = {}
+        self._left: dict[str, set[asyncio.Future[Any]]] = {}
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
         self._farewell: AsyncGenerator[None, None] | None = None
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         """Send `commands` on the shared wire, or on the one for large values; awaited, it is the replies."""
-        bulk = bulk or has_large(commands)
-        wire = self._lanes.get(bulk)
+        large = has_large(commands)
+        wire = self._lanes.get(bulk or large)
         if wire is None or not wire.alive or self._loop is not asyncio.get_running_loop() or self._closed:
-            return self._connected(commands, bulk)
-        return wire.roundtrip(commands)
+            return self._connected(commands, bulk or large)
+        return self.upload(wire, commands) if large else wire.roundtrip(commands)
 
     async def _connected(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         wire = await self._lane(bulk)
-        return await wire.roundtrip(commands)
+        return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))
+
+    async def upload(self, wire: Wire, commands: Sequence[Command]) -> list[Reply]:
+        """Send what is large. A caller who is cancelled leaves it on its way, with a note of that."""
+        arrived: asyncio.Future[list[Reply] | Exception] = wire.begin(commands)
+        try:
+            outcome = await asyncio.shield(arrived)
+        except asyncio.CancelledError:
+            if not arrived.done():
+                document = _document(commands)
+                self._left.setdefault(document, set()).add(arrived)
+                arrived.add_done_callback(lambda done: self._has_arrived(document, done))
+            raise
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+    def _has_arrived(self, document: str, arrived: asyncio.Future[Any]) -> None:
+        left = self._left.get(document, set())
+        left.discard(arrived)
+        if not left:
+            self._left.pop(document, None)
 
     async def _lane(self, bulk: bool) -> Wire:
         """Return the shared wire, connecting if need be: once for all who ask meanwhile, who share its failure too."""
@@ -135,25 +159,37 @@ class AsyncTransport:
         self._lanes.clear()
         self._opening.clear()
         self._spare.clear()
+        self._leaving.clear()
         self._orders.clear()
         self._left.clear()
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[Wire]:
+    async def hold(self) -> AsyncIterator[Held]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled."""
         self.check()
         while self._spare and not self._spare[-1].alive:
             self._spare.pop()
         wire = self._spare.pop() if self._spare else await self._opened()
+        lent = _Lent(self, wire)
         try:
-            yield wire
+            yield lent
         except BaseException:
-            await wire.close()
+            if lent.is_uploading:  # its reply tells when what is on its way has arrived
+                self._leaving.add(wire)
+                in_background(self._close_idle(wire), "reem close")
+            else:
+                await wire.close()
             raise
         if wire.alive and len(self._spare) < _SPARE and not self._closed:
             self._spare.append(wire)
         else:
             await wire.close()
+
+    async def _close_idle(self, wire: Wire) -> None:
+        with contextlib.suppress(ReemError):
+            await wire.roundtrip([_PING])
+        self._leaving.discard(wire)
+        await wire.close()
 
     @property
     def timeout(self) -> float:
@@ -172,35 +208,16 @@ class AsyncTransport:
         """Wait."""
         await asyncio.sleep(seconds)
 
-    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled: what comes after it must not overtake it.
+    def is_settled(self, document: str) -> bool:
+        """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
+        if self._left:
+            self.check()  # what was left in another event loop, or by the parent process, is none of ours
+        return document not in self._left
 
-        A large value goes over another connection than a small one.
-        """
-        task = asyncio.get_running_loop().create_task(call)
-        try:
-            return await asyncio.shield(task)
-        except asyncio.CancelledError:
-            left = self._left.setdefault(key, set())
-            left.add(task)
-            task.add_done_callback(lambda done: self._end_of_left(key, done))
-            raise
-
-    def _end_of_left(self, key: str, done: asyncio.Task[Any]) -> None:
-        if not done.cancelled():
-            done.exception()  # nobody is left to hear of it
-        left = self._left.get(key, set())
-        left.discard(done)
-        if not left:
-            self._left.pop(key, None)
-
-    def is_settled(self, key: str) -> bool:
-        """Return whether cancelled callers have left nothing to run that writes to `key`."""
-        return key not in self._left
-
-    async def settle(self, key: str) -> None:
-        """Wait for what cancelled callers have left to run."""
-        await asyncio.wait(self._left[key])
+    async def settle(self, document: str) -> None:
+        """Wait until it has arrived."""
+        while left := self._left.get(document):
+            await asyncio.wait(left)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
@@ -226,7 +243,37 @@ class AsyncTransport:
 
     async def release(self) -> None:
         """Close the connections of this event loop; another one may go on with this transport."""
-        wires = [*self._lanes.values(), *self._spare]
+        wires = [*self._lanes.values(), *self._spare, *self._leaving]
         self._forget()
         for wire in wires:
             await wire.close()
+
+
+class _Lent:
+    """A connection in the hands of one caller.
+
+    Attributes:
+        is_uploading: Something large was sent, and whether it has arrived is not known.
+    """
+
+    def __init__(self, transport: AsyncTransport, wire: Wire) -> None:
+        self._transport = transport
+        self._wire = wire
+        self.is_uploading = False
+
+    def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
+        """Send `commands`; awaited, it is their replies."""
+        return self._upload(commands) if has_large(commands) else self._wire.roundtrip(commands)
+
+    async def _upload(self, commands: Sequence[Command]) -> list[Reply]:
+        self.is_uploading = True
+        replies = await self._transport.upload(self._wire, commands)
+        self.is_uploading = False
+        return replies
+
+
+def _document(commands: Sequence[Command]) -> str:
+    """Return the name on the server of the document that commands are about: all their keys carry it."""
+    key = next(command for command in commands if len(command) > 1)[1]
+    name: str = key.decode() if isinstance(key, bytes) else str(key)
+    return name[1 : name.index("}")] if name.startswith("{") else name

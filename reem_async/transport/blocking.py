@@ -13,7 +13,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
 from typing import Any
@@ -275,15 +275,11 @@ class BlockingTransport:
         """Wait, and the thread with it."""
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
 
-    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call`; nothing can cancel it half way."""
-        return await call
-
-    def is_settled(self, key: str) -> bool:
-        """Return True: nobody can leave a call to run."""
+    def is_settled(self, document: str) -> bool:
+        """Return True: no caller can leave before the reply is there."""
         return True
 
-    async def settle(self, key: str) -> None:
+    async def settle(self, document: str) -> None:
         """Return: there is nothing to wait for."""
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:

@@ -9,7 +9,7 @@ from ..errors import ConnectionLost, NotConnected
 from ..plan import Command, Reply
 from ..plan.staging import are_missing, is_large, looks_at, stage
 from . import Held, Transport
-from .redirects import keys_in, refusal
+from .redirects import Ask, Moved, keys_in, refusal
 from .route import asked_of, watched
 
 __all__ = ["Publication"]
@@ -30,11 +30,17 @@ class Publication:
         channel: str = body[-1][1]
         moving, self._coming = stage(body, channel[: channel.index("}") + 1], secrets.token_hex(5))
         self._given = commands
-        self._commands = [multi, *moving, execute]
+        self._commands: Sequence[Command] = [multi, *moving, execute]
         self._there: Transport | None = None
 
     async def send_ahead(self, node: Transport, asking: bool) -> Outcome:
-        """Send to `node` what is large, unless that has it already."""
+        """Send to `node` what is large, unless that has it already.
+
+        A name that is nowhere yet is asked for elsewhere while its slot moves, whichever node the other keys are at.
+        Then all is sent together, as it is given.
+        """
+        if asking:
+            self._coming, self._commands = [], self._given
         if not self._coming or self._there is node:
             return None, None
         try:
@@ -42,6 +48,8 @@ class Publication:
         except ConnectionLost as error:
             raise NotConnected(f"{error}; what was sent is not in its place, so nothing was applied") from error
         problem = refusal(replies)
+        if isinstance(problem, Ask) and not isinstance(problem, Moved):
+            return await self.send_ahead(node, asking=True)
         if problem is None and any(isinstance(reply, Exception) for reply in replies):
             return None, self._refused(replies)
         self._there = node if problem is None else None
@@ -71,12 +79,13 @@ class Publication:
     def _as_given(self, replies: list[Reply]) -> list[Reply]:
         """Return one reply to each of the commands that were given; a large SET became two."""
         names = {each.name for each in self._coming}
-        kept = [
-            place
-            for place, command in enumerate(self._commands)
-            if not (command[0] == "PERSIST" and command[1] in names)
+        extra = [
+            place for place, command in enumerate(self._commands) if command[0] == "PERSIST" and command[1] in names
         ]
-        outcome = replies[-1]
+        replies, outcome = list(replies), replies[-1]
         if isinstance(outcome, list):
-            outcome = [outcome[place - 1] for place in kept[1:-1]]
-        return [*(replies[place] for place in kept[:-1]), outcome]
+            replies[-1] = [reply for place, reply in enumerate(outcome, 1) if place not in extra]
+        for place in extra:
+            if isinstance(replies[place], Exception):  # it is why the transaction was refused
+                replies[place + 1] = replies[place]
+        return [reply for place, reply in enumerate(replies) if place not in extra]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Coroutine, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from contextlib import AbstractAsyncContextManager
-from typing import Any
 
 from ..state import States
 from . import Transport
@@ -26,17 +25,14 @@ class Rooted(ABC):
         """Wait."""
         await self._root.pause(seconds)
 
-    async def whole(self, key: str, call: Coroutine[Any, Any, Any]) -> Any:
-        """Run `call` to its end even if the caller is cancelled; return its result."""
-        return await self._root.whole(key, call)
+    def is_settled(self, document: str) -> bool:
+        """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
+        return all(each.is_settled(document) for each in self._all())
 
-    def is_settled(self, key: str) -> bool:
-        """Return whether cancelled callers have left nothing to run that writes to `key`."""
-        return self._root.is_settled(key)
-
-    async def settle(self, key: str) -> None:
-        """Wait for what cancelled callers have left to run."""
-        await self._root.settle(key)
+    async def settle(self, document: str) -> None:
+        """Wait until it has arrived."""
+        for each in list(self._all()):
+            await each.settle(document)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""

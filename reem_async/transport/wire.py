@@ -211,6 +211,12 @@ class Wire(asyncio.BufferedProtocol):
         self.send(commands, done)
         return answer
 
+    def begin(self, commands: Sequence[Command]) -> asyncio.Future[list[Reply] | Exception]:
+        """Send `commands`; the result tells what became of them, error or not, and is not to be cancelled."""
+        arrived: asyncio.Future[list[Reply] | Exception] = self._loop.create_future()
+        self.send(commands, arrived.set_result)
+        return arrived
+
     def abort(self, reason: Exception) -> None:
         """Break the connection; whoever waits gets `reason`."""
         self._fail(reason)

@@ -132,7 +132,7 @@ class Poison:
         """A true .npy file with a few bytes changed, cut off, or added."""
         rng = self._rng
         array = np.zeros(rng.randrange(1, 50), rng.choice(["<f8", ">i4", "u1", "<M8[ns]", "<U3", "S4"]))
-        blob = bytearray(reem.NumpyShip().pack(array)[0] + array.tobytes())
+        blob = bytearray(b"".join(reem.NumpyShip().pack(array)))
         for _ in range(rng.randrange(1, 6)):
             kind = rng.randrange(4)
             at = rng.randrange(len(blob)) if rng.random() < 0.3 else rng.randrange(min(len(blob), 128))
