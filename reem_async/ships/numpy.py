@@ -175,7 +175,8 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
     """Return dtype and shape from the header of an .npy file, checked; raises BadData."""
     try:
         text = header[10 if header[6] == 1 else 12 :].decode("utf-8" if header[6] == 3 else "latin-1")
-        if not _HEADER.fullmatch(text) or _depth(text) > _DEEPEST:
+        # A field has up to three pairs of round brackets: its own, and those of a title and a shape.
+        if text.count("(") > 3 * _MOST_FIELDS + 1 or not _HEADER.fullmatch(text) or _depth(text) > _DEEPEST:
             raise ValueError(text)
         fields = ast.literal_eval(text)
         if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
