@@ -52,11 +52,8 @@ class DocumentReader:
         at = self.session.readers
         if counts_from_end(path):
             path, at = await self._resolved(path)
-        session = self.session
-        if session.ships.asynchronous:
-            await session.ships.ready()
         try:
-            sealed = await session.run(read(self.keys, path, session.ships, session.memory), at)
+            sealed = await self.sealed(path, at)
             return await opened(sealed) if sealed.crates else sealed.holder[0]
         except BadData:
             if at is self.session.transport:
@@ -252,8 +249,7 @@ class DocumentWriter:
     async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
         encoded, loaded = await self._prepared(path, value, _unique())
-        it = set_change(self.keys, path, encoded.text, loaded)
-        await self._exchange(it, before)
+        await self._exchange(set_change(self.keys, path, encoded.text, loaded), before)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
         await self._settled()

@@ -83,8 +83,8 @@ async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
         changes = []
         interface.on_state(changes.append)
         store = reem_async.KeyValueStore(interface)
-        async with store["robot"].watch() as updates:
-            await anext(updates)  # the initial value, or the writer was faster: only the newest is kept
+        async with store["robot"].watch(reem_async.Every(100_000)) as updates:
+            assert (await anext(updates)).initial
             old = await asyncio.to_thread(watched.primary)
             os.kill(watched.pid(old), signal.SIGKILL)
             await aeventually(lambda: interface.state == "reconnecting")

@@ -18,11 +18,9 @@ from .memory import Memory
 from .paths import Path, show, to_jsonpath
 from .placeholders import Crate, Placeholder, find, marked
 from .replies import checked, explained, full, loads, missing, type_name
+from .sizes import LARGE
 
-__all__ = ["BULK", "Sealed", "length", "read", "type_of"]
-
-BULK = 1 << 16
-"""Bytes from which a reply is asked for on a connection of its own."""
+__all__ = ["Sealed", "length", "read", "type_of"]
 
 _TRIES = 50
 
@@ -138,7 +136,7 @@ class _Fetch:
         self.memory.saw_layout(self.keys.document, self.path, self.wanted)
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
         commands = (get_command(self.keys, self.path), *reads, *self.also)
-        bulk = sum(each.size for each in self.wanted) >= BULK
+        bulk = sum(each.size for each in self.wanted) >= LARGE
         return Plan(
             commands,
             lambda replies: self._decode(asked, commands, replies),

@@ -9,16 +9,16 @@ Should its sender die in between, the server forgets it after a minute.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from . import Command, Reply
+from .sizes import LARGE, size_of_largest
 
 __all__ = ["STAGED", "Staged", "are_missing", "is_large", "looks_at", "stage"]
 
 STAGED = ":staged:"
 """Follows the tag of a top-level key in the names of what was sent and not yet put in place."""
 
-_LARGE = 1 << 16
 _KEPT = 60
 """Seconds."""
 
@@ -58,13 +58,7 @@ def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Comm
 
 def is_large(command: Command) -> bool:
     """Return whether a command stores a value that takes long to arrive."""
-    return len(command) == 3 and command[0] == "SET" and _size(command[2]) >= _LARGE
-
-
-def _size(word: Any) -> int:
-    if isinstance(word, tuple):
-        return sum(map(len, word))
-    return len(word) if isinstance(word, bytes | memoryview) else 0
+    return len(command) == 3 and command[0] == "SET" and size_of_largest(command) >= LARGE
 
 
 def looks_at(coming: Sequence[Staged]) -> list[Command]:

@@ -14,11 +14,11 @@ import anyio
 from ..background import in_background
 from ..errors import InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
+from ..plan.sizes import has_large
 from ..state import States
 from . import Held
 from .identity import WHO, who
 from .options import Options
-from .packing import has_large
 from .patience import patience
 from .wire import Wire, open_wire
 

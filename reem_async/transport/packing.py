@@ -13,13 +13,11 @@ from typing import Any
 import hiredis
 
 from ..plan import Command
+from ..plan.sizes import LARGE, size_of_largest
 
-__all__ = ["LARGE", "SLOW", "Piece", "has_large", "pack"]
+__all__ = ["SLOW", "Piece", "pack"]
 
 Piece = bytes | memoryview
-
-LARGE = 1 << 16
-"""Bytes from which a buffer becomes a piece of its own, on a connection where nobody waits behind it."""
 
 SLOW = 1 << 13
 """Bytes that may take longer on a slow link than a call has: as long as they move, it is not given up."""
@@ -39,33 +37,6 @@ def pack(commands: Sequence[Command]) -> list[Piece]:
     if small:
         pieces.append(b"".join(small))
     return pieces
-
-
-def has_large(commands: Sequence[Command]) -> bool:
-    """Return whether so much is sent that others should not wait behind it."""
-    for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
-        if size_of_largest(command) >= LARGE:
-            return True
-    return False
-
-
-def size_of_largest(command: Command) -> int:
-    """Return the bytes of the largest buffer among the words of `command`, 0 if there is none."""
-    largest = 0
-    for word in command:
-        kind = type(word)
-        if kind is str:
-            continue
-        size = 0
-        if kind is bytes:
-            size = len(word)
-        elif kind is memoryview:
-            size = word.nbytes
-        elif kind is tuple:
-            size = sum(map(len, word))
-        if size > largest:
-            largest = size
-    return largest
 
 
 def _packed(command: Command) -> bytes:

@@ -34,13 +34,9 @@ class Publication:
         self._there: Transport | None = None
 
     async def send_ahead(self, node: Transport, asking: bool) -> Outcome:
-        """Send to `node` what is large, unless that has it already.
-
-        A name that is nowhere yet is asked for elsewhere while its slot moves, whichever node the other keys are at.
-        Then all is sent together, as it is given.
-        """
+        """Send to `node` what is large, unless that has it already."""
         if asking:
-            self._coming, self._commands = [], self._given
+            self._keep_together()
         if not self._coming or self._there is node:
             return None, None
         try:
@@ -49,11 +45,16 @@ class Publication:
             raise NotConnected(f"{error}; what was sent is not in its place, so nothing was applied") from error
         problem = refusal(replies)
         if isinstance(problem, Ask) and not isinstance(problem, Moved):
-            return await self.send_ahead(node, asking=True)
+            self._keep_together()
+            return None, None
         if problem is None and any(isinstance(reply, Exception) for reply in replies):
             return None, self._refused(replies)
         self._there = node if problem is None else None
         return problem, None
+
+    def _keep_together(self) -> None:
+        """Send all as it is given: the slot moves, and what is nowhere yet would not be where the other keys are."""
+        self._coming, self._commands = [], self._given
 
     def _refused(self, replies: list[Reply]) -> list[Reply]:
         """Return what a server says to a transaction one of whose commands it does not take."""

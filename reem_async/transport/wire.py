@@ -20,8 +20,9 @@ import hiredis
 
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
+from ..plan.sizes import LARGE
 from .options import Options
-from .packing import LARGE, SLOW, Piece, pack
+from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import confirmed, patience, unsent
 
