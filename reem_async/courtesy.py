@@ -25,9 +25,13 @@ def give_way() -> None:
 
 
 def come_second() -> None:
-    """Come a little after others for the processor from now on, with all threads begun later, where that can be."""
+    """Come a little after others for the processor from now on, with all threads begun later, where that can be.
+
+    A batch thread that wakes does not take the processor from whoever has it.
+    """
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_NICER)
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 def stand_back() -> None:

@@ -137,10 +137,16 @@ class Hub:
 
     def _enter(self, listener: Listener) -> None:
         """Note who listens, before the server confirms: a notice right behind that must find somebody."""
-        self._pace = min(self._pace, listener.patience) if self._topics else listener.patience
+        if not self._topics:
+            self._pace = listener.patience
+        self.hurry(listener.patience)
+        self._topics.setdefault(listener.topic, Audience()).add(listener)
+
+    def hurry(self, patience: float) -> None:
+        """Have updates wait for each other no longer than so many seconds from now on, whoever listens."""
+        self._pace = min(self._pace, patience)
         for wire in self._wires.values():
             wire.pace = self._pace
-        self._topics.setdefault(listener.topic, Audience()).add(listener)
 
     def _discover(self) -> Discovery:
         if self._closed:

@@ -18,6 +18,7 @@ import reem.recording
 import reem_async
 from reem_async.errors import BadInput, BadKey, BadType, BadValue, MissingKey
 from reem_async.recording import ArrayHandle, Recorder, Replayer, open_log
+from reem_async.recording.line import HURRIED, PATIENCE
 
 IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64, 3)
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
@@ -72,6 +73,25 @@ async def test_every_update_is_recorded_bit_for_bit(key, apspace, akvs, binterfa
         times, numbers = log[f"{name}.n"].history()
         assert numbers.tolist() == [*range(20), 24]
         assert log[name]["list"][0].at(log.end)["a"].shape == IMAGE.shape
+
+
+async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, binterface, file):
+    """Else the next one would have replaced what was announced; where few come, publishers are spared."""
+    name = key("cam")
+
+    def paces():
+        return {wire.pace for wire in binterface.session.hub._wires.values()}
+
+    async with Recorder(binterface, [key("*")], file) as recorder:
+        for number in range(3):
+            await apspace[name].write({"image": FRAME, "n": number})
+            await aeventually(lambda n=number: recorder.status.messages > n)
+            await asyncio.sleep(0.04)
+        assert paces() == {PATIENCE}
+        async with asyncio.timeout(10):
+            while paces() != {HURRIED}:
+                await apspace[name].write({"image": FRAME, "n": 0})
+                await asyncio.sleep(0.008)
 
 
 async def test_what_was_there_and_what_only_was_stored(key, akvs, binterface, file):

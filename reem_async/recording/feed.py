@@ -35,6 +35,8 @@ _PAUSE = 0.1
 _LET_PASS = 0.004
 """Seconds, at most, from a large update to reading it. The server is busy with its publisher, others wait behind
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
+_FAST = 20_000_000
+"""Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
 _READ_RATE = 8e6
 """Bytes a second that are read of keys of which nothing is published."""
 
@@ -72,6 +74,9 @@ class Collector(Protocol):
 
     async def fence(self) -> None:
         """Wait until everything published before now has been handed to the feeds."""
+
+    def hurry(self) -> None:
+        """Look more often at what was published: large updates come fast."""
 
     def failed(self, error: Exception) -> None:
         """End the recording: something went wrong that should not."""
@@ -183,6 +188,8 @@ class Feed:
         try:
             if head.role == "update":
                 since, self._last_large = head.stamp[0] - self._last_large, head.stamp[0]
+                if since < _FAST:
+                    collector.hurry()
                 await asyncio.sleep(min(_LET_PASS, since / 1e9 / 5))  # not if they come fast: none should be missed
             async with collector.fetching:
                 self._since.clear()

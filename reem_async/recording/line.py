@@ -11,10 +11,13 @@ from ..policy import Mailbox
 from ..session import Session
 from ..transport.wire import Wire
 
-__all__ = ["PATIENCE", "Line"]
+__all__ = ["HURRIED", "PATIENCE", "Line"]
 
-PATIENCE = 0.002
+PATIENCE = 0.005
 """Seconds that updates may wait to be recorded, several at once. The publisher's time in them is not touched."""
+
+HURRIED = 0.002
+"""The same, once large updates were seen to come fast: each is to be fetched before the next one replaces it."""
 
 
 class Told(Protocol):

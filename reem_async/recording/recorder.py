@@ -26,7 +26,7 @@ from ..plan.patterns import Pattern, parse_pattern
 from ..policy import EMPTY, Ended, Last
 from .errors import RecordingFailed
 from .feed import Feed
-from .line import PATIENCE, Line
+from .line import HURRIED, PATIENCE, Line
 from .sample import Sampler, samples_of
 from .scribe import Operation, Scribe
 from .sink import Sink
@@ -303,6 +303,10 @@ class Recorder:
         if self._line is not None and self._line.wire is not None:
             await self._line.wire.roundtrip([("PING",)])
         self._pump()
+
+    def hurry(self) -> None:
+        """Look more often at what was published: large updates come fast."""
+        self.session.hub.hurry(HURRIED)
 
     def failed(self, error: Exception) -> None:
         """End the recording: something went wrong that should not."""
