@@ -61,8 +61,11 @@ def run(cases: list[Case], quick: bool, mode: str, console: Console) -> Results:
         )
         try:
             with Progress(*columns, console=console) as progress:
+                chapter = ""
                 for case in progress.track(cases, description="benchmarks"):
                     progress.update(progress.task_ids[0], description=case.identifier)
+                    if chapter != (chapter := case.identifier.partition(".")[0]):
+                        bench.workers.end()  # what a process did before has no part in what comes now
                     measure(case, bench, found)
                     server.empty()
         except redis.RedisError as error:

@@ -170,6 +170,7 @@ class Workers:
             publisher.end()
 
     def end(self) -> None:
-        """End every measuring process."""
+        """End every measuring process; new ones are started when needed."""
         for worker in self._running.values():
             worker.end()
+        self._running.clear()

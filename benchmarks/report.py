@@ -7,7 +7,14 @@ from rich.text import Text
 from .contenders import CONTENDERS
 from .results import Entry, Results
 
-OTHERS = {"python": "Python alone", "redis+numpy": "redis and numpy"}
+OTHERS = {
+    "python": "Python alone",
+    "redis+numpy": "redis and numpy",
+    "nobody": "nobody",
+    "fetches": "a bare client that subscribes and fetches",
+    "recorder": "reem record",
+    "background": "reem record --background",
+}
 
 STYLES = {
     "PASS *": "bold green",
@@ -57,7 +64,7 @@ def cases(results: Results) -> Table:
     """Every figure taken."""
     table = Table(title="Medians, with the 99th percentile", title_justify="left")
     names = [name for name in CONTENDERS if any(name in entries for entries in results.cases.values())]
-    names += list(OTHERS) if "import" in results.cases else []
+    names += [name for name in OTHERS if any(name in entries for entries in results.cases.values())]
     table.add_column("case")
     table.add_column("contender")
     for name in ("median", "p99", "samples", "remark"):

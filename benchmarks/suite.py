@@ -6,6 +6,7 @@ from typing import Any
 from .measure import CallCase, Case, ClientsCase
 from .measure_other import IMPORTS, CameraCase, ImportCase
 from .measure_pubsub import PublishCase, SubscribersCase
+from .measure_recorder import BESIDE, RecorderCase
 from .values import Spec
 
 # What grows along the axes of the figures.
@@ -103,7 +104,7 @@ def comparison(grown: Grown) -> list[Case]:
     contenders = (*FRONTS, "original", "pottery")
     value: Spec = {"kind": "pottery"}
     return [
-        CallCase("pottery.set", contenders, operation="set", value=value, one_core=True),
+        CallCase("pottery.set", (*contenders, "redis-py"), operation="set", value=value, one_core=True),
         CallCase("pottery.get", contenders, operation="get", value=value, tail=LEAF, one_core=True),
     ]
 
@@ -138,9 +139,10 @@ def crowds(grown: Grown) -> list[Case]:
 
 
 def programs(grown: Grown) -> list[Case]:
-    """A controller beside a camera, and imports."""
+    """A controller beside a camera, both beside a recorder, and imports."""
     return [
         CameraCase("camera", (*FRONTS, "original", "redis-py", "redis-asyncio")),
+        RecorderCase("recorder", tuple(BESIDE)),
         ImportCase("import", tuple(IMPORTS)),
     ]
 

@@ -141,6 +141,18 @@ def rows() -> list[Row]:
         for front, ours in FRONTS.items()
     ]
     found += [
+        Row(
+            f"{writer} beside {text}, p99 / alone",
+            (f"recorder.{case}", recorder),
+            (f"recorder.{case}", "nobody"),
+            1.2,
+            1.0,
+            statistic="p99",
+        )
+        for case, writer in (("setpoint", "1 kHz writer"), ("camera", "0.92 MB frames at 30 Hz"))
+        for recorder, text in (("recorder", "`reem record`"), ("background", "`reem record --background`"))
+    ]
+    found += [
         Row("import reem / import redis and numpy", ("import", "reem"), ("import", "redis+numpy"), 1.3, 1.1),
         Row(
             "8 threads on one interface, throughput / 1 thread",
@@ -154,7 +166,13 @@ def rows() -> list[Row]:
     return found
 
 
-_BARE = {"original": "redis-py", "pottery": "redis-py", "zenoh": "redis-py", "redis-asyncio": "redis-asyncio-uvloop"}
+_BARE = {
+    "original": "redis-py",
+    "pottery": "redis-py",
+    "zenoh": "redis-py",
+    "redis-asyncio": "redis-asyncio-uvloop",
+    "nobody": "fetches",
+}
 
 
 def bare(row: Row) -> Row | None:
