@@ -13,9 +13,10 @@ import redis.exceptions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reem_async.errors import BadData, BadKey
+from reem_async.errors import BadData, BadKey, BadValue
 from reem_async.follow import Update
 from reem_async.plan import placeholders, trees
+from reem_async.plan.documents import encode
 from reem_async.plan.floats import _as_parsed, exact_text, may_lose
 from reem_async.plan.paths import below, may_hold, parse, parse_suffix, show, suffix, to_jsonpath
 from reem_async.policy import Last, Mailbox
@@ -26,6 +27,35 @@ from reem_async.transport.parsing import MORE, LargeReader, SmallReader
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 PATHS = st.lists(st.one_of(TEXT, st.integers(0, 99)), max_size=5).map(tuple)
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+
+
+NOT_FINITE = [
+    struct.unpack("<d", bits)[0]
+    for exponent in (b"\xf0\x7f", b"\xf0\xff", b"\xf8\x7f", b"\xf8\xff", b"\xff\x7f", b"\xff\xff")
+    for bits in (bytes(6) + exponent, b"\x01" + bytes(5) + exponent, b"\xff" * 6 + exponent)
+]
+
+
+@pytest.mark.parametrize("value", NOT_FINITE, ids=lambda value: struct.pack("<d", value).hex())
+@pytest.mark.parametrize(
+    "around",
+    [
+        lambda value: value,
+        lambda value: [value, value],
+        lambda value: {"full": 1, "a": [1, 2.5, {"b": (value,)}]},
+        lambda value: [1.0] * 300 + [value],
+        lambda value: {"u" * 200: value},
+    ],
+    ids=["alone", "twice", "inside", "last of many", "under a long name"],
+)
+def test_what_is_not_finite_is_seen_wherever_it_is(value, around):
+    with pytest.raises(BadValue):
+        encode(around(value), ("foo",), lambda _: None, str)
+
+
+def test_none_is_stored_as_null():
+    for value in (None, [None], {"N": None, "u": [1, (None, "null")]}, {"null": 1, "u": "N"}):
+        assert orjson.loads(encode(value, ("foo",), lambda _: None, str).text) == orjson.loads(orjson.dumps(value))
 
 
 @given(PATHS)

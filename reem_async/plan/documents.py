@@ -121,11 +121,10 @@ def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
     Each search begins with one byte, which is found at memory speed: most documents lack it.
     """
     return (
-        (b"u" in text and b"null" in text)
-        or placeholders.marked(text)
+        placeholders.marked(text)
         or may_lose(text)
         or _may_be_deep(text, value, DEEPEST - above)
-        or not _only_plain_types(value)
+        or _may_be_converted(text, value)
     )
 
 
@@ -145,17 +144,18 @@ def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
     return bool(brackets) and _levels(value) > limit
 
 
-def _only_plain_types(value: Any) -> bool:
-    """Return whether all is of exactly the built-in types, so that orjson has converted nothing.
+def _may_be_converted(text: bytes, value: Any) -> bool:
+    """Return whether orjson may have converted something.
 
-    marshal (whose output is thrown away) is the one C-speed walk of the standard library that
-    refuses UUIDs, enums and subclasses, which orjson turns into something else without being asked.
+    marshal (whose output is only looked at) is the one C-speed walk of the standard library that
+    refuses UUIDs, enums and subclasses, which orjson turns into something else without being asked. It
+    writes None as N, and what is not finite with 7f or ff as its last byte; orjson makes `null` of both.
     """
     try:
-        marshal.dumps(value)
+        dumped = marshal.dumps(value)
     except ValueError:
-        return False
-    return True
+        return True
+    return (b"N" in dumped or b"\x7f" in dumped or b"\xff" in dumped) and b"null" in text
 
 
 def _levels(value: Any) -> int:
