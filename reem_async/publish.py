@@ -31,7 +31,8 @@ class DocumentPublisher(DocumentWriter):
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             await self._settled()
-            await self._check_place(path, loaded)
+            if loaded:
+                await self._check_place(path, loaded)
             stamp = self._stamp(path)
             notices = self._notice(stamp, with_value(*stamp, encoded.text, loaded))
             it = set_change(

@@ -138,12 +138,12 @@ def appendable(keys: Keys, path: Path) -> Plan:
 
 
 def takes(keys: Keys, path: Path, loaded: tuple[Loaded, ...], memory: Memory) -> Plan | None:
-    """Plan to make sure that something can be set at `path`; None if that is known, or nothing goes by ship.
+    """Plan to make sure that something can be set at `path`, of which `loaded` goes by ship; None if that is known.
 
     The transaction would store what goes by ship even if the server refused to set the rest.
     """
     known = memory.sure_members(keys.document)
-    if not path or not loaded or any(each.suffix.encode() in known for each in loaded):
+    if not path or any(each.suffix.encode() in known for each in loaded):
         return None
     return settable(keys, path)
 

@@ -34,7 +34,7 @@ from .writer import COMPRESSIONS, Writer
 __all__ = ["FLUSH_SECONDS", "FORMAT", "FullError", "Sink"]
 
 FORMAT = "1"
-FLUSH_SECONDS = 0.5
+FLUSH_SECONDS = 0.25
 """Seconds after which a chunk is closed and given to the operating system, however small it is."""
 
 _MOST_CHANNELS = 60_000

@@ -66,8 +66,6 @@ class _Line:
 
     def _set_limit(self, limit: float) -> None:
         """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
-        if limit == self._limit:
-            return
         self._limit = limit
         if self._tls:  # its reads need Python's timeout
             self._socket.settimeout(limit)
@@ -90,7 +88,8 @@ class _Line:
         try:
             receive = self._socket.recv_into
             if len(pieces) == 1 and len(pieces[0]) < SLOW:
-                self._set_limit(limit)
+                if limit != self._limit:
+                    self._set_limit(limit)
                 self._socket.sendall(pieces[0])
             else:
                 self._send_large(pieces, limit)
@@ -132,7 +131,8 @@ class _Line:
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
         """Send large values; bytes that move begin the limit anew."""
-        self._set_limit(limit / _LOOKS)
+        if limit / _LOOKS != self._limit:
+            self._set_limit(limit / _LOOKS)
         self._moved, self._left = time.monotonic(), 0
         for piece in pieces:
             view, sent = memoryview(piece), 0
