@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import random
@@ -204,6 +205,24 @@ def test_cut_anywhere_it_opens(names, file_and_values, tmp_path):
         cut.write_bytes(data[:place])
         with pytest.raises(DamagedRecording):
             open_log(cut)
+
+
+def test_cut_in_its_index_a_chunk_is_read_whole(names, file_and_values, tmp_path):
+    """What is there of the index does not tell that the rest of it is missing."""
+    data = file_and_values[0].read_bytes()
+    records, place = [], 8
+    while place + 9 < len(data):
+        records.append((data[place], place))
+        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
+    indexes = [here for (before, _), (kind, here) in itertools.pairwise(records) if before == kind == 0x07]
+    assert len(indexes) > 3
+    cut = tmp_path / "cut.mcap"
+    for index in (indexes[0], indexes[len(indexes) // 2], indexes[-1]):
+        counts = []
+        for more in range(13):
+            cut.write_bytes(data[: index + more])
+            counts.append(check(cut, names, file_and_values[1])[0])
+        assert len(set(counts)) == 1, counts
 
 
 def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_path):

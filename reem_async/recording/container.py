@@ -236,7 +236,8 @@ class Container:
             index += 9 + length
         info = ChunkInfo(number, start, last, position, end - position, end, index - end, frozenset(channels) or None)
         # Where the file ends there, a part of the index may be missing.
-        if index < self.size and channels and channels <= self.channels.keys():
+        is_whole = index < self.size and self._data[index] != _MESSAGE_INDEX
+        if is_whole and channels and channels <= self.channels.keys():
             return info
         # It brings new channels, or has no index: only the chunk itself can tell.
         content = self._unpacked(info)

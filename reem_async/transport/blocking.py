@@ -34,7 +34,7 @@ _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
 _SLICE = 1 << 19
 """Bytes of a large value that are sent before giving way."""
-_LOOKS = 40
+_LOOKS = 80
 """How many times per time limit to look whether a large value is moving."""
 
 

@@ -28,7 +28,7 @@ from .patience import confirmed, patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
-_LOOKS = 40
+_LOOKS = 80
 """How many times per time limit to look whether a large value is moving."""
 
 _BUSY = 2.5
