@@ -26,7 +26,7 @@ from .identity import WHO, who
 from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import patience, unsent
+from .patience import LOOKS, patience, unsent
 
 __all__ = ["BlockingTransport"]
 
@@ -34,8 +34,6 @@ _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
 _SLICE = 1 << 19
 """Bytes of a large value that are sent before giving way."""
-_LOOKS = 80
-"""How many times per time limit to look whether a large value is moving."""
 
 
 class _Line:
@@ -131,8 +129,8 @@ class _Line:
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
         """Send large values; bytes that move begin the limit anew."""
-        if limit / _LOOKS != self._limit:
-            self._set_limit(limit / _LOOKS)
+        if limit / LOOKS != self._limit:
+            self._set_limit(limit / LOOKS)
         self._moved, self._left = time.monotonic(), 0
         for piece in pieces:
             view, sent = memoryview(piece), 0

@@ -18,7 +18,11 @@ try:
 except ImportError:  # Windows: what the kernel still holds cannot be asked there
     fcntl = termios = None  # type: ignore[assignment]
 
-__all__ = ["check_timeout", "confirmed", "forget", "patience", "timeout", "unsent"]
+__all__ = ["LOOKS", "check_timeout", "confirmed", "forget", "patience", "timeout", "unsent"]
+
+LOOKS = 160
+"""How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
+move, and the other side's last confirmation alone may be 40 ms late."""
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
 _BYTES_ACKED = 120

@@ -24,12 +24,9 @@ from ..plan.sizes import LARGE
 from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import confirmed, patience, unsent
+from .patience import LOOKS, confirmed, patience, unsent
 
 __all__ = ["Wire", "open_wire"]
-
-_LOOKS = 80
-"""How many times per time limit to look whether a large value is moving."""
 
 _BUSY = 2.5
 """Three reads within so many times the pace are much."""
@@ -300,7 +297,7 @@ class Wire(asyncio.BufferedProtocol):
     def _watch_upload(self, limit: float) -> None:
         """Look often from now on: the last progress of a large value on its way up begins the time limit."""
         self._unsent = self._bytes_unsent()
-        self._watch_until(self._loop.time() + limit / _LOOKS)
+        self._watch_until(self._loop.time() + limit / LOOKS)
 
     def _watch_until(self, moment: float) -> None:
         """Look at the time at `moment`, unless it will be looked at before."""
@@ -329,8 +326,8 @@ class Wire(asyncio.BufferedProtocol):
         moments = [max(self._last_byte, due.since) + due.limit for due in self._due if not due.over]
         if moments:
             # While a large value is on its way up, look often: its last progress begins the limit.
-            soon = now + min(due.limit for due in self._due if not due.over) / _LOOKS if left else max(moments)
-            self._watch_until(max(min(*moments, soon), now + 0.01))
+            soon = now + min(due.limit for due in self._due if not due.over) / LOOKS if left else max(moments)
+            self._watch_until(max(min(*moments, soon), now + 0.002))
         elif waiting:
             self.abort(ConnectionLost(f"the server moved no byte for {waiting[-1].limit:g} s"))
 
