@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import reem_async
 from reem_async import subscribe as core
-from reem_async.errors import BadType, InterfaceClosed
+from reem_async.errors import BadType, InterfaceClosed, QueueFull
 from reem_async.plan.paths import Path
 from reem_async.policy import Ended, Newest, Policy
 
@@ -186,12 +186,12 @@ class CallbackSubscriber(SilentSubscriber):
             self._thread.start()
 
     def _call_all(self) -> None:
-        call, updates = self._calls._caller(), self._calls._updates
-        with call.ending(), contextlib.suppress(Ended):
+        caller, mailbox = self._calls._caller(), self._calls._updates.mailbox
+        try:
             while True:
-                update = updates.mailbox.take_waiting()
-                with call.logging(update, updates.dropped):
-                    call(update)
+                caller.call(mailbox.take_waiting(), mailbox.dropped)
+        except (Ended, QueueFull) as reason:
+            caller.ended(reason)
 
     def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""

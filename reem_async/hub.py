@@ -47,6 +47,7 @@ class Hub:
 
     Attributes:
         place: The process and the event loop it belongs to.
+        callers: What makes calls for updates, kept here although nobody else may hold on to it.
     """
 
     def __init__(self, transport: Transport, ships: Ships) -> None:
@@ -63,6 +64,7 @@ class Hub:
         self._pace = 0.0
         self._closed = False
         self._warned = False
+        self.callers: set[Any] = set()
         self.place = os.getpid(), asyncio.get_running_loop()
 
     async def follow(self, listener: Listener) -> None:

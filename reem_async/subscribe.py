@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import inspect
-import logging
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, NoReturn, Self
 
-from .background import in_background
+from .callbacks import Caller, Calls
 from .connection import RedisInterface
-from .errors import BadType, InterfaceClosed, MissingKey, QueueFull, ReadOnly
+from .errors import BadType, InterfaceClosed, MissingKey, ReadOnly
 from .follow import Follower, Update
 from .hub import Hub
 from .plan.keys import Keys
@@ -23,8 +20,6 @@ from .session import Session
 from .stream import Stream
 
 __all__ = ["CallbackSubscriber", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
-
-logger = logging.getLogger("reem.subscribe")
 
 
 class _Link:
@@ -235,43 +230,6 @@ class LocalAccessor:
         return f"<LocalAccessor {show((self._subscriber.channel, *self._path))}>"
 
 
-class Caller:
-    """Makes the calls of one callback subscriber; both fronts use it, each on a thread of its own choice."""
-
-    def __init__(self, channel: str, function: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
-        self._channel = channel
-        self._function = function
-        self._kwargs = kwargs
-        self._dropped = 0
-
-    def __call__(self, update: Update) -> Any:
-        """Call the function for `update`, unless that is only the value that was there already."""
-        return None if update.initial else self._function(update.data, update.path, **self._kwargs)
-
-    @contextmanager
-    def logging(self, update: Update, dropped: int) -> Iterator[None]:
-        """Log what is raised inside, and updates that were dropped since the last call."""
-        if dropped > self._dropped:
-            self._dropped = dropped
-            logger.warning(
-                "%s: %d updates were skipped so far; newer ones came before the callback was done",
-                self._channel,
-                dropped,
-            )
-        try:
-            yield
-        except Exception:
-            logger.exception("the callback for %s raised at %s; the subscription goes on", self._channel, update.path)
-
-    @contextmanager
-    def ending(self) -> Iterator[None]:
-        """Log the end of the calls if it is not by closing: the policy allowed no skipped update."""
-        try:
-            yield
-        except QueueFull as error:
-            logger.error("the callback for %s is not called any more: %s", self._channel, error)
-
-
 class CallbackSubscriber(SilentSubscriber):
     """Calls a function for each update of what is published at a path.
 
@@ -301,16 +259,16 @@ class CallbackSubscriber(SilentSubscriber):
             raise BadType(f"callback_function is a function, not {type(callback_function).__name__}")
         self.callback_function = callback_function
         self.kwargs = dict(kwargs or {})
-        self._task: asyncio.Task[None] | None = None
         self._updates = self.watch()
         self._link = self._updates._link  # one follower serves the calls and value()
+        self._calls: Calls | None = None
 
     async def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
         await self._updates.listen()
-        if self._task is None or self._task.get_loop() is not asyncio.get_running_loop():
-            # The task keeps a subscriber alive that nobody holds on to: it works until the interface is closed.
-            self._task = in_background(self._call_all(), f"reem {self.channel}")
+        if self._calls is None or self._calls.loop is not asyncio.get_running_loop():
+            # The hub keeps them although nobody may hold on to the subscriber: it works until the interface is closed.
+            self._calls = Calls(self._caller(), self._updates.mailbox, self.interface.session.hub.callers)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)
@@ -319,17 +277,8 @@ class CallbackSubscriber(SilentSubscriber):
         """Return what makes the calls."""
         return Caller(self.channel, self.callback_function, self.kwargs)
 
-    async def _call_all(self) -> None:
-        call = self._caller()
-        with call.ending():
-            async for update in self._updates:
-                with call.logging(update, self._updates.dropped):
-                    result = call(update)
-                    if inspect.isawaitable(result):
-                        await result
-
     async def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
         await super().close()
-        if self._task is not None and self._task is not asyncio.current_task():
-            await asyncio.wait([self._task])
+        if self._calls is not None:
+            await self._calls.done()
