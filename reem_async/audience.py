@@ -91,4 +91,4 @@ _LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
 def is_message(message: list[Any]) -> bool:
     """Return whether what was pushed is what a hub is told: its kind, the pattern if any, channel, and payload."""
     length = _LENGTHS.get(message[0]) if message and type(message[0]) is bytes else None
-    return len(message) == length and all(type(part) is bytes for part in message[1:-1])
+    return len(message) == length and type(message[1]) is bytes and type(message[-2]) is bytes

@@ -12,7 +12,7 @@ import numpy as np
 from .errors import BadData, BadType, MissingKey, PathRefused
 from .plan import Command, Plan
 from .plan.documents import Encoded, Parcel, encode, number_text
-from .plan.paths import Path, counts_from_end, show, suffix
+from .plan.paths import Path, counts_from_end, has_index, show, suffix
 from .plan.reads import Sealed, interpret, length, read, type_of
 from .plan.writes import (
     Change,
@@ -153,7 +153,7 @@ class DocumentWriter:
         """Store `value` at `path`: one transaction."""
         if counts_from_end(path):
             path = await self._from_front(path, PathRefused)
-        unique = "" if _is_fixed(path) else _unique()
+        unique = _unique() if has_index(path) else ""
         encoded, loaded = await self._prepared(path, value, unique)
         await self._set(path, encoded, loaded)
 
@@ -259,7 +259,7 @@ class DocumentWriter:
 
     async def _change(self, it: Change) -> None:
         """Make a change that sets a value, without a look at what it replaces where the shape is vouched for."""
-        memory, fixed = self.session.memory, _is_fixed(it.path)
+        memory, fixed = self.session.memory, not has_index(it.path)
         suffixes = frozenset([each.suffix for each in it.loaded])
         if self.static and fixed:
             known = memory.shape(it.keys.document, it.path)
@@ -307,11 +307,6 @@ class DocumentWriter:
             await result
         commands: tuple[Command, ...] = tuple(recorder.commands)
         return Loaded(parcel.suffix, ship.label, commands)
-
-
-def _is_fixed(path: Path) -> bool:
-    """Return whether what is at `path` stays there: items of lists move when others are deleted."""
-    return not any(isinstance(key, int) for key in path)
 
 
 def _unique() -> str:

@@ -22,13 +22,14 @@ from .background import in_background
 from .errors import MissingKey, RedisError
 from .hub import Topic
 from .plan import Plan, Reply, wire_commands
+from .plan.copies import applied, concerns, is_whole
 from .plan.keys import Keys
 from .plan.memory import Memory
-from .plan.notices import ANNOUNCED, Notice
+from .plan.notices import Notice
 from .plan.paths import Path, show
 from .plan.reads import Sealed, interpret, read
 from .plan.replies import decoded
-from .plan.trees import MISSING, CannotApply, copied, get, removed, replaced
+from .plan.trees import MISSING, CannotApply, copied, get
 from .policy import Mailbox
 from .sequences import Sequences
 from .ships.registry import Ships
@@ -152,24 +153,25 @@ class Follower:
     def _take(self, notice: Notice, order: str) -> None:
         if order == "again" or self._wire is None:
             return
-        self._recall(notice)
+        if self._losses:
+            self._recall(notice)
         if self._settling:
             self._defer(notice)
             self._later.append((notice, order))
-        elif not _concerns(notice, self.path):
+        elif not concerns(notice, self.path):
             pass
         elif self._reading:
             self._defer(notice)
             self._covered.append(notice)
-        elif self._behind or order == "late" or not _is_whole(notice, self.path, self.tree):
+        elif self._behind or order == "late" or not is_whole(notice, self.path, self.tree):
             self._fetch(notice)
         else:
             self._apply(notice)
 
     def _apply(self, notice: Notice) -> None:
-        before = self.at()
+        before = self.at() if self.rest else None
         try:
-            self.tree = _applied(self.tree, notice, self.path)
+            self.tree = applied(self.tree, notice, self.path)
         except CannotApply:  # the server has refused it too, or this copy is behind: look
             self._fetch(notice)
             return
@@ -189,8 +191,7 @@ class Follower:
 
     def _recall(self, notice: Notice) -> None:
         """Count what was lost before a notice as lost before what is told of next."""
-        if self._losses:
-            self._heard.lose(self._losses.pop((notice.publisher, notice.sequence), 0))
+        self._heard.lose(self._losses.pop((notice.publisher, notice.sequence), 0))
 
     def _read(self) -> None:
         self._last_reading += 1
@@ -345,55 +346,25 @@ class Follower:
             mailbox.put(Update(path, data, value, initial=initial, gap=not initial, missed=missed))
 
     def _emit(self, notice: Notice) -> None:
-        self._recall(notice)
+        if self._losses:
+            self._recall(notice)
         path, (gap, missed) = show((self.keys.name, *notice.path)), self._heard.lost()
         stamp = notice.time, notice.publisher, notice.sequence
+        whole = self.at()
+        part = whole if self.rest else self.at(notice.path[len(self.path) :])
         for mailbox in self.mailboxes:
-            value = self.value(() if self.rest else notice.path[len(self.path) :])
-            mailbox.put(Update(path, self.value(), value, False, *stamp, gap, missed))
+            data, value = _handed_out(whole), _handed_out(part)
+            mailbox.put(Update(path, data, value, False, *stamp, gap, missed))
 
     def value(self, inner: Path = ()) -> Any:
         """Return a copy of what is at `inner` below what is followed, None if nothing is. Any thread may."""
-        found = self.at(inner)
-        return None if found is MISSING else copied(found)
+        return _handed_out(self.at(inner))
 
     def at(self, inner: Path = ()) -> Any:
         """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
         return get(self.tree, (*self.rest, *inner))
 
 
-def _concerns(notice: Notice, followed: Path) -> bool:
-    """Return whether an update may change what is at the followed path."""
-    for position, (theirs, ours) in enumerate(zip(notice.path, followed, strict=False)):
-        if theirs == ours:
-            continue
-        if not isinstance(theirs, int) or not isinstance(ours, int):
-            return False
-        # Another item of the same list: the same one if we count from the end, and moved if that one is gone.
-        return ours < 0 or (notice.deleted and position == len(notice.path) - 1)
-    return True
-
-
-def _is_whole(notice: Notice, followed: Path, tree: Any) -> bool:
-    """Return whether the notice alone tells what is now at the followed path, given what was there."""
-    if notice.path[: len(followed)] != followed[: len(notice.path)]:
-        return False
-    if notice.deleted:  # deleting an item moves the next one to its place
-        return len(notice.path) > len(followed) or not _deletes_item(notice)
-    if notice.value is ANNOUNCED:
-        return False
-    # The server may have refused it for want of a parent; where there was something, there is a parent.
-    return not notice.path or len(notice.path) > len(followed) or tree is not MISSING
-
-
-def _deletes_item(notice: Notice) -> bool:
-    """Return whether an item of a list was deleted, so that those after it have moved."""
-    return bool(notice.path) and isinstance(notice.path[-1], int)
-
-
-def _applied(tree: Any, notice: Notice, followed: Path) -> Any:
-    """Return the local copy after an update; raises CannotApply."""
-    if len(notice.path) <= len(followed):
-        return MISSING if notice.deleted else get(notice.value, followed[len(notice.path) :])
-    inner = notice.path[len(followed) :]
-    return removed(tree, inner) if notice.deleted else replaced(tree, inner, notice.value)
+def _handed_out(found: Any) -> Any:
+    """Return a copy for a user, None for what is not there."""
+    return None if found is MISSING else copied(found)

@@ -75,17 +75,18 @@ def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted:
 
 def with_value(publisher: str, sequence: int, time: float, path: Path, text: bytes, loaded: Sequence[Loaded]) -> bytes:
     """Return a notice with the value if it is small and made of bytes, else without."""
-    size = len(text) + sum([_size(each) for each in loaded])
-    if size > LARGEST_INLINE or any(each.blob is None for each in loaded):
+    size, travels = len(text), True
+    for each in loaded:
+        size += sum([len(piece) for piece in each.blob or ()])
+        travels = travels and each.blob is not None
+    if size > LARGEST_INLINE or not travels:
         return announce(publisher, sequence, time, path, size=size)
-    blobs = [b"".join(each.blob or ()) for each in loaded]
-    parts = [[each.label, each.suffix, len(blob)] for each, blob in zip(loaded, blobs, strict=True)]
+    parts: list[Any] = []
+    blobs: list[bytes] = []
+    for each in loaded:
+        blobs.append(b"".join(each.blob or ()))
+        parts.append([each.label, each.suffix, len(blobs[-1])])
     return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
-
-
-def _size(it: Loaded) -> int:
-    """Return the bytes a ship sends, as far as it works with bytes."""
-    return sum([len(piece) for piece in it.blob or ()])
 
 
 def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
@@ -119,9 +120,7 @@ def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, ki
         and type(sequence) is int
         and type(time) in (int, float)
         and type(path) is list
-        and len(path) <= _DEEPEST
-        and all(type(key) in (str, int) for key in path)
-        and sum([len(key) for key in path if type(key) is str]) <= _LONGEST_PATH
+        and (not path or _is_path(path))
         and kind in ("set", "look", "delete")
         and type(size) is int
         and size >= 0
@@ -129,6 +128,14 @@ def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, ki
     )
     if not sound:
         raise BadData("a notice has fields of wrong types; it was not written by REEM")
+
+
+def _is_path(path: list[Any]) -> bool:
+    return (
+        len(path) <= _DEEPEST
+        and all(type(key) in (str, int) for key in path)
+        and sum([len(key) for key in path if type(key) is str]) <= _LONGEST_PATH
+    )
 
 
 def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships) -> Any:

@@ -16,8 +16,8 @@ import orjson
 from ..errors import BadKey, BadType
 
 __all__ = [
-    "Path", "below", "check_element", "check_top_key", "counts_from_end", "may_hold", "parse", "parse_suffix", "show",
-    "suffix", "to_jsonpath",
+    "Path", "below", "check_element", "check_top_key", "counts_from_end", "has_index", "may_hold", "parse",
+    "parse_suffix", "show", "suffix", "to_jsonpath",
 ]  # fmt: skip
 
 Path = tuple[str | int, ...]
@@ -175,6 +175,12 @@ def show(path: Path) -> str:
 def counts_from_end(path: Path) -> bool:
     """Return whether any index is negative."""
     return any(isinstance(key, int) and key < 0 for key in path)
+
+
+@lru_cache(maxsize=4096)
+def has_index(path: Path) -> bool:
+    """Return whether it leads through a list, whose items move when others are deleted."""
+    return any(isinstance(key, int) for key in path)
 
 
 def below(path: Path, ancestor: Path) -> bool:

@@ -6,34 +6,26 @@ from collections.abc import Sequence
 
 from . import Command
 
-__all__ = ["LARGE", "has_large", "size_of_largest"]
+__all__ = ["LARGE", "has_large"]
 
 LARGE = 1 << 16
 """Bytes from which others should not have to wait behind a value, in either direction."""
 
 
 def has_large(commands: Sequence[Command]) -> bool:
-    """Return whether so much is sent that others should not wait behind it."""
-    for command in commands:  # noqa: SIM110 - a generator costs more than the whole check
-        if size_of_largest(command) >= LARGE:
-            return True
+    """Return whether any argument of `commands` is so large that others should not wait behind it."""
+    for command in commands:
+        for word in command:
+            kind = type(word)
+            if kind is str:
+                continue
+            size = 0
+            if kind is bytes:
+                size = len(word)
+            elif kind is memoryview:
+                size = word.nbytes
+            elif kind is tuple:
+                size = sum(map(len, word))
+            if size >= LARGE:
+                return True
     return False
-
-
-def size_of_largest(command: Command) -> int:
-    """Return the bytes of the largest buffer among the words of `command`, 0 if there is none."""
-    largest = 0
-    for word in command:
-        kind = type(word)
-        if kind is str:
-            continue
-        size = 0
-        if kind is bytes:
-            size = len(word)
-        elif kind is memoryview:
-            size = word.nbytes
-        elif kind is tuple:
-            size = sum(map(len, word))
-        if size > largest:
-            largest = size
-    return largest

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from . import Command, Reply
-from .sizes import LARGE, size_of_largest
+from .sizes import has_large
 
 __all__ = ["STAGED", "Staged", "are_missing", "is_large", "looks_at", "stage"]
 
@@ -58,7 +58,7 @@ def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Comm
 
 def is_large(command: Command) -> bool:
     """Return whether a command stores a value that takes long to arrive."""
-    return len(command) == 3 and command[0] == "SET" and size_of_largest(command) >= LARGE
+    return len(command) == 3 and command[0] == "SET" and has_large((command,))
 
 
 def looks_at(coming: Sequence[Staged]) -> list[Command]:

@@ -22,6 +22,8 @@ class _Missing:
 MISSING: Final = _Missing()
 """Stands for a tree or a value that is not there."""
 
+_CONTAINERS = dict, list
+
 
 class CannotApply(Exception):
     """The update does not fit the tree: its parent is not there or cannot hold it."""
@@ -68,7 +70,7 @@ def copied(tree: Any) -> Any:
     """Return `tree` with containers of its own, for a user to keep; leaves (arrays too) are shared."""
     kind = type(tree)
     if kind is dict:
-        return {key: copied(value) for key, value in tree.items()}
+        return {key: copied(value) if type(value) in _CONTAINERS else value for key, value in tree.items()}
     if kind is list:
-        return [copied(item) for item in tree]
+        return [copied(item) if type(item) in _CONTAINERS else item for item in tree]
     return tree

@@ -18,7 +18,7 @@ from . import Command, Plan, Reply
 from .keys import Keys
 from .memory import Memory
 from .orphans import clean, survey, unreferred, watch
-from .paths import Path, below, may_hold, parse_suffix, show, to_jsonpath
+from .paths import Path, below, has_index, may_hold, parse_suffix, show, to_jsonpath
 from .replies import checked, diagnose, explained, full, registered, settable, type_name
 from .staging import Staged, are_missing, looks_at, stage
 
@@ -192,7 +192,7 @@ def _moves(it: Change, memory: Memory) -> bool:
         bool(known)
         and it.replaces
         and it.looks
-        and any(isinstance(key, int) for key in it.path)
+        and has_index(it.path)
         and any(may_hold(it.path, _place(member)) for member in known)
     )
 
@@ -248,7 +248,7 @@ def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
     written = {each.suffix.encode() for each in it.loaded}
     if it.gone is not None:
         return [member for member in it.gone if member not in written]
-    if any(isinstance(key, int) for key in it.path):
+    if has_index(it.path):
         return []
     return [member for member in known if member not in written and below(_place(member), it.path)]
 

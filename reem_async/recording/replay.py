@@ -10,7 +10,7 @@ from typing import Any
 
 from ..connection import RedisInterface
 from ..errors import BadKey, BadValue, MissingKey, PathRefused
-from ..plan.paths import Path, check_top_key, parse
+from ..plan.paths import Path, check_top_key, has_index, parse
 from ..plan.patterns import Pattern, parse_pattern
 from ..plan.trees import MISSING
 from ..plan.writes import make_parents
@@ -186,7 +186,7 @@ class Replayer:
         try:
             await self._at(path).write(value)
         except PathRefused:
-            if not parents or any(isinstance(key, int) for key in path):
+            if not parents or has_index(path):
                 self._refused += 1
                 return
             await self._session.run(make_parents(self._session.keys(path[0]), path[1:]))

@@ -221,7 +221,8 @@ class AsyncTransport:
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
-        return self._orders.setdefault(key, anyio.Lock())
+        # A free one is taken at once; else the event loop would make a turn before anything is sent.
+        return self._orders.get(key) or self._orders.setdefault(key, anyio.Lock(fast_acquire=True))
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""

@@ -202,7 +202,7 @@ class BlockingTransport:
         self._idle: collections.deque[_Line] = collections.deque()
         self._pid = os.getpid()
         self._closed = False
-        self._orders: dict[str, threading.Lock] = {}
+        self._orders: dict[str, _Locked] = {}
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
 
@@ -284,7 +284,7 @@ class BlockingTransport:
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""
         self._notice_fork()
-        return _Locked(self._orders.setdefault(key, threading.Lock()))
+        return self._orders.get(key) or self._orders.setdefault(key, _Locked())
 
     async def close(self) -> None:
         """Close all connections that are not in use; the others are closed when given back."""
@@ -303,8 +303,8 @@ class _Locked:
 
     __slots__ = ("_lock",)
 
-    def __init__(self, lock: threading.Lock) -> None:
-        self._lock = lock
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
 
     async def __aenter__(self) -> None:
         self._lock.acquire()

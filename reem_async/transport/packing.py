@@ -13,7 +13,7 @@ from typing import Any
 import hiredis
 
 from ..plan import Command
-from ..plan.sizes import LARGE, size_of_largest
+from ..plan.sizes import LARGE, has_large
 
 __all__ = ["SLOW", "Piece", "pack"]
 
@@ -25,27 +25,29 @@ SLOW = 1 << 13
 
 def pack(commands: Sequence[Command]) -> list[Piece]:
     """Return the bytes of `commands`, small ones joined, large buffers as they are."""
-    if len(commands) == 1 and size_of_largest(commands[0]) < LARGE:
-        return [_packed(commands[0])]
+    if not has_large(commands):
+        return [_joined(commands)]
     pieces: list[Piece] = []
     small: list[bytes] = []
     for command in commands:
-        if size_of_largest(command) >= LARGE:
+        if has_large((command,)):
             _pack_large(command, pieces, small)
         else:
-            small.append(_packed(command))
+            small.append(_joined((command,)))
     if small:
         pieces.append(b"".join(small))
     return pieces
 
 
-def _packed(command: Command) -> bytes:
+def _joined(commands: Sequence[Command]) -> bytes:
     try:
-        packed: bytes = hiredis.pack_command(command)
+        return b"".join(map(hiredis.pack_command, commands))
     except TypeError:  # an argument in several pieces
-        words: list[Any] = [b"".join(word) if type(word) is tuple else word for word in command]
-        packed = hiredis.pack_command(tuple(words))
-    return packed
+        return b"".join([hiredis.pack_command(tuple(map(_whole, command))) for command in commands])
+
+
+def _whole(word: Any) -> Any:
+    return b"".join(word) if type(word) is tuple else word
 
 
 def _pack_large(command: Command, pieces: list[Piece], small: list[bytes]) -> None:

@@ -14,7 +14,7 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import hiredis
 
@@ -276,11 +276,11 @@ class Wire(asyncio.BufferedProtocol):
         if not self._gone.done():
             self._gone.set_result(None)
 
-    def _take(self, reply: Reply) -> None:
+    def _take(self, reply: Any) -> None:
         # The confirmation of a SUBSCRIBE is pushed too, but it is the only reply there is to the command.
         if type(reply) is hiredis.PushNotification and not (reply and reply[0] in _CONFIRMATIONS):
             if self._on_push is not None:
-                self._on_push(cast("list[Any]", reply))
+                self._on_push(reply)
             return
         if not self._due:
             self.abort(ConnectionLost("the server sent a reply that nobody asked for"))
