@@ -67,9 +67,10 @@ class Audience:
         self._references: list[weakref.ref[Listener]] = []
 
     def add(self, listener: Listener) -> None:
-        """Take somebody in; once is enough."""
+        """Take somebody in; once is enough. Those who only keep a copy come first: callbacks may look at it."""
         if listener not in self.present():
-            self._references.append(weakref.ref(listener, self._references.remove))
+            place = len(self._references) if listener.mailboxes else 0
+            self._references.insert(place, weakref.ref(listener, self._references.remove))
 
     def discard(self, listener: Listener) -> None:
         """Let somebody go who may be there."""
@@ -78,7 +79,7 @@ class Audience:
                 self._references.remove(reference)
 
     def present(self) -> list[Listener]:
-        """Return all who are still there, in the order in which they came."""
+        """Return all who are still there, in the order in which they are told."""
         # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
         return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
 

@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from .background import in_background
 from .errors import QueueFull
-from .policy import EMPTY, Ended, Mailbox
+from .policy import EMPTY, Ended
 from .transport.patience import forget
 
 if TYPE_CHECKING:
     from .follow import Update
+    from .subscribe import Watch
 
 __all__ = ["Caller", "Calls"]
 
@@ -70,24 +71,24 @@ class Calls:
 
     Args:
         caller: Makes a call.
-        mailbox: Where the updates wait.
+        updates: Where the updates come from.
         kept: Where to be as long as there may be calls.
 
     Attributes:
         loop: The event loop.
     """
 
-    def __init__(self, caller: Caller, mailbox: Mailbox, kept: set[Any]) -> None:
+    def __init__(self, caller: Caller, updates: Watch, kept: set[Any]) -> None:
         self.loop = asyncio.get_running_loop()
         self._caller = caller
-        self._mailbox = mailbox
+        self._updates = updates
         self._kept = kept
         self._busy = False
         self._awaited: asyncio.Task[None] | None = None
         self._context = copy_context()
         self._context.run(forget)  # a time limit given for listen() is not meant for what callbacks do
         kept.add(self)
-        mailbox.wake = self._go_on
+        updates.mailbox.wake = self._go_on
         self._go_on()
 
     def _go_on(self) -> None:
@@ -96,7 +97,7 @@ class Calls:
             self._context.run(self._call_waiting)
 
     def _call_waiting(self) -> None:
-        self._busy, mailbox = True, self._mailbox
+        self._busy, mailbox = True, self._updates.mailbox
         try:
             while (update := mailbox.take()) is not EMPTY:
                 result = self._caller.call(update, mailbox.dropped)

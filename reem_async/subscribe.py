@@ -32,12 +32,12 @@ class _Link:
         self._mailboxes = mailboxes
         self._hub: Hub | None = None
         self._following: asyncio.Lock | None = None
-        self._closed = False
+        self.closed = False
         self.follower: Follower | None = None
 
     async def follow(self) -> None:
         """Begin to follow, if it has not begun; several callers wait for the same beginning."""
-        if self._closed:
+        if self.closed:
             raise InterfaceClosed("this subscription is closed; make a new one")
         hub = self._session.hub
         if hub is not self._hub:
@@ -56,7 +56,7 @@ class _Link:
 
     async def unfollow(self) -> None:
         """Stop following, for good. Idempotent; also after the interface was closed."""
-        self._closed = True
+        self.closed = True
         if self._hub is not None and self.follower is not None:
             await self._hub.unfollow(self.follower)
 
@@ -259,16 +259,22 @@ class CallbackSubscriber(SilentSubscriber):
             raise BadType(f"callback_function is a function, not {type(callback_function).__name__}")
         self.callback_function = callback_function
         self.kwargs = dict(kwargs or {})
+        self._begin()
+
+    def _begin(self) -> None:
         self._updates = self.watch()
         self._link = self._updates._link  # one follower serves the calls and value()
         self._calls: Calls | None = None
 
     async def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
+        if self._calls is not None and self._calls.loop is not asyncio.get_running_loop() and not self._link.closed:
+            self._watches.remove(self._updates)  # it ended with the other event loop
+            self._begin()
         await self._updates.listen()
-        if self._calls is None or self._calls.loop is not asyncio.get_running_loop():
+        if self._calls is None:
             # The hub keeps them although nobody may hold on to the subscriber: it works until the interface is closed.
-            self._calls = Calls(self._caller(), self._updates.mailbox, self.interface.session.hub.callers)
+            self._calls = Calls(self._caller(), self._updates, self.interface.session.hub.callers)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)

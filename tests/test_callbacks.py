@@ -1,0 +1,170 @@
+"""The calls of callback subscribers on an event loop: where, in which order, and for how long they are made."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+import weakref
+
+import pytest
+from conftest import PATIENCE, aeventually
+
+import reem_async
+from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
+from reem_async.policy import Ended, Every, Last, Mailbox
+from reem_async.transport.patience import patience
+
+
+async def test_calls_that_are_awaited_are_made_one_after_the_other_and_close_waits_for_all(ainterface, apspace, key):
+    """What comes while one is awaited waits, and is not lost by closing."""
+    begun, ended, go_on = [], [], asyncio.Event()
+
+    async def callback(data, updated_path):
+        begun.append(data)
+        await go_on.wait()
+        ended.append(data)
+
+    subscriber = CallbackSubscriber(key(), ainterface, callback)
+    await subscriber.listen()
+    for number in range(5):
+        await apspace[key()].write(number)
+    await aeventually(lambda: subscriber.value() == 4)
+    assert (begun, ended) == ([0], [])
+    closing = asyncio.create_task(subscriber.close())
+    await asyncio.sleep(0.05)
+    assert not closing.done()
+    go_on.set()
+    await asyncio.wait_for(closing, PATIENCE)
+    assert begun == ended == list(range(5))
+
+
+async def test_an_awaited_call_may_close_its_own_subscriber(ainterface, apspace, key):
+    """It does not wait for itself, and what waited is still told."""
+    told = []
+
+    async def callback(data, updated_path):
+        told.append(data)
+        if data == 0:
+            await apspace[key()].write(1)
+            await aeventually(lambda: subscriber.value() == 1)
+            await subscriber.close()
+
+    subscriber = CallbackSubscriber(key(), ainterface, callback)
+    await subscriber.listen()
+    await apspace[key()].write(0)
+    await aeventually(lambda: told == [0, 1])
+
+
+async def test_a_function_that_returns_something_to_await_is_awaited(ainterface, apspace, key):
+    """A lambda around a coroutine function, between plain calls."""
+    told = []
+
+    async def slowly(data):
+        await asyncio.sleep(0.01)
+        told.append(data)
+
+    async with CallbackSubscriber(key(), ainterface, lambda data, _: slowly(data) if data % 2 else told.append(data)):
+        for number in range(6):
+            await apspace[key()].write(number)
+        await aeventually(lambda: told == list(range(6)))
+
+
+async def test_a_subscriber_that_nobody_holds_works_until_its_interface_is_closed(server_url, apspace, key):
+    """And is gone then."""
+    told = []
+
+    class Told:
+        def __call__(self, data, updated_path):
+            told.append(data)
+
+    async with RedisInterface(server_url) as interface:
+        callback = Told()
+        kept = weakref.ref(callback)
+        await CallbackSubscriber(key(), interface, callback).listen()
+        del callback
+        gc.collect()
+        await apspace[key()].write(1)
+        await aeventually(lambda: told == [1])
+    gc.collect()
+    assert kept() is None
+
+
+async def test_a_callback_sees_mirrors_of_the_same_key_as_they_are_after_the_update(ainterface, apspace, key):
+    """Whichever was made first."""
+    seen = []
+    before = SilentSubscriber(key(), ainterface)
+    await before.listen()
+    caller = CallbackSubscriber(
+        key(), ainterface, lambda data, _: seen.append((data, before.value(), after.value(), caller.value()))
+    )
+    after = SilentSubscriber(key(), ainterface)
+    await caller.listen()
+    await after.listen()
+    for number in range(3):
+        await apspace[key()].write(number)
+    await aeventually(lambda: seen == [(number,) * 4 for number in range(3)])
+    await caller.close()
+
+
+async def test_a_time_limit_for_listen_is_not_one_for_the_calls(ainterface, apspace, key):
+    """Nor is one that somebody else sets while the update arrives."""
+    limits = []
+
+    subscriber = CallbackSubscriber(key(), ainterface, lambda *_: limits.append(patience(7.0)))
+    with reem_async.timeout(0.5):
+        await subscriber.listen()
+        await apspace[key()].write(1)
+        await aeventually(lambda: limits == [7.0])
+    await subscriber.close()
+
+
+def test_a_subscriber_can_be_used_again_in_another_event_loop(server_url, key):
+    """Also if a call was cut off by the end of the first."""
+    begun, ended = [], []
+
+    async def callback(data, updated_path):
+        begun.append(data)
+        await asyncio.sleep(0 if data else 60)
+        ended.append(data)
+
+    interface = RedisInterface(server_url)
+    subscriber, space = CallbackSubscriber(key(), interface, callback), PublishSpace(interface)
+
+    async def use(number):
+        await subscriber.listen()
+        await space[key()].write(number)
+        await aeventually(lambda: begun[-1:] == [number])
+
+    async def use_and_close():
+        await use(1)
+        await subscriber.close()
+        await interface.close()
+
+    asyncio.run(use(0))
+    asyncio.run(use_and_close())
+    assert (begun, ended) == ([0, 1], [1])
+
+
+@pytest.mark.parametrize("policy", [Last(100), Every(100)], ids=["last", "every"])
+def test_any_number_of_threads_may_wait_at_a_mailbox(policy):
+    """Each item is taken once, and closing ends all who wait."""
+    mailbox, taken, over = Mailbox(policy), [], []
+
+    def take():
+        try:
+            while True:
+                taken.append(mailbox.take_waiting())
+        except Ended:
+            over.append(threading.current_thread())
+
+    threads = [threading.Thread(target=take, daemon=True) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for number in range(100):
+        mailbox.put(number)
+    mailbox.close()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert sorted(taken) == list(range(100))
+    assert len(over) == 4
