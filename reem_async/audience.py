@@ -67,10 +67,9 @@ class Audience:
         self._references: list[weakref.ref[Listener]] = []
 
     def add(self, listener: Listener) -> None:
-        """Take somebody in; once is enough. Those who only keep a copy come first: callbacks may look at it."""
+        """Take somebody in; once is enough."""
         if listener not in self.present():
-            place = len(self._references) if listener.mailboxes else 0
-            self._references.insert(place, weakref.ref(listener, self._references.remove))
+            self._references.append(weakref.ref(listener, self._references.remove))
 
     def discard(self, listener: Listener) -> None:
         """Let somebody go who may be there."""
@@ -79,7 +78,7 @@ class Audience:
                 self._references.remove(reference)
 
     def present(self) -> list[Listener]:
-        """Return all who are still there, in the order in which they are told."""
+        """Return all who are still there, in the order in which they came."""
         # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
         return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
 

@@ -50,7 +50,7 @@ class Caller:
             return None
         try:
             return self._function(update.data, update.path, **self._kwargs)
-        except Exception:
+        except (Exception, asyncio.CancelledError):  # of something that was cancelled, and whose result it asked for
             self.failed(update)
             return None
 
@@ -67,7 +67,8 @@ class Caller:
 class Calls:
     """The calls of one subscriber on the event loop, one after the other, until its mailbox is closed.
 
-    A plain function is called right where the update arrives: a task would be woken a turn of the loop later.
+    They are made in the loop's next turn, when all that arrived in this one has been told to everybody. A task of
+    their own would do the same at a higher price; only what must be awaited gets one.
 
     Args:
         caller: Makes a call.
@@ -84,7 +85,8 @@ class Calls:
         self._updates = updates
         self._kept = kept
         self._busy = False
-        self._awaited: asyncio.Task[None] | None = None
+        self._awaited: asyncio.Task[Any] | None = None
+        self._over = self.loop.create_future()
         self._context = copy_context()
         self._context.run(forget)  # a time limit given for listen() is not meant for what callbacks do
         kept.add(self)
@@ -92,33 +94,52 @@ class Calls:
         self._go_on()
 
     def _go_on(self) -> None:
-        """Make the calls that are due, unless one is being made."""
+        """Have the calls made that are due, unless that is under way."""
         if not self._busy:
-            self._context.run(self._call_waiting)
+            self._busy = True
+            self.loop.call_soon(self._call_waiting, context=self._context)
 
     def _call_waiting(self) -> None:
-        self._busy, mailbox = True, self._updates.mailbox
+        mailbox = self._updates.mailbox
         try:
             while (update := mailbox.take()) is not EMPTY:
                 result = self._caller.call(update, mailbox.dropped)
                 if result is not None and inspect.isawaitable(result):
-                    self._awaited = in_background(self._wait(update, result), "reem callback")
+                    in_background(self._wait(update, result), "reem callback")
                     return
+            self._busy = False
         except (Ended, QueueFull) as reason:
             self._caller.ended(reason)
-            self._kept.discard(self)
-            mailbox.wake = lambda: None
-        self._busy = False
+            self._end()
+        except BaseException:
+            self._end()
+            raise
 
     async def _wait(self, update: Update, result: Awaitable[Any]) -> None:
+        self._awaited = asyncio.current_task()
         try:
             await result
-        except Exception:
+        except (Exception, asyncio.CancelledError):
+            if _is_being_cancelled():
+                self._end()
+                raise
             self._caller.failed(update)
-        self._busy, self._awaited = False, None
+        self._busy = False
         self._go_on()
 
+    def _end(self) -> None:
+        self._kept.discard(self)
+        self._updates.mailbox.wake = lambda: None
+        if not self._over.done():
+            self._over.set_result(None)
+
     async def done(self) -> None:
-        """Wait for the calls that are being made, unless this is called by one of them."""
-        while (task := self._awaited) is not None and not task.done() and task is not asyncio.current_task():
-            await asyncio.wait([task])
+        """Wait until the mailbox, which is closed, is empty and all calls were made, unless one of them asks for it."""
+        if self._awaited is not asyncio.current_task():
+            await asyncio.wait([self._over])
+
+
+def _is_being_cancelled() -> bool:
+    """Return whether this task is, and not only what it awaits."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0

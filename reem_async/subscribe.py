@@ -268,13 +268,14 @@ class CallbackSubscriber(SilentSubscriber):
 
     async def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
+        hub = self.interface.session.hub  # raises, before anything is changed, where this cannot be used
         if self._calls is not None and self._calls.loop is not asyncio.get_running_loop() and not self._link.closed:
             self._watches.remove(self._updates)  # it ended with the other event loop
             self._begin()
         await self._updates.listen()
         if self._calls is None:
             # The hub keeps them although nobody may hold on to the subscriber: it works until the interface is closed.
-            self._calls = Calls(self._caller(), self._updates, self.interface.session.hub.callers)
+            self._calls = Calls(self._caller(), self._updates, hub.callers)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.channel, self.interface, self.callback_function, self.kwargs, self.policy)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import threading
+import time
 import weakref
 
 import pytest
@@ -12,7 +13,8 @@ from conftest import PATIENCE, aeventually
 
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
-from reem_async.policy import Ended, Every, Last, Mailbox
+from reem_async.errors import WrongLoop
+from reem_async.policy import Ended, Every, Last, Mailbox, Newest
 from reem_async.transport.patience import patience
 
 
@@ -168,3 +170,65 @@ def test_any_number_of_threads_may_wait_at_a_mailbox(policy):
         thread.join(PATIENCE)
     assert sorted(taken) == list(range(100))
     assert len(over) == 4
+
+
+def test_a_call_of_listen_in_a_wrong_loop_changes_nothing(server_url, key):
+    """WrongLoop is raised; in its own loop the subscriber goes on as before: one call for each update."""
+    told = []
+    with asyncio.Runner() as mine, asyncio.Runner() as other:
+        interface = RedisInterface(server_url)
+        subscriber = CallbackSubscriber(key(), interface, lambda data, _: told.append(data))
+        space = PublishSpace(interface)
+        mine.run(subscriber.listen())
+        with pytest.raises(WrongLoop):
+            other.run(subscriber.listen())
+
+        async def go_on():
+            await subscriber.listen()
+            await space[key()].write(1)
+            await aeventually(lambda: subscriber.value() == 1)
+            await subscriber.close()
+            await space[key()].write(2)
+            await interface.close()
+
+        mine.run(go_on())
+    assert told == [1]
+
+
+@pytest.mark.parametrize("kind", ["plain", "awaited"])
+async def test_the_cancelled_result_of_something_else_ends_nothing(ainterface, apspace, key, caplog, kind):
+    """A CancelledError that a callback lets out is logged like any other; others hear all of it, without a gap."""
+    told, gone = [], asyncio.get_running_loop().create_future()
+    gone.cancel()
+
+    def callback(data, updated_path):
+        told.append(data)
+        return gone if kind == "awaited" else gone.result()
+
+    caller = CallbackSubscriber(key(), ainterface, callback)
+    async with caller, SilentSubscriber(key(), ainterface) as mirror, mirror.watch(Every(10)) as updates:
+        for number in range(3):
+            await apspace[key()].write(number)
+        heard = [await asyncio.wait_for(anext(updates), PATIENCE) for _ in range(3)]
+        await aeventually(lambda: told == [0, 1, 2])
+    assert [(update.data, update.gap) for update in heard] == [(0, False), (1, False), (2, False)]
+    assert caplog.text.count("the subscription goes on") == 3
+    assert "connection" not in caplog.text
+
+
+async def test_updates_that_arrive_together_wait_as_the_policy_says(ainterface, pspace, key):
+    """With Newest, a plain function that is slower than the updates is called with the last of them only."""
+    told = []
+
+    def callback(data, updated_path):
+        told.append(data)
+        time.sleep(0.05)
+
+    def publish():
+        for number in range(50):
+            pspace[key()] = number
+
+    async with CallbackSubscriber(key(), ainterface, callback, policy=Newest()):
+        await asyncio.to_thread(publish)
+        await aeventually(lambda: told[-1:] == [49])
+    assert len(told) < 25
