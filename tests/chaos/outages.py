@@ -186,7 +186,7 @@ def black_hole(run: Run) -> None:
 
 
 async def _black_hole(run: Run) -> None:
-    rounds, beside = run.size((10, 2), (1, 2))
+    rounds, beside = run.size((4, 5), (1, 2))
     asyncio.get_running_loop().set_default_executor(concurrent.futures.ThreadPoolExecutor(4 * beside))  # none waits
     victims: list[_Victims] = []
     with PrivateServer() as server, contextlib.ExitStack() as outer:
