@@ -25,7 +25,6 @@ class _Mischief:
         self._proxy = proxy
         self._over = threading.Event()
         self.made = 0
-        self.slow: list[tuple[float, float]] = []
         self.thread = threading.Thread(target=self._make)
 
     def _make(self) -> None:
@@ -49,11 +48,9 @@ class _Mischief:
         self._proxy.heal()
 
     def _slow(self) -> None:
-        began = time.monotonic()
         self._proxy.delay = 0.003
         self._over.wait(0.1)
         self._proxy.heal()
-        self.slow.append((began, time.monotonic()))
 
     def __enter__(self) -> _Mischief:
         self.thread.start()
@@ -114,8 +111,7 @@ def soak(run: Run) -> None:
     run.none("updates told again or backwards", found["disordered"])
     run.none("torn", found["torn"])
     _judge_costs(run, np.array(found["samples"]))
-    slow = [(start - begun, end - begun) for start, end in mischief.slow]
-    _judge_times(run, _undelayed(np.array(found["calls"]), slow), np.array(yardstick.calls), seconds)
+    _judge_times(run, np.array(found["calls"]), np.array(yardstick.calls), seconds)
 
 
 def _judge_costs(run: Run, samples: Any) -> None:
@@ -128,17 +124,6 @@ def _judge_costs(run: Run, samples: Any) -> None:
     half = len(warm) // 2
     for column, what in ((2, "more descriptors"), (3, "more tasks")):
         run.at_most(what, float(np.median(warm[half:, column]) - np.median(warm[:half, column])), 1.0)
-
-
-def _undelayed(calls: Any, slow: list[tuple[float, float]]) -> Any:
-    """Return the calls that were not slowed on purpose.
-
-    Those are about as many as lie above the 99th percentile, which would be one of them or not, as chance will have it.
-    """
-    kept = np.ones(len(calls), bool)
-    for start, end in slow:
-        kept &= (calls[:, 0] < start - 0.1) | (calls[:, 0] > end + 0.1)
-    return calls[kept]
 
 
 def _judge_times(run: Run, calls: Any, plain: Any, seconds: float) -> None:
