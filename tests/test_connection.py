@@ -18,6 +18,7 @@ import reem
 import reem_async
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
 from reem_async.server import EmbeddedServer
+from reem_async.transport.patience import moved_last
 
 
 @pytest.fixture
@@ -95,6 +96,23 @@ def test_the_limit_of_one_blocking_call_is_its_own(server):
 def test_what_is_no_time_limit_is_refused(seconds):
     with pytest.raises(BadValue, match="timeout"), reem.timeout(seconds):
         pass
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "limit", "moved"),
+    [
+        (9000, 9000, 1.0, 10.0),  # nothing was confirmed
+        (0, 9000, 1.0, 10.0),  # written, not yet on its way
+        (9000, 4000, 1.0, 10.5),  # moves
+        (9000, 0, 1.0, 10.46),  # all is there: the kernel may say so 40 ms late
+        (9000, 0, 0.25, 10.49),  # of a short limit, no more than a 25th is given away
+        (9000, 0, 100.0, 10.46),
+        (0, 0, 1.0, 10.0),
+    ],
+)
+def test_the_last_confirmation_of_an_upload_counts_from_when_its_bytes_may_have_come(before, left, limit, moved):
+    assert moved_last(10.0, 10.5, before, left, limit) == pytest.approx(moved)
+    assert moved_last(10.495, 10.5, before, left, limit) >= 10.495  # never before what was seen
 
 
 async def test_a_slow_upload_is_not_cut_off(server):

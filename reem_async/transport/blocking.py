@@ -26,7 +26,7 @@ from .identity import WHO, who
 from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import LOOKS, patience, unsent
+from .patience import LOOKS, moved_last, patience, unsent
 
 __all__ = ["BlockingTransport"]
 
@@ -155,10 +155,9 @@ class _Line:
 
     def _check_moved(self, limit: float) -> None:
         """Raise TimeoutError if nothing has moved for the whole limit, neither here nor on its way up."""
-        before, self._left = self._left, unsent(self._socket)
-        if self._left < before:
-            self._moved = time.monotonic()
-        if time.monotonic() - self._moved >= limit:
+        before, self._left, now = self._left, unsent(self._socket), time.monotonic()
+        self._moved = moved_last(self._moved, now, before, self._left, limit)
+        if now - self._moved >= limit:
             raise TimeoutError
 
     def fresh(self) -> bool:

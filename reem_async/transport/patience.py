@@ -18,11 +18,15 @@ try:
 except ImportError:  # Windows: what the kernel still holds cannot be asked there
     fcntl = termios = None  # type: ignore[assignment]
 
-__all__ = ["LOOKS", "check_timeout", "confirmed", "forget", "patience", "timeout", "unsent"]
+__all__ = ["LOOKS", "check_timeout", "confirmed", "forget", "moved_last", "patience", "timeout", "unsent"]
 
 LOOKS = 160
 """How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
-move, and the other side's last confirmation alone may be 40 ms late."""
+move."""
+
+_DELAYED = 0.04
+"""Seconds after which the other side's kernel confirms the last bytes, if it has nothing to send with it: TCP's delayed
+acknowledgement. Those before are confirmed at once."""
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
 _BYTES_ACKED = 120
@@ -67,6 +71,21 @@ def patience(default: float) -> float:
     """Return the time limit of a call made now."""
     given = _given.get()
     return default if given is None else given
+
+
+def moved_last(last: float, now: float, before: int, left: int, limit: float) -> float:
+    """Return when a byte of a large value on its way up moved last.
+
+    Args:
+        last: When one had moved at the last look.
+        now: The time.
+        before: How many bytes were not confirmed at the last look.
+        left: How many are not confirmed now.
+        limit: The time limit of the call, in seconds.
+    """
+    if left >= before:
+        return last
+    return now if left else max(last, now - min(_DELAYED, limit / 25))
 
 
 def unsent(connected: socket.socket | None) -> int:

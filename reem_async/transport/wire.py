@@ -24,7 +24,7 @@ from ..plan.sizes import LARGE
 from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import LOOKS, confirmed, patience, unsent
+from .patience import LOOKS, confirmed, moved_last, patience, unsent
 
 __all__ = ["Wire", "open_wire"]
 
@@ -311,10 +311,10 @@ class Wire(asyncio.BufferedProtocol):
         """Tell the callers whose limit has passed; break the connection if nobody is left to wait for it."""
         self._watch = None
         now, left = self._loop.time(), self._bytes_unsent()
-        if left < self._unsent:  # a large value on its way up is progress too
-            self._last_byte = now
-        self._unsent = left
         waiting = [due for due in self._due if not due.over]
+        if waiting:  # a large value on its way up is progress too
+            self._last_byte = moved_last(self._last_byte, now, self._unsent, left, waiting[0].limit)
+        self._unsent = left
         for due in waiting:
             if max(self._last_byte, due.since) + due.limit <= now:
                 due.over = True
