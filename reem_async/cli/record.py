@@ -55,7 +55,8 @@ def record(
     no pattern, only the samples are recorded. Ctrl-C ends the recording and completes the file; if it is
     killed, all but the last second can be read.
 
-    The programs that are recorded come first. With --background they notice the recorder least, but where
+    The programs that are recorded come first. On the server's own machine it is read through its Unix socket,
+    if it has one: that costs it less than TCP. With --background they notice the recorder least, but where
     they need every processor wholly, updates are missing from the recording; it says how many.
 
     Examples:
@@ -67,10 +68,13 @@ def record(
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
+        from reem_async.transport.nearby import take_shortcut
+
         if background:
             _stand_back()
         else:
             come_second()
+        await take_shortcut(interface.session)
         recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
         try:
             async with recorder:

@@ -23,7 +23,7 @@ from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotCon
 from ..plan import Command
 from ..plan.replies import refusal
 
-__all__ = ["Address", "NodeOptions", "Options", "connecting_by", "question", "question_here"]
+__all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machine", "question", "question_here"]
 
 Address = tuple[str, int]
 """Host and port."""
@@ -44,12 +44,16 @@ class Options:
         BadValue: A URL that cannot be parsed, or an option that cannot be meant.
         BadType: An option that redis-py does not know.
 
+    Attributes:
+        nearer: A shorter way to the same server, for asyncio connections, as long as it can be gone; else None.
+
     Warns:
         InsecureConnection: Others can listen; once for each address.
     """
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
         self.timeout = timeout
+        self.nearer: Options | None = None
         self.settings = {**_address(host), **options}
         if self.settings.setdefault("protocol", 3) not in (3, "3"):
             raise BadValue("REEM speaks protocol 3 (notices and replies share a connection); leave protocol= out")
@@ -86,7 +90,7 @@ class Options:
 
     def _warn_of_listeners(self) -> None:
         """Say once for each address if what is sent there is open to others; looks nothing up, connects to nothing."""
-        if self.socket_path is not None or _is_this_machine(str(self.settings.get("host", "localhost"))):
+        if self.socket_path is not None or is_this_machine(str(self.settings.get("host", "localhost"))):
             return
         if not self.tls:
             danger, remedy = (
@@ -128,6 +132,8 @@ class Options:
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
+        if self.nearer is not None:
+            return self.nearer.asynchronous_connection()
         module: Any = redis.asyncio.connection
         # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12.
         settings = {"socket_timeout": None, **self.settings}
@@ -248,7 +254,7 @@ def _levels_to_caller() -> int:
     return level
 
 
-def _is_this_machine(host: str) -> bool:
+def is_this_machine(host: str) -> bool:
     """Return whether a name stands for this very machine, as far as can be told without looking it up."""
     if host in ("", "localhost") or host.endswith(".localhost"):
         return True

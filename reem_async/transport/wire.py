@@ -370,6 +370,7 @@ async def open_wire(
         async with asyncio.timeout(options.handshake_timeout):
             await connection.connect()
     except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
+        options.nearer = None  # whoever tries again goes the long way
         await connection.disconnect(nowait=True)
         raise options.refused(error) from error
     wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
