@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import shutil
 import signal
@@ -72,6 +73,28 @@ async def test_a_socket_that_is_gone_is_not_taken(server):
     Path(server.socket_path).unlink()
     async with connected(server) as interface:
         assert await take_shortcut(interface.session) is None
+
+
+@pytest.mark.parametrize("said", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 100, b"", None])
+async def test_a_stranger_at_the_path_is_left_alone(server, said):
+    """One that speaks something else, hangs up, or says nothing at all."""
+    Path(server.socket_path).unlink()
+
+    async def answer(reader, writer):
+        await reader.read(100)
+        if said is not None:
+            writer.write(said)
+        else:
+            await reader.read()  # until the other side gives up
+        writer.close()
+
+    listening = await asyncio.start_unix_server(answer, server.socket_path)
+    async with connected(server) as interface:
+        async with asyncio.timeout(3):
+            assert await take_shortcut(interface.session) is None
+        await reem_async.KeyValueStore(interface)["a"].write(1)
+    listening.close()
+    await listening.wait_closed()
 
 
 async def test_who_may_not_ask_goes_on_by_tcp(server):

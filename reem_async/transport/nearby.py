@@ -6,9 +6,6 @@ import asyncio
 import os
 from typing import TYPE_CHECKING, Any
 
-from redis.exceptions import RedisError
-
-from ..errors import ReemError
 from .identity import WHO, who
 from .options import Options, is_this_machine, question
 
@@ -16,6 +13,9 @@ if TYPE_CHECKING:
     from ..session import Session
 
 __all__ = ["take_shortcut"]
+
+_PATIENCE = 1.0
+"""Seconds for whoever is at the socket to say who he is."""
 
 _OF_TCP = ("host", "port", "socket_keepalive", "socket_keepalive_options", "socket_type")
 
@@ -36,13 +36,14 @@ async def take_shortcut(session: Session) -> str | None:
         return None
     try:
         server, told = await session.transport.roundtrip([WHO, ("CONFIG", "GET", "unixsocket")])
-        path = os.fsdecode(told[b"unixsocket"]) if isinstance(told, dict) and told.get(b"unixsocket") else ""
+        name = told.get(b"unixsocket") if isinstance(told, dict) else None
         process = who([server])
-        if process is None or not os.path.isabs(path):
+        if process is None or not isinstance(name, bytes) or not os.path.isabs(name):
             return None
+        path = os.fsdecode(name)
         nearer = Options("localhost", options.timeout, _settings(options) | {"unix_socket_path": path})
         await _verify(nearer, process)
-    except (RedisError, ReemError, OSError):  # not allowed to ask, or to connect: it is only a shortcut
+    except Exception:  # not allowed to ask, or to connect, or a stranger's nonsense: it is only a shortcut
         return None
     options.nearer = nearer
     return path
@@ -61,7 +62,7 @@ async def _verify(nearer: Options, process: str) -> None:
 
     connection = nearer.asynchronous_connection()
     try:
-        async with asyncio.timeout(nearer.handshake_timeout):
+        async with asyncio.timeout(_PATIENCE):
             await connection.connect()
             await question(connection, [WHO], check)
     finally:
