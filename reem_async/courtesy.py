@@ -8,12 +8,16 @@ a millisecond should therefore give way himself now and then: a set point may be
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import sys
 import time
 
-__all__ = ["come_second", "give_way", "stand_back"]
+__all__ = ["come_second", "give_way", "keep_memory", "stand_back"]
 
 _NICER, _NICEST = 5, 19
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""What glibc's mallopt calls them."""
 
 
 def give_way() -> None:
@@ -46,3 +50,16 @@ def stand_back() -> None:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     else:
         os.nice(_NICEST)
+
+
+def keep_memory() -> None:
+    """Have this process keep the memory it frees for what comes next, up to 64 MiB a thread, where that can be.
+
+    Large blocks are given back to the system otherwise, and each page that is taken anew costs a fault: for a
+    camera of 28 MB/s twelve thousand a second.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(AttributeError, OSError):  # another C library
+            library = ctypes.CDLL(None)
+            library.mallopt(_MMAP_THRESHOLD, 32 << 20)
+            library.mallopt(_TRIM_THRESHOLD, 64 << 20)

@@ -200,3 +200,19 @@ async def test_a_patient_monitor_is_woken_seldom_unless_somebody_else_is_in_a_hu
             return 1 + sum(b.received - a.received > 0.003 for a, b in itertools.pairwise(events))
 
     assert await batches(hurried=False) <= 15 < await batches(hurried=True)
+
+
+@pytest.mark.parametrize(("patience", "gives_way"), [(0.0, False), (0.002, False), (0.01, True)])
+async def test_a_monitor_that_has_time_gives_way_after_each_update(
+    patience, gives_way, apspace, server_url, key, monkeypatch
+):
+    ways = []
+    monkeypatch.setattr("reem_async.transport.wire.give_way", lambda: ways.append(1))
+    async with reem_async.RedisInterface(server_url) as watching:
+        monitor = Monitor(watching, [key("*")], patience=patience)
+        async with monitor:
+            for number in range(3):
+                await apspace[key("a")].write(number)
+            assert [event.value for event in await taken(monitor, 3)] == [0, 1, 2]
+    assert (len(ways) >= 3) == gives_way
+    assert gives_way or not ways

@@ -14,7 +14,7 @@ import typer
 from reem_async.cli.options import DEFAULT_URL, AsJson, Namespace, Patterns, Url
 from reem_async.cli.output import clean, cut, emit, emit_json, size_text, width
 from reem_async.cli.running import Refused, prepared, run
-from reem_async.courtesy import come_second, stand_back
+from reem_async.courtesy import come_second, keep_memory, stand_back
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -74,6 +74,7 @@ def record(
             _stand_back()
         else:
             come_second()
+        keep_memory()
         await take_shortcut(interface.session)
         recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
         try:

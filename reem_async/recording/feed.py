@@ -190,7 +190,8 @@ class Feed:
                 since, self._last_large = head.stamp[0] - self._last_large, head.stamp[0]
                 if since < _FAST:
                     collector.hurry()
-                await asyncio.sleep(min(_LET_PASS, since / 1e9 / 5))  # not if they come fast: none should be missed
+                let_pass = min(_LET_PASS, since / 1e9 / 5)  # not if they come fast: none should be missed
+                await asyncio.sleep(let_pass - collector.clock.since(head.stamp[0]))
             async with collector.fetching:
                 self._since.clear()
                 last = self._items[-1].stamp[0]  # what has been announced until now is older than the reply

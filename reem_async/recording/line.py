@@ -13,7 +13,7 @@ from ..transport.wire import Wire
 
 __all__ = ["HURRIED", "PATIENCE", "Line"]
 
-PATIENCE = 0.005
+PATIENCE = 0.01
 """Seconds that updates may wait to be recorded, several at once. The publisher's time in them is not touched."""
 
 HURRIED = 0.002

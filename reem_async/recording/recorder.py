@@ -19,6 +19,7 @@ import numpy as np
 
 from ..catalog import names
 from ..connection import RedisInterface
+from ..courtesy import give_way
 from ..errors import BadType, BadValue, InterfaceClosed, RedisError
 from ..monitor import Monitor
 from ..plan.paths import Path
@@ -137,6 +138,7 @@ class Recorder:
         self._tasks: list[asyncio.Task[None]] = []
         self._begun = self._ended = 0.0
         self._dropped = 0
+        self._hurried = False
         self._failure: Exception | None = None
         self._done = asyncio.Event()
 
@@ -282,6 +284,8 @@ class Recorder:
         assert self._monitor is not None
         async for event in self._monitor:
             self._feed(event.name).on_event(event)
+            if not self._hurried:
+                give_way()
 
     def _pump(self) -> None:
         """Take what has arrived already."""
@@ -306,6 +310,7 @@ class Recorder:
 
     def hurry(self) -> None:
         """Look more often at what was published: large updates come fast."""
+        self._hurried = True
         self.session.hub.hurry(HURRIED)
 
     def failed(self, error: Exception) -> None:

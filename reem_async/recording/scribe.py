@@ -19,7 +19,7 @@ from ..plan.paths import Path, show
 from ..plan.trees import MISSING, CannotApply, get, removed, replaced
 from ..ships.numpy import NumpyShip
 from ..ships.registry import Ships
-from .gentle import digest
+from .contents import Content, Recent
 from .layout import WRAPPER, Document, to_json
 from .messages import encode
 from .sink import FullError, Sink
@@ -115,6 +115,7 @@ class Scribe:
         self._changed = threading.Condition()
         self._ending = False
         self._trees: dict[str, Any] = {}
+        self._recent = Recent()
         self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
 
     def start(self) -> None:
@@ -158,6 +159,7 @@ class Scribe:
         try:
             while not self._take():
                 self._sink.tick()
+                self._recent.tick()
             self._sink.finish({**self._metadata, **self._summary()})
         except Exception as error:
             with self._changed:
@@ -263,10 +265,12 @@ class Scribe:
             if data is None:
                 self.counts.lose(path)
                 return Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
-            stored = _described(label, path, it.stamp[0], data)
+            content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", data)
+            stored = _described(label, path, it.stamp[0], data, content)
             old = get(before, path[len(it.path) :]) if it.role == "state" else None
-            if type(old) is Stored and stored.digest == old.digest and stored.label == old.label:
+            if type(old) is Stored and _is_same(stored, old):
                 return old
+            self._recent.add(content)
             role = "update" if path == it.path and it.role == "update" else "part"
             encoded = encode(label, data, show(path), it.stamp[1] or it.stamp[0])
             try:
@@ -292,9 +296,14 @@ class Scribe:
         self.counts.bytes += size
 
 
-def _described(label: str, path: Path, at: int, data: Any) -> Stored:
+def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Stored:
     if isinstance(data, np.ndarray):
         size, summary = _NUMPY.describe(data)
-        unlike = digest(*_NUMPY.pack(data))
-        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, unlike)
-    return Stored(label, path, at, len(data), label, digest=digest(b"", data))
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content)
+    return Stored(label, path, at, len(data), label, content=content)
+
+
+def _is_same(one: Stored, other: Stored) -> bool:
+    if one.content is None or other.content is None or one.label != other.label:
+        return False
+    return one.content.digest() == other.content.digest()

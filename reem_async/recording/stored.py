@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..plan.paths import Path, show
+from .contents import Content
 
 __all__ = ["LONGEST_INLINE", "LOST", "Store", "Stored", "extract", "is_inline", "resolve", "same"]
 
@@ -35,7 +36,7 @@ class Stored:
         summary: What it is, for people: "uint8[480,640,3]".
         dtype: The dtype of an array, for people.
         shape: The shape of an array, None for anything else.
-        digest: A digest of its bytes, to tell whether it has changed; not in the file.
+        content: Its bytes, or a digest of them, to tell whether it has changed; not in the file.
     """
 
     label: str
@@ -45,7 +46,7 @@ class Stored:
     summary: str = ""
     dtype: str = ""
     shape: tuple[int, ...] | None = None
-    digest: bytes = field(default=b"", compare=False)
+    content: Content | None = field(default=None, compare=False, repr=False)
 
     @property
     def shown(self) -> str:

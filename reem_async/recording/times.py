@@ -62,6 +62,10 @@ class Clock:
         self._last = max(now // STEP * STEP, self._last + STEP)
         return self._last
 
+    def since(self, stamp: int) -> float:
+        """Return the seconds that have passed since a log time."""
+        return (time.monotonic_ns() + self._offset - stamp) / 1e9
+
 
 class Arrivals:
     """Tells when updates arrived that were taken a little later, several at once.

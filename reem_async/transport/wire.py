@@ -18,6 +18,7 @@ from typing import Any
 
 import hiredis
 
+from ..courtesy import give_way
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
@@ -30,6 +31,9 @@ __all__ = ["Wire", "open_wire"]
 
 _BUSY = 2.5
 """Three reads within so many times the pace are much."""
+
+_LEISURELY = 0.005
+"""A pace from which on nobody waits for what comes: others are given way after each message."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -249,6 +253,8 @@ class Wire(asyncio.BufferedProtocol):
             self._reader.received(nbytes)
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
+                if self.pace >= _LEISURELY:
+                    give_way()
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
         if self._last_byte - before < _BUSY * self.pace and self.alive:
