@@ -51,6 +51,11 @@ class Line:
         self.patience = PATIENCE
         self.wire: Wire | None = None
 
+    @property
+    def leisurely(self) -> bool:
+        """Whether nobody waits for the notices."""
+        return self.wire is not None and self.wire.leisurely
+
     def start(self, wire: Wire, kind: str) -> None:
         """Take the connection; after a broken one, have all keys read anew."""
         self.wire = wire

@@ -138,7 +138,6 @@ class Recorder:
         self._tasks: list[asyncio.Task[None]] = []
         self._begun = self._ended = 0.0
         self._dropped = 0
-        self._hurried = False
         self._failure: Exception | None = None
         self._done = asyncio.Event()
 
@@ -284,7 +283,7 @@ class Recorder:
         assert self._monitor is not None
         async for event in self._monitor:
             self._feed(event.name).on_event(event)
-            if not self._hurried:
+            if self._line is not None and self._line.leisurely:
                 give_way()
 
     def _pump(self) -> None:
@@ -310,7 +309,6 @@ class Recorder:
 
     def hurry(self) -> None:
         """Look more often at what was published: large updates come fast."""
-        self._hurried = True
         self.session.hub.hurry(HURRIED)
 
     def failed(self, error: Exception) -> None:

@@ -33,7 +33,7 @@ _BUSY = 2.5
 """Three reads within so many times the pace are much."""
 
 _LEISURELY = 0.005
-"""A pace from which on nobody waits for what comes: others are given way after each message."""
+"""A pace from which on nobody waits for what comes."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -136,6 +136,11 @@ class Wire(asyncio.BufferedProtocol):
     def alive(self) -> bool:
         """Whether commands can be sent."""
         return self._reason is None and self._transport is not None and not self._transport.is_closing()
+
+    @property
+    def leisurely(self) -> bool:
+        """Whether nobody waits for what comes, so that others are given way after each message."""
+        return self.pace >= _LEISURELY
 
     def send(self, commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]) -> None:
         """Send `commands`; `done` is called with their replies, in order with pushed messages, or with an error."""
@@ -253,7 +258,7 @@ class Wire(asyncio.BufferedProtocol):
             self._reader.received(nbytes)
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
-                if self.pace >= _LEISURELY:
+                if self.leisurely:
                     give_way()
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
