@@ -77,7 +77,10 @@ class Stream(Generic[Item]):
 
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+            try:
+                self._waiter.set_result(None)
+            except asyncio.InvalidStateError:  # Ctrl-C cancels between any two steps of Python
+                return
 
     async def __aenter__(self) -> Self:
         await self.listen()

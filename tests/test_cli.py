@@ -53,7 +53,7 @@ class CommandLine:
         """Run a command as a user does."""
         words, environment = self.words(command, *arguments), self.environment(**changes)
         run = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=30, check=False)
-        assert "Traceback" not in run.stderr
+        assert "Traceback" not in run.stderr, run.stderr
         return run
 
     def result(self, *arguments, **options):
@@ -106,7 +106,7 @@ class CommandLine:
             patience.cancel()
             code = process.wait(10)
         assert not todo, said
-        assert b"Traceback" not in said
+        assert b"Traceback" not in said, said.decode()
         return said.decode(), code
 
 

@@ -7,6 +7,8 @@ import contextlib
 import logging
 import os
 import random
+import signal
+import sys
 import threading
 import time
 
@@ -588,3 +590,49 @@ async def test_a_follower_of_an_index_that_is_too_far_from_the_end_sees_nothing(
         await apspace[key()].write([40])
         await aeventually(lambda: near.value() is None)
         assert far.value() is None
+
+
+# --- Ctrl-C ---------------------------------------------------------------------------------------
+
+
+def interrupting(module, went):
+    """A profiler that presses Ctrl-C in this module, in front of the step that tells a waiting task."""
+
+    def profiler(frame, event, arg):
+        its = event == "c_call" and arg.__name__ == "set_result" and frame.f_code.co_filename.endswith(module)
+        if its and not went:
+            went.append(module)
+            signal.raise_signal(signal.SIGINT)
+
+    return profiler
+
+
+@pytest.mark.parametrize("module", ["stream.py", "wire.py"])
+def test_ctrl_c_between_a_reply_and_its_waiter_costs_no_connection(server_url, key, caplog, module):
+    """asyncio.run cancels its task within the handler of the signal, thus between any two steps."""
+    went, afterwards = [], []
+
+    async def program():
+        async with asyncio.timeout(PATIENCE), RedisInterface(server_url) as interface:
+            space, store = PublishSpace(interface), KeyValueStore(interface)
+            await space[key()].write(0)
+            async with store[key()].watch(Last(10)) as updates:
+                writing = asyncio.create_task(write(space))
+                sys.setprofile(interrupting(module, went))
+                try:
+                    while True:
+                        await (anext(updates) if module == "stream.py" else store[key()].read())
+                finally:
+                    sys.setprofile(None)
+                    writing.cancel()
+                    afterwards.append(await store[key()].read() > 0)
+
+    async def write(space):
+        for number in range(1, 1000):
+            await space[key()].write(number)
+            await asyncio.sleep(0.01)
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(program())
+    assert (went, afterwards) == ([module], [True])
+    assert caplog.records == []

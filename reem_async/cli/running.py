@@ -10,7 +10,7 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -105,16 +105,31 @@ async def _connected(
 ) -> Any:
     from reem_async.connection import RedisInterface
 
-    task = asyncio.current_task()
-    if live and task is not None:
-        with suppress(NotImplementedError):  # Windows
-            asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    _cancel_on([signal.SIGINT, signal.SIGTERM] if live else [signal.SIGINT])
     interface = RedisInterface(address_of(url), namespace=namespace, timeout=CALL_SECONDS)
     try:
         await interface.initialize()
         return await work(interface)
     finally:
         await interface.close()
+
+
+def _cancel_on(signals: Sequence[signal.Signals]) -> None:
+    """Cancel this task, once, when a signal comes; the same signal again ends the process as ever.
+
+    `asyncio.run` alone cancels within the handler of the signal, between any two steps of Python: thus also
+    after a reply's waiter was seen to wait and before it is told, which asyncio complains about at length.
+    """
+    task, loop = asyncio.current_task(), asyncio.get_running_loop()
+
+    def cancel(number: signal.Signals) -> None:
+        loop.remove_signal_handler(number)
+        if task is not None:
+            task.cancel()
+
+    with suppress(NotImplementedError):  # Windows
+        for number in signals:
+            loop.add_signal_handler(number, cancel, number)
 
 
 def address_of(url: str) -> str:

@@ -208,12 +208,13 @@ class Wire(asyncio.BufferedProtocol):
         answer: asyncio.Future[list[Reply]] = self._loop.create_future()
 
         def done(outcome: list[Reply] | Exception) -> None:
-            if answer.done():  # cancelled
+            try:
+                if isinstance(outcome, Exception):
+                    answer.set_exception(outcome)
+                else:
+                    answer.set_result(outcome)
+            except asyncio.InvalidStateError:  # cancelled; asked before, Ctrl-C could still come between
                 return
-            if isinstance(outcome, Exception):
-                answer.set_exception(outcome)
-            else:
-                answer.set_result(outcome)
 
         self.send(commands, done)
         return answer
