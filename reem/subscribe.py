@@ -11,6 +11,7 @@ from typing import Any, Self
 
 import reem_async
 from reem_async import subscribe as core
+from reem_async.courtesy import take_short_turns
 from reem_async.errors import BadType, InterfaceClosed, QueueFull
 from reem_async.plan.paths import Path
 from reem_async.policy import Ended, Newest, Policy
@@ -187,6 +188,7 @@ class CallbackSubscriber(SilentSubscriber):
 
     def _call_all(self) -> None:
         caller, mailbox = self._calls._caller(), self._calls._updates.mailbox
+        take_short_turns()  # the event loop's thread has had its wake-up before: waiting once in line is enough
         try:
             while True:
                 caller.call(mailbox.take_waiting(), mailbox.dropped)

@@ -10,14 +10,19 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import struct
 import sys
 import time
 
-__all__ = ["come_second", "give_way", "keep_memory", "stand_back"]
+__all__ = ["come_second", "give_way", "keep_memory", "stand_back", "take_short_turns"]
 
 _NICER, _NICEST = 5, 19
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """What glibc's mallopt calls them."""
+_SET_ATTRIBUTES = {"x86_64": 314, "aarch64": 274}
+"""The number of Linux's system call sched_setattr on 64-bit processors; the C library has no name for it."""
+_RESET_ON_FORK = 1
+_SHORTEST_TURN = 100_000
 
 
 def give_way() -> None:
@@ -50,6 +55,21 @@ def stand_back() -> None:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     else:
         os.nice(_NICEST)
+
+
+def take_short_turns() -> None:
+    """Have this thread, but none that it begins, take turns of 0.1 ms, where that can be: Linux from 6.12 on.
+
+    Its share of the processor stays what it was, but when it is woken it comes before threads with longer turns, so
+    also before those that were woken earlier. A thread with another policy than the ordinary one is left as it is.
+    """
+    if sys.platform != "linux" or sys.maxsize < 1 << 32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
+        return
+    if number := _SET_ATTRIBUTES.get(os.uname().machine):
+        nice = os.getpriority(os.PRIO_PROCESS, 0)
+        wish = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, _RESET_ON_FORK, nice, 0, _SHORTEST_TURN, 0, 0)
+        with contextlib.suppress(AttributeError, OSError):
+            ctypes.CDLL(None).syscall(ctypes.c_long(number), 0, ctypes.c_char_p(wish), 0)
 
 
 def keep_memory() -> None:

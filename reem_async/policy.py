@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-import queue
 import threading
 from collections.abc import Callable
 from typing import Any
 
 from .errors import BadValue, QueueFull
+from .tickets import Tickets, tickets
 
 __all__ = ["EMPTY", "Ended", "Every", "Last", "Mailbox", "Newest", "Policy"]
 
@@ -77,7 +77,7 @@ class Mailbox:
         self._lock = threading.Lock()
         # A threading.Condition does the same in Python, at several times the cost.
         self._sleeping = 0  # threads that wait for a ticket, and
-        self._tickets: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self._tickets: Tickets | None = None
         self._end: BaseException | None = None
         self.dropped = 0
         self.wake: Callable[[], None] = lambda: None
@@ -111,7 +111,7 @@ class Mailbox:
 
     def _tell(self) -> None:
         """Wake all who wait; who then has nothing to take waits again."""
-        if self._sleeping:
+        if self._sleeping and self._tickets is not None:
             with self._lock:
                 sleeping, self._sleeping = self._sleeping, 0
             for _ in range(sleeping):
@@ -146,8 +146,9 @@ class Mailbox:
             with self._lock:
                 if (item := self._take()) is not EMPTY:
                     return item
+                waiting = self._tickets = self._tickets or tickets()
                 self._sleeping += 1
-            self._tickets.get()  # left by Ctrl-C, its ticket wakes somebody in vain
+            waiting.get()  # left by Ctrl-C, its ticket wakes somebody in vain
 
     def close(self) -> None:
         """End the queue after what waits."""

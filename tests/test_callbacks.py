@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import gc
+import os
+import signal
 import threading
 import time
 import weakref
 
 import pytest
-from conftest import PATIENCE, aeventually
+from conftest import PATIENCE, aeventually, python
 
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
@@ -149,8 +152,11 @@ def test_a_subscriber_can_be_used_again_in_another_event_loop(server_url, key):
 
 
 @pytest.mark.parametrize("policy", [Last(100), Every(100)], ids=["last", "every"])
-def test_any_number_of_threads_may_wait_at_a_mailbox(policy):
-    """Each item is taken once, and closing ends all who wait."""
+@pytest.mark.parametrize("descriptors", ["left", "used up"])
+def test_any_number_of_threads_may_wait_at_a_mailbox(policy, descriptors, monkeypatch):
+    """Each item is taken once, and closing ends all who wait; also where the system gives nothing to wait at."""
+    if descriptors == "used up":
+        monkeypatch.setattr(os, "eventfd", none_left, raising=False)
     mailbox, taken, over = Mailbox(policy), [], []
 
     def take():
@@ -170,6 +176,66 @@ def test_any_number_of_threads_may_wait_at_a_mailbox(policy):
         thread.join(PATIENCE)
     assert sorted(taken) == list(range(100))
     assert len(over) == 4
+
+
+def none_left(*_):
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
+def test_a_forked_child_does_not_take_what_its_parent_waits_for():
+    """Both wait at the same mailbox; the update is the parent's, whoever began to wait first."""
+    done = python(_FORKED)
+    assert (done.stdout, done.stderr) == ("1 2 3\n", "")
+
+
+_FORKED = """
+import os, signal, threading, time
+from reem_async.policy import Last, Mailbox
+mailbox = Mailbox(Last(10))
+threading.Timer(0.1, mailbox.put, [1]).start()
+first = mailbox.take_waiting()
+time.sleep(0.1)
+child = os.fork()
+if child == 0:
+    signal.alarm(20)
+    mailbox.take_waiting()
+    os._exit(0)
+time.sleep(0.3)
+taken = [first]
+signal.alarm(20)
+for number in (2, 3):
+    threading.Timer(0.1, mailbox.put, [number]).start()
+    taken.append(mailbox.take_waiting())
+os.kill(child, signal.SIGKILL)
+os.waitpid(child, 0)
+print(*taken)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="this system has no such signals")
+def test_a_signal_with_a_handler_does_not_end_the_wait_at_a_mailbox():
+    """Ctrl-C does, since its handler raises; then the next one to wait takes what comes."""
+    done = python(_SIGNALLED)
+    assert (done.stdout, done.stderr) == ("handled interrupted 1\n", "")
+
+
+_SIGNALLED = """
+import os, signal, threading
+from reem_async.policy import Last, Mailbox
+said, mailbox = [], Mailbox(Last(10))
+def usr1(*_):
+    said.append("handled")
+signal.signal(signal.SIGUSR1, usr1)
+threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGUSR1]).start()
+threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
+try:
+    mailbox.take_waiting()
+except KeyboardInterrupt:
+    said.append("interrupted")
+threading.Timer(0.1, mailbox.put, [1]).start()
+print(*said, mailbox.take_waiting())
+"""
 
 
 def test_a_call_of_listen_in_a_wrong_loop_changes_nothing(server_url, key):
