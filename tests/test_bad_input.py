@@ -96,6 +96,8 @@ VALUES = {
     "key that would collide": (BadKey, {1: "one", "1": "eins"}),
     "key lone surrogate": (BadInput, {"\udfff": 1}),
     "nan beside an array": (BadValue, {"a": np.arange(2), "n": float("nan")}),
+    "nan beside None": (BadValue, {"a": None, "n": [None, float("nan")], "s": "N"}),
+    "minus infinity beside None": (BadValue, [None, -float("inf")]),
     "set beside an array": (BadType, [np.arange(2), {1}]),
     "101 levels": (TooDeep, nest(101)),
     "2000 levels": (TooDeep, nest(2000)),

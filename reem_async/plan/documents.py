@@ -149,13 +149,13 @@ def _may_be_converted(text: bytes, value: Any) -> bool:
 
     marshal (whose output is only looked at) is the one C-speed walk of the standard library that
     refuses UUIDs, enums and subclasses, which orjson turns into something else without being asked. It
-    writes None as N, and what is not finite with 7f or ff as its last byte; orjson makes `null` of both.
+    writes what is not finite, of which orjson makes `null`, with 7f or ff as its last byte.
     """
     try:
         dumped = marshal.dumps(value)
     except ValueError:
         return True
-    return (b"N" in dumped or b"\x7f" in dumped or b"\xff" in dumped) and b"null" in text
+    return (b"\x7f" in dumped or b"\xff" in dumped) and b"null" in text
 
 
 def _levels(value: Any) -> int:
