@@ -234,17 +234,18 @@ def test_an_exception_in_a_callback_is_logged_and_ends_nothing(interface, pspace
 
 
 def test_a_callback_may_close_its_own_subscriber(interface, pspace, key):
-    """After the first update it wanted; no deadlock."""
-    seen = []
+    """After the first update it wanted; no deadlock, and nothing that is published afterwards is seen."""
+    seen, closed = [], threading.Event()
 
     def once(data, updated_path):
         seen.append(data)
         subscriber.close()
+        closed.set()
 
     subscriber = CallbackSubscriber(key(), interface, once, {})
     subscriber.listen()
     pspace[key()] = 1
-    eventually(lambda: seen == [1])
+    assert closed.wait(PATIENCE)
     pspace[key()] = 2
     time.sleep(0.2)
     assert seen == [1]
