@@ -1,24 +1,33 @@
-"""The Unix socket of a server on this machine, taken in place of TCP by `reem record`."""
+"""The Unix socket of a server on this machine: taken by whoever says localhost, and by `reem record`."""
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
+import os
 import shutil
 import signal
+import socket
+import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 import redis
-from conftest import aeventually, eventually
+from chaos.proxy import Proxy
+from conftest import FRONTS, eventually
 from test_cli_record import is_recording, started
 
 import reem
-import reem_async
+from reem.errors import ConnectionLost, NotConnected
 from reem_async.recording import open_log
 from reem_async.server import EmbeddedServer
 from reem_async.transport import nearby
-from reem_async.transport.nearby import take_shortcut
+from reem_async.transport.nearby import Way, look_nearby
+from reem_async.transport.options import NodeOptions, Options
+
+pytestmark = pytest.mark.skipif(
+    not hasattr(socket, "SO_PEERCRED"), reason="this system does not tell who listens at a socket"
+)
 
 
 @pytest.fixture
@@ -28,112 +37,210 @@ def server():
         yield own
 
 
-async def ways(interface):
-    """Of each connection to the server that the interface has, whether it was made through the socket."""
-    (clients,) = await interface.session.transport.roundtrip([("CLIENT", "LIST")])
-    mine = f"name={interface.session.options.settings['client_name']} "
-    return ["redis.sock" in line for line in clients.decode().splitlines() if mine in line]
+@pytest.fixture(params=list(FRONTS))
+def connect(request):
+    """Opens either front at a host and port; all are closed at the end."""
+    with contextlib.ExitStack() as stack:
+
+        def open_(port, host="localhost", **options):
+            front = FRONTS[request.param](host, port=port, client_name="nearby", **options)
+            return stack.enter_context(contextlib.closing(front))
+
+        yield open_
 
 
-@contextlib.asynccontextmanager
-async def connected(server, **options):
-    """An interface that goes by TCP, and has a connection."""
-    url = f"redis://127.0.0.1:{server.port}"
-    async with reem_async.RedisInterface(url, client_name="nearby", **options) as interface:
-        yield interface
+def ways(server):
+    """Of each connection of a front, whether it came through the socket."""
+    with contextlib.closing(redis.Redis(port=server.port, password=server.password)) as client:
+        return ["redis.sock" in each["addr"] for each in client.client_list() if each["name"] == "nearby"]
 
 
-async def test_later_connections_go_through_the_socket(server):
-    async with connected(server) as interface:
-        assert await take_shortcut(interface.session) == str(server.socket_path)
-        space = reem_async.PublishSpace(interface)
-        mirror = reem_async.SilentSubscriber("a", interface)
-        await mirror.listen()
-        await space["a"].write({"n": 1})
-        await aeventually(lambda: mirror.value() == {"n": 1})
-        assert sorted(await ways(interface)) == [False, True]
+def goes_on(front, value=1):
+    """Write and read: small, and large enough for a connection of its own."""
+    front.write(["a"], {"n": value, "image": np.full(100_000, value)})
+    assert front.read(["a", "n"]) == value
+    assert front.read(["a", "image"])[-1] == value
 
 
-async def test_a_password_is_given_there_too():
+@contextlib.contextmanager
+def in_place_of(server, answer):
+    """Have somebody else, `answer`, listen at the server's socket."""
+    Path(server.socket_path).unlink()
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(server.socket_path)
+        listening.listen()
+
+        def serve():
+            with contextlib.suppress(OSError):
+                while True:
+                    connection, _ = listening.accept()
+                    with connection:
+                        answer(connection)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield
+        listening.shutdown(socket.SHUT_RDWR)
+        thread.join()
+
+
+def test_localhost_means_the_socket(server, connect):
+    front = connect(server.port)
+    goes_on(front)
+    assert all(ways(server))
+    assert front.interface.hostname == f"localhost:{server.port}"
+
+
+def test_so_it_does_in_a_url(server, connect):
+    goes_on(connect(server.port, f"redis://localhost:{server.port}/0"))
+    assert all(ways(server))
+
+
+def test_subscribers_use_it_too(server):
+    with reem.RedisInterface("localhost", port=server.port, client_name="nearby") as interface:
+        mirror = reem.SilentSubscriber("a", interface)
+        mirror.listen()
+        reem.PublishSpace(interface)["a"] = {"n": 1}
+        eventually(lambda: mirror.value() == {"n": 1})
+        found = ways(server)
+        assert all(found)
+        assert len(found) == 2
+
+
+def test_a_number_means_tcp(server, connect):
+    goes_on(connect(server.port, "127.0.0.1"))
+    assert not any(ways(server))
+
+
+def test_a_password_is_given_there_too(connect):
     with EmbeddedServer(password="secret") as server:
-        async with connected(server, password="secret") as interface:
-            assert await take_shortcut(interface.session) == str(server.socket_path)
+        goes_on(connect(server.port, password="secret"))
+        assert all(ways(server))
 
 
-async def test_another_server_at_the_same_path_is_not_taken(server):
-    """As behind a tunnel: the server that answers says a path that leads to another one here."""
+def test_who_may_not_ask_goes_by_tcp(server, connect):
+    with contextlib.closing(redis.Redis(port=server.port)) as client:
+        client.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-info")
+    goes_on(connect(server.port, username="robot", password="pw"))
+    assert not any(ways(server))
+
+
+def test_a_proxy_is_not_passed_by(server, connect):
+    """It says that the server has another port than the one connected to: whoever put it there had a reason."""
+    with Proxy(server.port) as proxy:
+        goes_on(connect(proxy.port))
+        assert not any(ways(server))
+
+
+def test_a_socket_that_is_gone_is_not_taken(server, connect):
+    Path(server.socket_path).unlink()
+    goes_on(connect(server.port))
+    assert not any(ways(server))
+
+
+def test_another_server_at_the_same_path_is_not_taken(server, connect):
     with EmbeddedServer() as other:
         Path(server.socket_path).unlink()
         shutil.move(other.socket_path, server.socket_path)
-        async with connected(server) as interface:
-            assert await take_shortcut(interface.session) is None
-            assert await reem_async.KeyValueStore(interface).keys() == []
+        goes_on(connect(server.port))
+        assert not any(ways(server) + ways(other))
 
 
-async def test_a_socket_that_is_gone_is_not_taken(server):
-    Path(server.socket_path).unlink()
-    async with connected(server) as interface:
-        assert await take_shortcut(interface.session) is None
-
-
-@pytest.mark.parametrize("said", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 100, b"", None])
-async def test_a_stranger_at_the_path_is_left_alone(server, said):
-    """One that speaks something else, hangs up, or says nothing at all."""
-    Path(server.socket_path).unlink()
-
-    async def answer(reader, writer):
-        await reader.read(100)
-        if said is not None:
-            writer.write(said)
-        else:
-            await reader.read()  # until the other side gives up
-        writer.close()
-
-    listening = await asyncio.start_unix_server(answer, server.socket_path)
-    async with connected(server) as interface:
-        async with asyncio.timeout(3):
-            assert await take_shortcut(interface.session) is None
-        await reem_async.KeyValueStore(interface)["a"].write(1)
-    listening.close()
-    await listening.wait_closed()
-
-
-async def test_who_may_not_ask_goes_on_by_tcp(server):
-    async with connected(server) as interface:
-        await interface.session.transport.roundtrip(
-            [("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-config")]
-        )
-    async with connected(server, username="robot", password="pw") as interface:
-        assert await take_shortcut(interface.session) is None
-        await reem_async.KeyValueStore(interface)["a"].write(1)
-
-
-async def test_by_the_socket_there_is_nothing_shorter(server):
-    async with reem_async.RedisInterface(server) as interface:
-        assert await take_shortcut(interface.session) is None
-
-
-async def test_a_server_elsewhere_is_not_asked(server, monkeypatch):
-    """It would find the socket: all but the address is as in the first test."""
-    monkeypatch.setattr(nearby, "is_this_machine", lambda host: host != "127.0.0.1")
-    async with connected(server) as interface:
-        assert await take_shortcut(interface.session) is None
-
-
-async def test_when_the_socket_goes_away_it_goes_on_by_tcp(server):
-    async with connected(server) as interface:
-        assert await take_shortcut(interface.session)
-        mirror = reem_async.SilentSubscriber("a", interface)
-        await mirror.listen()
+def test_not_even_if_its_process_had_the_same_number(server, connect, monkeypatch):
+    """As in two containers that share a folder, and both begin to count at 1."""
+    monkeypatch.setattr(Way, "_check_listener", lambda self, listening: None)
+    with EmbeddedServer() as other:
         Path(server.socket_path).unlink()
-        async with connected(server) as killer:
-            await killer.session.transport.roundtrip([("CLIENT", "KILL", "TYPE", "pubsub")])
-            await reem_async.PublishSpace(killer)["a"].write(1)
-        await aeventually(lambda: mirror.value() == 1)
-        assert not any(await ways(interface))
+        shutil.move(other.socket_path, server.socket_path)
+        goes_on(connect(server.port))
+        assert not any(ways(server) + ways(other))
 
 
-def test_a_recorder_takes_it(server, tmp_path):
+def test_a_stranger_at_the_path_gets_no_password(connect):
+    heard = []
+    with (
+        EmbeddedServer(password="secret") as server,
+        in_place_of(server, lambda connection: heard.append(connection.recv(1000))),
+    ):
+        goes_on(connect(server.port, password="secret"))
+        eventually(lambda: heard)
+        assert set(heard) == {b""}  # connected to, and left without a word
+        assert not any(ways(server))
+
+
+@pytest.mark.parametrize("said", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 100, b""])
+def test_nonsense_at_the_path_does_no_harm(server, connect, monkeypatch, said):
+    monkeypatch.setattr(Way, "_check_listener", lambda self, listening: None)
+    with in_place_of(server, lambda connection: (connection.recv(1000), connection.sendall(said))):
+        goes_on(connect(server.port))
+        assert not any(ways(server))
+
+
+def test_when_the_socket_goes_away_it_goes_on_by_tcp(server, connect):
+    front = connect(server.port)
+    goes_on(front)
+    Path(server.socket_path).unlink()
+    with contextlib.closing(redis.Redis(port=server.port)) as client:
+        client.execute_command("CLIENT", "KILL", "TYPE", "normal", "SKIPME", "yes")
+        eventually(lambda: not ways(server))
+    with contextlib.suppress(ConnectionLost):  # the asyncio front's loop has not run since
+        goes_on(front)
+    goes_on(front, 2)
+    assert not any(ways(server))
+
+
+def test_a_restarted_server_is_gone_to_through_its_new_socket(server, connect):
+    front, port = connect(server.port), server.port
+    goes_on(front)
+    server.stop()
+    with contextlib.suppress(ConnectionLost, NotConnected):  # as above
+        goes_on(front)
+    with pytest.raises(NotConnected, match=f"localhost:{port} "):
+        goes_on(front)
+    with EmbeddedServer(port) as again:
+        goes_on(front, 2)
+        assert all(ways(again))
+
+
+def test_a_silent_server_is_waited_for_once(server, connect):
+    """What does not answer through the socket does not by TCP either."""
+    front = connect(server.port, timeout=0.2)
+    goes_on(front)
+    os.kill(server.pid, signal.SIGSTOP)
+    try:
+        for error in (ConnectionLost, NotConnected):  # on a connection that was there, on a new one
+            with pytest.raises(error):
+                goes_on(front)
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+    goes_on(front, 2)
+    assert all(ways(server))  # it was not given up
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["robot.example", "192.0.2.1", "rediss://localhost", "unix:///tmp/redis.sock"],
+)
+def test_elsewhere_nothing_is_looked_for(host, recwarn):
+    options = Options(host, 1.0, {})
+    look_nearby(options)
+    assert options.nearby is None
+
+
+def test_nor_for_one_of_several_servers():
+    options = NodeOptions(Options("localhost", 1.0, {}), ("localhost", 7000))
+    look_nearby(options)
+    assert options.nearby is None
+
+
+def test_nor_where_nobody_tells_who_listens(monkeypatch):
+    monkeypatch.delattr(nearby.socket, "SO_PEERCRED")
+    options = Options("localhost", 1.0, {})
+    look_nearby(options)
+    assert options.nearby is None
+
+
+def test_a_recorder_takes_it_by_any_address_of_this_machine(server, tmp_path):
     url, file = f"redis://127.0.0.1:{server.port}", tmp_path / "run.mcap"
     with reem.RedisInterface(server) as interface:
         reem.PublishSpace(interface)["arm"] = 1

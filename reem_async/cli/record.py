@@ -68,14 +68,14 @@ def record(
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.transport.nearby import take_shortcut
+        from reem_async.transport.nearby import look_nearby
 
         if background:
             _stand_back()
         else:
             come_second()
         keep_memory()
-        await take_shortcut(interface.session)
+        look_nearby(interface.session.options)
         recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
         try:
             async with recorder:

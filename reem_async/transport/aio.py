@@ -18,6 +18,7 @@ from ..plan.sizes import has_large
 from ..state import States
 from . import Held
 from .identity import WHO, who
+from .nearby import Nearby
 from .options import Options
 from .patience import patience
 from .wire import Wire, open_wire
@@ -118,12 +119,41 @@ class AsyncTransport:
             if on_lost is not None:
                 on_lost(wire, reason)
 
-        wire = await open_wire(self._options, on_push, gone, large=large)
+        nearby = self._options.nearby
+        wire = await (open_wire(self._options, large=large) if nearby is None else self._nearest(nearby, large))
         if self._closed:
             await wire.close()
             self.check()
+        wire.on_push, wire.on_lost = on_push, gone
         wire.send([WHO], lambda replies: self.states.opened(self._options.address, who(replies)))
         return wire
+
+    async def _nearest(self, nearby: Nearby, large: bool) -> Wire:
+        """Return a new connection: through the server's socket, if it is found."""
+        through = await self._through(nearby, large)
+        if through is not None:
+            return through
+        wire = await open_wire(self._options, large=large)
+        try:
+            nearby.learn(await wire.roundtrip([WHO]))
+            through = await self._through(nearby, large)
+        except BaseException:
+            await wire.close()
+            raise
+        if through is None:
+            return wire
+        await wire.close()
+        return through
+
+    async def _through(self, nearby: Nearby, large: bool) -> Wire | None:
+        way = nearby.way
+        if way is None:
+            return None
+        try:
+            return await open_wire(way, large=large)
+        except ReemError as error:
+            nearby.give_up(way, error)
+            return None
 
     def check(self) -> None:
         """Bind to the running loop at first use; raise if this is another one, or if it is closed."""

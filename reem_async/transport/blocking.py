@@ -19,10 +19,11 @@ from functools import partial
 from typing import Any
 
 from ..courtesy import give_way
-from ..errors import ConnectionLost, InterfaceClosed
+from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from ..state import States
 from .identity import WHO, who
+from .nearby import Nearby
 from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
@@ -60,7 +61,8 @@ class _Line:
         self._small = SmallReader()
         self._large: LargeReader | None = None
         self.broken = False
-        self._states.opened(options.address, who(self.exchange([WHO])))
+        self.introduction = self.exchange([WHO])
+        self._states.opened(options.address, who(self.introduction))
 
     def _set_limit(self, limit: float) -> None:
         """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
@@ -223,10 +225,36 @@ class BlockingTransport:
             try:
                 line = self._idle.pop()
             except IndexError:
-                return _Line(self._options, self.states)
+                return self._opened()
             if line.fresh():
                 return line
             line.lost("the server closed an idle connection")
+
+    def _opened(self) -> _Line:
+        """Return a new connection: through the server's socket, if that is looked for and found."""
+        nearby = self._options.nearby
+        if nearby is None:
+            return _Line(self._options, self.states)
+        through = self._through(nearby)
+        if through is not None:
+            return through
+        line = _Line(self._options, self.states)
+        nearby.learn(line.introduction)
+        through = self._through(nearby)
+        if through is None:
+            return line
+        line.close()
+        return through
+
+    def _through(self, nearby: Nearby) -> _Line | None:
+        way = nearby.way
+        if way is None:
+            return None
+        try:
+            return _Line(way, self.states)
+        except ReemError as error:
+            nearby.give_up(way, error)
+            return None
 
     def _give(self, line: _Line) -> None:
         if line.broken:

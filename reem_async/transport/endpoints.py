@@ -8,6 +8,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from ..errors import BadType, BadValue
 from . import Transport
+from .nearby import look_nearby
 from .options import Options
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def way_to(
             "redis+cluster://host:port,host:port or redis+sentinel://host:26379/mymaster, or connect to the replica"
         )
     one = Options(host, timeout, options)
+    if one.settings.get("host", "localhost") == "localhost":  # a number means TCP
+        look_nearby(one)
     server = new_transport(one)
     return one, server, server
 

@@ -12,7 +12,7 @@ import ssl
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import redis
 import redis.asyncio
@@ -22,6 +22,9 @@ from redis.asyncio.connection import parse_url
 from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
 from ..plan import Command
 from ..plan.replies import refusal
+
+if TYPE_CHECKING:
+    from .nearby import Nearby
 
 __all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machine", "question", "question_here"]
 
@@ -45,7 +48,7 @@ class Options:
         BadType: An option that redis-py does not know.
 
     Attributes:
-        nearer: A shorter way to the same server, for asyncio connections, as long as it can be gone; else None.
+        nearby: What is known of a shorter way to the same server, if one is looked for; else None.
 
     Warns:
         InsecureConnection: Others can listen; once for each address.
@@ -53,7 +56,7 @@ class Options:
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
         self.timeout = timeout
-        self.nearer: Options | None = None
+        self.nearby: Nearby | None = None
         self.settings = {**_address(host), **options}
         if self.settings.setdefault("protocol", 3) not in (3, "3"):
             raise BadValue("REEM speaks protocol 3 (notices and replies share a connection); leave protocol= out")
@@ -132,8 +135,6 @@ class Options:
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
-        if self.nearer is not None:
-            return self.nearer.asynchronous_connection()
         module: Any = redis.asyncio.connection
         # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12.
         settings = {"socket_timeout": None, **self.settings}

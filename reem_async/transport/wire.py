@@ -75,24 +75,18 @@ class Wire(asyncio.BufferedProtocol):
     Args:
         timeout: Seconds without a byte moving, while a reply is due, after which a call is given up.
         reader: Parses what is received.
-        on_push: Called with each message the server sends unasked.
-        on_lost: Called once when the connection is gone, with the reason.
 
     Attributes:
+        on_push: Called with each message the server sends unasked.
+        on_lost: Called once when the connection is gone, with the reason.
         pace: Seconds for which nothing more is read after something was, if much comes: it is taken together.
     """
 
-    def __init__(
-        self,
-        timeout: float,
-        reader: Reader,
-        on_push: Callable[[list[Any]], None] | None = None,
-        on_lost: Callable[[Wire, Exception], None] | None = None,
-    ) -> None:
+    def __init__(self, timeout: float, reader: Reader) -> None:
+        self.on_push: Callable[[list[Any]], None] | None = None
+        self.on_lost: Callable[[Wire, Exception], None] | None = None
         self.pace = 0.0
         self._timeout = timeout
-        self._on_push = on_push
-        self._on_lost = on_lost
         self._reader = reader
         self._due: collections.deque[_Due] = collections.deque()
         self._outbox: list[Piece] = []
@@ -126,7 +120,7 @@ class Wire(asyncio.BufferedProtocol):
         """Give the connection up without touching it: it belongs to the parent process."""
         self._reason = self._reason or ConnectionLost("this connection belongs to the parent process")
         _inherited.append((self._transport, self._keep))
-        self._transport = self._keep = self._on_lost = None
+        self._transport = self._keep = self.on_lost = None
         waiting, self._due = self._due, collections.deque()
         for due in waiting:
             if not due.over:
@@ -291,8 +285,8 @@ class Wire(asyncio.BufferedProtocol):
     def _take(self, reply: Any) -> None:
         # The confirmation of a SUBSCRIBE is pushed too, but it is the only reply there is to the command.
         if type(reply) is hiredis.PushNotification and not (reply and reply[0] in _CONFIRMATIONS):
-            if self._on_push is not None:
-                self._on_push(reply)
+            if self.on_push is not None:
+                self.on_push(reply)
             return
         if not self._due:
             self.abort(ConnectionLost("the server sent a reply that nobody asked for"))
@@ -360,17 +354,11 @@ class Wire(asyncio.BufferedProtocol):
         for due in waiting:
             if not due.over:
                 due.done(reason)
-        if self._on_lost is not None:
-            self._on_lost(self, reason)
+        if self.on_lost is not None:
+            self.on_lost(self, reason)
 
 
-async def open_wire(
-    options: Options,
-    on_push: Callable[[list[Any]], None] | None = None,
-    on_lost: Callable[[Wire, Exception], None] | None = None,
-    *,
-    large: bool = False,
-) -> Wire:
+async def open_wire(options: Options, *, large: bool = False) -> Wire:
     """Connect, log in, and return the wire; `large` replies are received in place.
 
     Raises:
@@ -382,10 +370,9 @@ async def open_wire(
         async with asyncio.timeout(options.handshake_timeout):
             await connection.connect()
     except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
-        options.nearer = None  # whoever tries again goes the long way
         await connection.disconnect(nowait=True)
         raise options.refused(error) from error
-    wire = Wire(options.timeout, LargeReader() if large else SmallReader(), on_push, on_lost)
+    wire = Wire(options.timeout, LargeReader() if large else SmallReader())
     wire.take_over(connection)
     return wire
 
