@@ -11,7 +11,7 @@ class Contender:
     module: str
     colour: str
     environment: str | None = None
-    unix_socket: bool = False
+    host: str = "localhost"  # what it is told to connect to
     loop: str = "asyncio"
     instead: str | None = None  # who is asked where this one fails
 
@@ -19,9 +19,9 @@ class Contender:
 CONTENDERS = {
     "reem": Contender("REEM, blocking", "reem_blocking", "#0b5fa5"),
     "async": Contender("REEM, asyncio", "reem_asyncio", "#19a0a0"),
-    "reem-unix": Contender("REEM, blocking, unix socket", "reem_blocking", "#6fa8dc", unix_socket=True),
+    "reem-tcp": Contender("REEM, blocking, by TCP", "reem_blocking", "#6fa8dc", host="127.0.0.1"),
     "reem-static": Contender("REEM, blocking, static schema", "reem_static", "#2f3f8f"),
-    "async-unix": Contender("REEM, asyncio, unix socket", "reem_asyncio", "#8fd6d6", unix_socket=True),
+    "async-tcp": Contender("REEM, asyncio, by TCP", "reem_asyncio", "#8fd6d6", host="127.0.0.1"),
     "async-uvloop": Contender("REEM, asyncio on uvloop", "reem_asyncio", "#0e7a5f", loop="uvloop"),
     "original": Contender(
         "original REEM 0.1.2", "original", "#d1495b", environment="reem-0.1.2", instead="original-0.0.11"
@@ -35,3 +35,6 @@ CONTENDERS = {
     "pyzmq": Contender("pyzmq", "pyzmq_pubsub", "#e0a030"),
     "zenoh": Contender("zenoh over TCP", "zenoh_pubsub", "#b5651d"),
 }
+
+BY_TCP = {"reem": "reem-tcp", "async": "async-tcp"}
+"""Who goes through the server's Unix socket, as REEM does at `localhost`, and the same by TCP."""

@@ -2,32 +2,36 @@
 
 import pathlib
 import re
+from collections.abc import Callable
 
 from .environment import FOLDER
 from .report import label
 from .results import Results
-from .targets import bare, rows
+from .targets import Row, bare, by_tcp, rows
 
 PAGE = FOLDER.parent / "docs" / "performance.md"
 _TABLE = re.compile(r"<!-- goals -->\n.*?<!-- end of goals -->\n", re.DOTALL)
 
 
 def table(results: Results) -> str:
-    """Markdown: each ratio, its goal, and what a client without REEM's guarantees reaches in the same run."""
-    lines = ["| case | ratio | goal | met | a bare client |", "|---|---|---|---|---|"]
+    """Markdown: each ratio, its goal, the same with REEM by TCP, and with a client without REEM's guarantees."""
+    known = {row.text: row for row in rows()}
+    lines = ["| case | ratio | goal | met | by TCP | a bare client |", "|---|---|---|---|---|---|"]
     for row in results.rows:
         sign = ">=" if row["throughput"] else "<="
         ratio = "-" if row["ratio"] is None else f"{row['ratio']:.2f}"
         met = {"PASS": "yes", "PASS *": "yes, as hoped", "near": "nearly"}.get(row["verdict"], "no")
-        lines.append(f"| {row['text']} | {ratio} | {sign} {row['must']:g} | {met} | {_bare(row['text'], results)} |")
+        tcp, client = (_other(known.get(row["text"]), of, results) for of in (by_tcp, bare))
+        named = f"{tcp[0]:.2f}" if tcp else "", f"{client[0]:.2f} ({label(client[1])})" if client else ""
+        lines.append(f"| {row['text']} | {ratio} | {sign} {row['must']:g} | {met} | {' | '.join(named)} |")
     return "\n".join(lines) + "\n"
 
 
-def _bare(text: str, results: Results) -> str:
-    """The same ratio for a client that only moves the bytes, where one was measured beside."""
-    found = next((bare(row) for row in rows() if row.text == text), None)
-    ratio = None if found is None else found.ratio(results)
-    return "" if found is None or ratio is None else f"{ratio:.2f} ({label(found.ours[1])})"
+def _other(row: Row | None, of: Callable[[Row], Row | None], results: Results) -> tuple[float, str] | None:
+    """The same ratio for somebody else in REEM's place, and who that is; None where it was not measured."""
+    found = of(row) if row is not None else None
+    ratio = found.ratio(results) if found is not None else None
+    return None if found is None or ratio is None else (ratio, found.ours[1])
 
 
 def rewrite(results: Results, page: pathlib.Path = PAGE) -> None:

@@ -110,10 +110,9 @@ class Workers:
     def target(self, contender: Contender, peer_port: int) -> dict[str, Any]:
         """What a worker needs to know to connect."""
         server = self.server
-        url = server.unix_url if contender.unix_socket else server.url
         return {
-            "url": url,
-            "host": server.host,
+            "url": f"redis://{contender.host}:{server.port}",
+            "host": contender.host,
             "port": server.port,
             "loop": contender.loop,
             "peer_port": peer_port,

@@ -16,19 +16,13 @@ USUAL_PORT = 6379  # the only one the original can be told to use
 class Server:
     """Where the server listens."""
 
-    host: str
     port: int
-    socket_path: str
+    host: str = "localhost"
 
     @property
     def url(self) -> str:
-        """Over TCP, as every primary comparison is made."""
+        """What a program on this machine would write."""
         return f"redis://{self.host}:{self.port}"
-
-    @property
-    def unix_url(self) -> str:
-        """Over the unix socket."""
-        return f"unix://{self.socket_path}"
 
     def pid(self) -> int:
         """Its process."""
@@ -70,5 +64,5 @@ def free_port(wanted: int = 0) -> int:
 def private_server() -> Iterator[Server]:
     """Start a server on port 6379 if that is free, else on another one, and stop it at the end."""
     port = free_port(USUAL_PORT)
-    with EmbeddedServer(port=port) as embedded:
-        yield Server("127.0.0.1", port, str(embedded.socket_path))
+    with EmbeddedServer(port=port):
+        yield Server(port)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from .contenders import BY_TCP
 from .measure import CallCase, Case, ClientsCase
 from .measure_other import IMPORTS, CameraCase, ImportCase
 from .measure_pubsub import PublishCase, SubscribersCase
@@ -34,6 +35,7 @@ QUICK = {
 }
 
 FRONTS = ("reem", "async")
+TCP = tuple(BY_TCP.values())
 DOCUMENTS = (*FRONTS, "original", "redis-py", "redis-asyncio")
 LEAF = ("sub_0", "sub_1", "sub_2", "sub_3", "sub_4", "copy_0_single_key")
 
@@ -51,8 +53,8 @@ def _both(name: str, contenders: tuple[str, ...], value: Spec, **more: Any) -> l
 
 
 def small(grown: Grown) -> list[Case]:
-    """A dictionary of two entries, over TCP, the unix socket and another loop."""
-    everyone = (*DOCUMENTS, "reem-unix", "async-unix", "async-uvloop", "redis-asyncio-uvloop")
+    """A dictionary of two entries, also on another loop."""
+    everyone = (*DOCUMENTS, *TCP, "async-uvloop", "redis-asyncio-uvloop")
     return _both("small", everyone, {"kind": "small"}, count=4000, limit=1.0)
 
 
@@ -60,9 +62,11 @@ def strings_and_arrays(grown: Grown) -> list[Case]:
     """Chapter 5.1.1: entries against latency."""
     cases: list[Case] = []
     for count in grown(STRINGS):
-        cases += _both(f"strings.{count}", DOCUMENTS, {"kind": "strings", "count": count})
+        more = TCP if count == STRINGS[-1] else ()
+        cases += _both(f"strings.{count}", (*DOCUMENTS, *more), {"kind": "strings", "count": count})
     for count in grown(ARRAYS):
-        cases += _both(f"arrays.{count}", (*FRONTS, "original"), {"kind": "arrays", "count": count})
+        more = TCP if count == ARRAYS[-1] else ()
+        cases += _both(f"arrays.{count}", (*FRONTS, "original", *more), {"kind": "arrays", "count": count})
     both = ("reem", "reem-static")
     cases.append(
         CallCase("static.small", both, operation="set", value={"kind": "small"}, count=4000, limit=1.0, one_core=True)
@@ -77,7 +81,7 @@ def array_rates(grown: Grown) -> list[Case]:
     for side in grown(SIDES):
         contenders: tuple[str, ...] = (*DOCUMENTS, "connection")
         if side == SIDES[-1]:
-            contenders += ("reem-unix", "async-unix")
+            contenders += TCP
         value: Spec = {"kind": "array", "shape": [side, side]}
         cases += _both(f"array.{side}", contenders, value, inner=("key",), count=500)
     return cases
@@ -86,9 +90,10 @@ def array_rates(grown: Grown) -> list[Case]:
 def subscribers(grown: Grown) -> list[Case]:
     """Chapter 5.2: subscriber overhead, and peers with one subscriber."""
     fronts = (*FRONTS, "original", "redis-py")
+    everyone = (*fronts, *TCP, "pyzmq", "zenoh")
     cases: list[Case] = [
-        PublishCase("publish.small", (*fronts, "pyzmq", "zenoh"), payload="small", count=600, gap=0.004),
-        PublishCase("publish.frame", (*fronts, "pyzmq", "zenoh"), payload="frame", count=45, gap=0.05),
+        PublishCase("publish.small", everyone, payload="small", count=600, gap=0.004),
+        PublishCase("publish.frame", everyone, payload="frame", count=45, gap=0.05),
     ]
     for total in grown(tuple(SUBSCRIBERS)):
         processes, each = SUBSCRIBERS[total]
@@ -101,7 +106,7 @@ def subscribers(grown: Grown) -> list[Case]:
 
 def comparison(grown: Grown) -> list[Case]:
     """Chapter 5.3: pottery."""
-    contenders = (*FRONTS, "original", "pottery")
+    contenders = (*FRONTS, *TCP, "original", "pottery")
     value: Spec = {"kind": "pottery"}
     return [
         CallCase("pottery.set", (*contenders, "redis-py"), operation="set", value=value, one_core=True),
@@ -141,7 +146,7 @@ def crowds(grown: Grown) -> list[Case]:
 def programs(grown: Grown) -> list[Case]:
     """A controller beside a camera, both beside a recorder, and imports."""
     return [
-        CameraCase("camera", (*FRONTS, "original", "redis-py", "redis-asyncio")),
+        CameraCase("camera", (*FRONTS, *TCP, "original", "redis-py", "redis-asyncio")),
         RecorderCase("recorder", tuple(BESIDE)),
         ImportCase("import", tuple(IMPORTS)),
     ]

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+from .contenders import BY_TCP
 from .results import Results
 
 Place = tuple[str, str]  # case, contender
@@ -164,6 +165,15 @@ def rows() -> list[Row]:
         ),
     ]
     return found
+
+
+def by_tcp(row: Row) -> Row | None:
+    """Return the row with REEM by TCP, as the others; None where it does not compare REEM with others."""
+    case, ours = row.ours
+    if ours not in BY_TCP:
+        return None
+    theirs = row.theirs[0], BY_TCP.get(row.theirs[1], row.theirs[1])
+    return dataclasses.replace(row, ours=(case, BY_TCP[ours]), theirs=theirs)
 
 
 _BARE = {
