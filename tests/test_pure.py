@@ -13,7 +13,7 @@ import redis.exceptions
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reem_async.errors import BadData, BadKey, BadValue
+from reem_async.errors import BadData, BadKey, BadValue, TooDeep
 from reem_async.follow import Update
 from reem_async.plan import placeholders, trees
 from reem_async.plan.documents import encode
@@ -34,6 +34,42 @@ NOT_FINITE = [
     for exponent in (b"\xf0\x7f", b"\xf0\xff", b"\xf8\x7f", b"\xf8\xff", b"\xff\x7f", b"\xff\xff")
     for bits in (bytes(6) + exponent, b"\x01" + bytes(5) + exponent, b"\xff" * 6 + exponent)
 ]
+
+
+def nested(levels, beside, ahead):
+    """As many levels, in each of which there is something flat besides, ahead of the next level or behind it."""
+    value = 1
+    for level in range(levels):
+        if level % 2:
+            value = [*beside, value] if ahead else [value, *beside]
+        else:
+            value = {"a": beside, "b": value} if ahead else {"a": value, "b": beside}
+    return value
+
+
+def depth(value):
+    """How deep containers are nested."""
+    if not isinstance(value, dict | list):
+        return 0
+    return 1 + max(map(depth, value.values() if isinstance(value, dict) else value), default=0)
+
+
+@pytest.mark.parametrize("ahead", [True, False])
+@pytest.mark.parametrize(
+    "beside",
+    [(), ("}" * 300,), ("]" * 300,), ("{" * 300,), ("[" * 300,), ({"x": []},) * 3, ("}", {}, "[")],
+    ids=["nothing", "}", "]", "{", "[", "containers", "all of it"],
+)
+def test_the_depth_is_seen_whatever_is_beside(beside, ahead):
+    """Whether the deepest place comes early or late in the text; brackets in strings are none."""
+    shapes = [nested(levels, list(beside), ahead) for levels in range(90, 102)]
+    assert {100, 101} <= {depth(shape) for shape in shapes}
+    for shape in shapes:
+        if depth(shape) > 100:
+            with pytest.raises(TooDeep):
+                encode(shape, ("foo",), lambda _: None, str)
+        else:
+            assert orjson.loads(encode(shape, ("foo",), lambda _: None, str).text) == shape
 
 
 @pytest.mark.parametrize("value", NOT_FINITE, ids=lambda value: struct.pack("<d", value).hex())

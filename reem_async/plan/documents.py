@@ -132,9 +132,11 @@ def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
     """Return whether containers are nested over `limit` levels."""
     if text.find(b"{", 1) < 0 and text.find(b"[", 1) < 0:
         return limit < 1
-    brackets = text.translate(None, _NOT_BRACKETS)
-    if len(brackets) <= 2 * limit:
+    before, after = text[: len(text) // 2], text[len(text) // 2 :]
+    # At no place of the one half more is open than was opened in it, of the other than will be closed in it.
+    if _up_to(limit, before, b"{", b"[") and _up_to(limit, after, b"}", b"]"):
         return False
+    brackets = text.translate(None, _NOT_BRACKETS)
     for _ in range(limit // 2):  # each turn strips one or two levels
         stripped = brackets.replace(b"{}", b"").replace(b"[]", b"")
         if len(stripped) == len(brackets):
@@ -142,6 +144,12 @@ def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
         brackets = stripped
     # What is left are very deep levels, or brackets inside of strings.
     return bool(brackets) and _levels(value) > limit
+
+
+def _up_to(limit: int, text: bytes, one: bytes, other: bytes) -> bool:
+    """Return whether two bytes occur no more than `limit` times together; replacing finds them at memory speed."""
+    left = limit - len(text) + len(text.replace(one, b"", limit + 1))
+    return left >= 0 and len(text) - len(text.replace(other, b"", left + 1)) <= left
 
 
 def _may_be_converted(text: bytes, value: Any) -> bool:
