@@ -288,6 +288,8 @@ class DocumentWriter:
             return suffix(path + inner) + (f"~{unique}" if unique else "")
 
         encoded = encode(value, (self.name, *path), fits, name)
+        if not encoded.parcels:
+            return encoded, ()
         loaded = [
             self._packed(parcel) if parcel.ship.blob is not None else await self._recorded(parcel)
             for parcel in encoded.parcels

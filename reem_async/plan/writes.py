@@ -83,14 +83,18 @@ class Change(NamedTuple):
 REFUSED = object()
 """The server did nothing and did not say why."""
 
+_NO_MEMBERS: frozenset[bytes] = frozenset()
+_STORED: list[Reply] = [b"OK", []]
+"""The usual replies to a write without arrays, and the registry: nothing is to be looked at further."""
+
 
 def set_change(keys: Keys, path: Path, text: bytes, loaded: tuple[Loaded, ...], **notices: Any) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
+    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), _judged_set, loaded, **notices)
 
-    def judge(reply: Reply) -> Any:
-        return REFUSED if reply is None else None
 
-    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), judge, loaded, **notices)
+def _judged_set(reply: Reply) -> Any:
+    return REFUSED if reply is None else None
 
 
 def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
@@ -163,23 +167,26 @@ def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callabl
     memory.forget_numbers(it.keys.document)
     known = memory.members(it.keys.document)
     stale = _stale(it, known)
+    commands: list[Command] = []
+    after: list[Command] = []
     if it.loaded or stale:
         _expect(it, memory, known, stale)
-    before = _clearing(it, stale)
-    writes = [command for each in it.loaded for command in each.commands]
-    after: list[Command] = []
+        commands = _clearing(it, stale)
+        commands.extend(command for each in it.loaded for command in each.commands)
     if it.loaded:
         after.append(("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
     if it.looks:
         after.append(("SMEMBERS", it.keys.registry))
-    after.extend(it.notices)
-    commands = [*before, *writes, it.command, *after]
-    main = len(before) + len(writes)
+    main = len(commands)
+    commands += (it.command, *after, *it.notices)
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         if replies is None:
             assert given_up is not None  # only watched transactions are given up
             return given_up()
+        if replies == _STORED and len(commands) == len(_STORED) and it.looks:
+            memory.saw_members(it.keys.document, _NO_MEMBERS)
+            return None
         return _Outcome(it, memory, commands, replies, main).next()
 
     return Plan(commands, decode, atomic=len(commands) > (2 if it.looks else 1) or held, held=held)
@@ -270,8 +277,6 @@ def _place(member: bytes) -> Path:
 
 def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
     """Return the commands that make room: no leftovers, and no foreign type under a ship's key."""
-    if not stale and not it.loaded:
-        return []
     tag = it.keys.tag.encode()
     gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.loaded]
     commands: list[Command] = [("UNLINK", *gone)]
