@@ -88,6 +88,10 @@ class Accessor:
         Two where this interface puts arrays for the first time (unless it is a whole top-level key), two or
         three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
 
+        An array of 64 KB or more lets calls of this interface that are under way in the same event loop be answered
+        first, since encoding and sending it keep the loop; it is stored as it is then. (Publishing keeps the order of
+        calls instead.)
+
         Raises:
             BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
             PathRefused: The parent is missing or cannot hold this element; nothing was stored.

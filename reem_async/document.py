@@ -14,6 +14,7 @@ from .plan import Command, Plan
 from .plan.documents import Encoded, Parcel, encode, number_text
 from .plan.paths import Path, counts_from_end, has_index, show, suffix
 from .plan.reads import Sealed, interpret, length, read, type_of
+from .plan.sizes import has_large
 from .plan.writes import (
     Change,
     Loaded,
@@ -155,7 +156,14 @@ class DocumentWriter:
             path = await self._from_front(path, PathRefused)
         unique = _unique() if has_index(path) else ""
         encoded, loaded = await self._prepared(path, value, unique)
+        if loaded and await self._let_pass(loaded):
+            # Another task may have changed an array meanwhile; all that is stored is to be of one instant.
+            encoded, loaded = await self._prepared(path, value, unique)
         await self._set(path, encoded, loaded)
+
+    async def _let_pass(self, loaded: tuple[Loaded, ...]) -> bool:
+        """Let small calls that are under way be answered before a large one; returns whether it waited."""
+        return any(has_large(each.commands) for each in loaded) and await self.session.transport.let_pass()
 
     async def _settled(self) -> None:
         """Wait for large values that cancelled calls have left on their way, over another connection."""

@@ -28,6 +28,10 @@ class DocumentPublisher(DocumentWriter):
     calls wait for each other; those to different keys do not.
     """
 
+    async def _let_pass(self, loaded: tuple[Loaded, ...]) -> bool:
+        """Return False: a later call to the same key would overtake it."""
+        return False
+
     async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
             await self._settled()

@@ -62,6 +62,13 @@ class Transport(Held, Protocol):
         """Wait."""
         ...
 
+    async def let_pass(self) -> bool:
+        """Wait, before something large is sent, until small calls of the same thread that are under way are answered.
+
+        Returns whether anything else could happen meanwhile.
+        """
+        ...
+
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
         ...

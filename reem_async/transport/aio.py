@@ -27,6 +27,8 @@ __all__ = ["AsyncTransport"]
 
 _SPARE = 4
 _PING: Command = ("PING",)
+_COURTESIES = 3
+"""How often a large value waits for calls that are under way: there may always be some."""
 
 
 class AsyncTransport:
@@ -237,6 +239,17 @@ class AsyncTransport:
     async def pause(self, seconds: float) -> None:
         """Wait."""
         await asyncio.sleep(seconds)
+
+    async def let_pass(self) -> bool:
+        """Wait until the calls under way on the shared wire, or about to begin, are answered; returns that it did."""
+        self.check()
+        for _ in range(_COURTESIES):
+            await asyncio.sleep(0)
+            wire = self._lanes.get(False)
+            if wire is None or not wire.busy:
+                break
+            await wire.roundtrip([_PING])  # answered after all the others
+        return True
 
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""

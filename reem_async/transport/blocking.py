@@ -301,6 +301,10 @@ class BlockingTransport:
         """Wait, and the thread with it."""
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
 
+    async def let_pass(self) -> bool:
+        """Return False: a call has a connection of its own, and keeps no other thread."""
+        return False
+
     def is_settled(self, document: str) -> bool:
         """Return True: no caller can leave before the reply is there."""
         return True

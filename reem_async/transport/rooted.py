@@ -25,6 +25,10 @@ class Rooted(ABC):
         """Wait."""
         await self._root.pause(seconds)
 
+    async def let_pass(self) -> bool:
+        """Wait until calls under way are answered; returns whether it did."""
+        return any([await each.let_pass() for each in self._all()])
+
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
         return all(each.is_settled(document) for each in self._all())

@@ -132,6 +132,11 @@ class Wire(asyncio.BufferedProtocol):
         return self._reason is None and self._transport is not None and not self._transport.is_closing()
 
     @property
+    def busy(self) -> bool:
+        """Whether replies are due."""
+        return bool(self._due) and self.alive
+
+    @property
     def leisurely(self) -> bool:
         """Whether nobody waits for what comes, so that others are given way after each message."""
         return self.pace >= _LEISURELY
