@@ -29,7 +29,8 @@ class RedisInterface:
     loop; any number of tasks may share it, and their calls are pipelined.
 
     Args:
-        host: A host name, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`. Several servers:
+        host: A host name, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`. `localhost` means the
+            server's Unix socket where it has one (on Linux), which is quicker; `127.0.0.1` means TCP. Several servers:
             `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an
             `EmbeddedCluster`; `redis+sentinel://host:26379,host:26380/mymaster` for the primary that
             sentinels name. With TLS they begin with `rediss+`. See docs/fleet.md.

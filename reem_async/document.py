@@ -178,7 +178,7 @@ class DocumentWriter:
         await self._settled()
         if loaded:
             await self._check_place(path, loaded)
-        await self._change(set_change(self.keys, path, encoded.text, loaded))
+        await self._change(set_change(self.keys, path, encoded.text, loaded, looks=self._looks(path, loaded)))
 
     async def delete(self, path: Path) -> None:
         """Remove what is at `path`."""
@@ -266,17 +266,23 @@ class DocumentWriter:
         await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))
 
     async def _change(self, it: Change) -> None:
-        """Make a change that sets a value, without a look at what it replaces where the shape is vouched for."""
-        memory, fixed = self.session.memory, not has_index(it.path)
-        suffixes = frozenset([each.suffix for each in it.loaded])
-        if self.static and fixed:
-            known = memory.shape(it.keys.document, it.path)
-            if known is not None and known != suffixes:
-                raise self._new_shape(min(known ^ suffixes))
-            it = it._replace(looks=known is None)
+        """Make a change that sets a value."""
+        memory = self.session.memory
         await self.session.run(change(it, memory))
-        if fixed:
-            memory.saw_shape(it.keys.document, it.path, suffixes)
+        if not has_index(it.path):
+            memory.saw_shape(it.keys.document, it.path, frozenset([each.suffix for each in it.loaded]))
+
+    def _looks(self, path: Path, loaded: tuple[Loaded, ...]) -> bool:
+        """Return whether to look for arrays that are replaced: not where the shape is vouched for; raises BadType."""
+        if not self.static or has_index(path):
+            return True
+        known = self.session.memory.shape(self.keys.document, path)
+        if known is None:
+            return True
+        suffixes = frozenset([each.suffix for each in loaded])
+        if known != suffixes:
+            raise self._new_shape(min(known ^ suffixes))
+        return False
 
     def _new_shape(self, suffix: str) -> BadType:
         return BadType(

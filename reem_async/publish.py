@@ -37,10 +37,15 @@ class DocumentPublisher(DocumentWriter):
             await self._settled()
             if loaded:
                 await self._check_place(path, loaded)
-            stamp = self._stamp(path)
-            notices = self._notice(stamp, with_value(*stamp, encoded.text, loaded))
+            looks, stamp = self._looks(path, loaded), self._stamp(path)
             it = set_change(
-                self.keys, path, encoded.text, loaded, notices=notices, retraction=lambda: self._announced(path)
+                self.keys,
+                path,
+                encoded.text,
+                loaded,
+                looks=looks,
+                notices=self._notice(stamp, with_value(*stamp, encoded.text, loaded)),
+                retraction=lambda: self._announced(path),
             )
             await self._change(it)
 

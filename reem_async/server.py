@@ -28,7 +28,7 @@ class EmbeddedServer(Startable):
     """A Redis-compatible server with JSON that belongs to this program and ends with it, however it ends.
 
         with EmbeddedServer() as server:          # or: async with
-            kvs = KeyValueStore(RedisInterface(server.url))
+            kvs = KeyValueStore(RedisInterface(server))
 
     It listens on 127.0.0.1 and on a unix socket that only this user can open. Several run side by side.
     One object serves blocking and asyncio programs, and any thread; a forked child may use the server, but

@@ -58,6 +58,13 @@ def test_a_server_as_it_should_be(own):
     assert admin.dbsize() == 0
 
 
+@pytest.mark.skipif(not hasattr(socket, "SO_PEERCRED"), reason="this system does not tell who listens at a socket")
+@pytest.mark.parametrize(("host", "way"), [("localhost", "reached through its Unix socket"), ("127.0.0.1", "by TCP")])
+def test_it_tells_the_way(own, host, way):
+    url = f"redis://{host}:{urllib.parse.urlsplit(own[0]).port}"
+    assert findings(CommandLine(url, "")("doctor", "--json", "--no-write"))["access"]["message"].endswith(way)
+
+
 def test_the_installed_command_in_a_pipe_and_in_a_terminal(own):
     cli = CommandLine(own[0], "robot:")
     run = cli.process("doctor", "--no-write")
@@ -212,7 +219,7 @@ def test_clock_and_latency():
 
 def test_access():
     def statuses(**how):
-        known = {"address": "robot:6379", "loopback": False, "tls": True, "password": True}
+        known = {"address": "robot:6379", "loopback": False, "by_socket": False, "tls": True, "password": True}
         return [finding.status for finding in checks.who("default", **{**known, **how})]
 
     assert statuses() == [OK]
@@ -228,10 +235,16 @@ def test_access():
 
 def test_versions_of_redis_8_and_of_a_cluster():
     info = {"redis_version": "8.2.1", "redis_mode": "standalone", "uptime_in_seconds": "7200"}
-    assert checks.version(Facts(info, None), "robot:6379").message == (
+    assert checks.version(Facts(info, None), "robot:6379", sharded=False).message == (
         "redis 8.2.1 at robot:6379, standalone, up for 2.0 hours"
     )
-    assert checks.version(Facts({**info, "redis_mode": "cluster"}, None), "robot:6379").status == WARN
+    node = Facts({**info, "redis_mode": "cluster"}, None)
+    assert checks.version(node, "robot:6379", sharded=True).status == OK
+    alone = checks.version(node, "robot:6379", sharded=False)
+    assert (alone.status, alone.remedy) == (
+        WARN,
+        "this is one node of several; reach all: redis+cluster://robot:6379",
+    )
     modules = "name=bf,ver=80200,api=1\nname=ReJSON,ver=80201,api=1"
     assert checks.json_support(Facts({"module": modules}, None), "").message == "RedisJSON 8.2.1"
     assert checks.json_support(Facts({}, None), "use Redis 8").status == FAIL

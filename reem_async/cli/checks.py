@@ -64,8 +64,8 @@ def not_allowed(check: str, command: str) -> Finding:
     return Finding(check, UNKNOWN, f"this user may not run {command}", f"ask as an administrator, or allow {rule}")
 
 
-def version(facts: Facts, address: str) -> Finding:
-    """Which server it is."""
+def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
+    """Which server it is; `sharded` if all nodes of a cluster are asked, and not this one alone."""
     if facts.info is None:
         return Finding("server", OK, f"answers at {address}; this user may not ask for its version")
     name = facts.info.get("server_name", "redis")
@@ -73,8 +73,8 @@ def version(facts: Facts, address: str) -> Finding:
     hours = facts.number("uptime_in_seconds") / 3600
     mode = facts.info.get("redis_mode") or facts.info.get("server_mode", "standalone")
     text = f"{name} {number} at {address}, {mode}, up for {hours:.1f} hours"
-    if mode == "cluster":
-        return Finding("server", WARN, text, "REEM's layout fits a cluster, but REEM has not been run on one")
+    if mode == "cluster" and not sharded:
+        return Finding("server", WARN, text, f"this is one node of several; reach all: redis+cluster://{address}")
     return Finding("server", OK, text)
 
 
@@ -90,13 +90,16 @@ def json_support(facts: Facts, missing: str) -> Finding:
     return Finding("json", OK, "RedisJSON answers; its version is not told")
 
 
-def who(user: str | None, *, address: str, loopback: bool, tls: bool, password: bool) -> Iterator[Finding]:
-    """As whom, and how safely, this program is connected."""
+def who(
+    user: str | None, *, address: str, loopback: bool, by_socket: bool, tls: bool, password: bool
+) -> Iterator[Finding]:
+    """As whom, which way, and how safely, this program is connected."""
     name = f"as user {user}" if user else "as a user whose name it may not ask"
     secrets = f"{'with' if password else 'without'} password, {'with' if tls else 'without'} TLS"
     text = f"connected {name}, {secrets}"
     if loopback:
-        yield Finding("access", OK, f"{text}; {address} is this machine")
+        way = "reached through its Unix socket" if by_socket else "reached by TCP"
+        yield Finding("access", OK, f"{text}; {address} is this machine, {way}")
         return
     if not password:
         yield Finding("access", WARN, f"{text}; {address} is another machine", "set a password on the server")

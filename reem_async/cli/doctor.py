@@ -118,14 +118,16 @@ async def _of_server(interface: RedisInterface, missing: str, *, write: bool) ->
         [("INFO",), ("CONFIG", "GET", "client-output-buffer-limit", "save"), ("ACL", "WHOAMI")]
     )
     facts = Facts(_info(info), _config(config))
-    yield checks.version(facts, interface.hostname)
+    yield checks.version(facts, interface.hostname, sharded=session.transport.sharded)
     yield checks.json_support(facts, missing)
     options = session.options
-    loopback = options.socket_path is not None or checks.is_loopback(str(options.settings.get("host", "localhost")))
+    by_socket = options.socket_path is not None or (options.nearby is not None and options.nearby.way is not None)
+    loopback = by_socket or checks.is_loopback(str(options.settings.get("host", "localhost")))
     for finding in checks.who(
         user.decode(errors="replace") if isinstance(user, bytes) else None,
         address=interface.hostname,
         loopback=loopback,
+        by_socket=by_socket,
         tls=options.tls,
         password=bool(options.settings.get("password")),
     ):

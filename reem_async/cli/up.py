@@ -129,7 +129,7 @@ class Stop:
 
 def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None, snapshot: Path | None) -> None:
     password = f', password=os.environ["{variable}"]' if variable else ""
-    url = f"redis://127.0.0.1:{server.port}"
+    url = f"redis://localhost:{server.port}"
     connect = f'KeyValueStore(RedisInterface("{url}"{password}))'
     imports = "import os; from" if variable else "from"
     console = Console()

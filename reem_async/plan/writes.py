@@ -85,12 +85,13 @@ REFUSED = object()
 
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 _STORED: list[Reply] = [b"OK", []]
-"""The usual replies to a write without arrays, and the registry: nothing is to be looked at further."""
+_STORED_UNSEEN: list[Reply] = [b"OK"]
+"""The usual replies to a write without arrays, with a look at the registry and without: there is nothing more to do."""
 
 
-def set_change(keys: Keys, path: Path, text: bytes, loaded: tuple[Loaded, ...], **notices: Any) -> Change:
+def set_change(keys: Keys, path: Path, text: bytes, loaded: tuple[Loaded, ...], **more: Any) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
-    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), _judged_set, loaded, **notices)
+    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), _judged_set, loaded, **more)
 
 
 def _judged_set(reply: Reply) -> Any:
@@ -184,8 +185,10 @@ def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callabl
         if replies is None:
             assert given_up is not None  # only watched transactions are given up
             return given_up()
-        if replies == _STORED and len(commands) == len(_STORED) and it.looks:
+        if it.looks and replies == _STORED and len(commands) == len(_STORED):
             memory.saw_members(it.keys.document, _NO_MEMBERS)
+            return None
+        if replies == _STORED_UNSEEN:
             return None
         return _Outcome(it, memory, commands, replies, main).next()
 
