@@ -63,7 +63,7 @@ def up(*arguments: str, **changes: str):
 
 
 def port_in(said: str) -> int:
-    return int(re.search(r"redis://127\.0\.0\.1:(\d+)\n", said)[1])
+    return int(re.search(r"redis://localhost:(\d+)\n", said)[1])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
@@ -114,7 +114,7 @@ def test_a_signal_may_come_at_any_moment():
 
 def test_says_what_to_type(tmp_path):
     with up("--port", "0", "--directory", str(tmp_path / "x" / ("long" * 20))) as (_, said):
-        url = f"redis://127.0.0.1:{port_in(said)}"
+        url = f"redis://localhost:{port_in(said)}"
         for package in ("reem", "reem_async"):
             line = f"from {package} import KeyValueStore, RedisInterface; "
             line += f'kvs = KeyValueStore(RedisInterface("{url}"))'
