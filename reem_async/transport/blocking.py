@@ -240,7 +240,11 @@ class BlockingTransport:
             return through
         line = _Line(self._options, self.states)
         nearby.learn(line.introduction)
-        through = self._through(nearby)
+        try:
+            through = self._through(nearby)
+        except BaseException:
+            line.close()
+            raise
         if through is None:
             return line
         line.close()
