@@ -11,7 +11,7 @@ class Contender:
     module: str
     colour: str
     environment: str | None = None
-    host: str = "localhost"  # what it is told to connect to
+    host: str = "127.0.0.1"  # what it is told to connect to
     loop: str = "asyncio"
     instead: str | None = None  # who is asked where this one fails
 
@@ -19,9 +19,9 @@ class Contender:
 CONTENDERS = {
     "reem": Contender("REEM, blocking", "reem_blocking", "#0b5fa5"),
     "async": Contender("REEM, asyncio", "reem_asyncio", "#19a0a0"),
-    "reem-tcp": Contender("REEM, blocking, by TCP", "reem_blocking", "#6fa8dc", host="127.0.0.1"),
+    "reem-local": Contender("REEM, blocking, at localhost", "reem_blocking", "#6fa8dc", host="localhost"),
     "reem-static": Contender("REEM, blocking, static schema", "reem_static", "#2f3f8f"),
-    "async-tcp": Contender("REEM, asyncio, by TCP", "reem_asyncio", "#8fd6d6", host="127.0.0.1"),
+    "async-local": Contender("REEM, asyncio, at localhost", "reem_asyncio", "#8fd6d6", host="localhost"),
     "async-uvloop": Contender("REEM, asyncio on uvloop", "reem_asyncio", "#0e7a5f", loop="uvloop"),
     "original": Contender(
         "original REEM 0.1.2", "original", "#d1495b", environment="reem-0.1.2", instead="original-0.0.11"
@@ -36,5 +36,5 @@ CONTENDERS = {
     "zenoh": Contender("zenoh over TCP", "zenoh_pubsub", "#b5651d"),
 }
 
-BY_TCP = {"reem": "reem-tcp", "async": "async-tcp"}
-"""Who goes through the server's Unix socket, as REEM does at `localhost`, and the same by TCP."""
+LOCAL = {"reem": "reem-local", "async": "async-local"}
+"""Who goes by TCP, as all do in every comparison, and the same at `localhost`: through the server's Unix socket."""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
 from . import suite
-from .contenders import BY_TCP, CONTENDERS
+from .contenders import CONTENDERS, LOCAL
 from .figures_bars import draw_camera, draw_import, draw_messages, draw_pottery, draw_ratios, draw_small
 from .results import Results
 
@@ -205,7 +205,7 @@ def _panel(axes: Axes, results: Results, lines: Lines, panel: Panel) -> list[str
             for x in lines.xs
             if "median" in (entry := results.cases.get(panel.case.format(x=x), {}).get(name, {}))
         ]
-        if points and name not in BY_TCP.values():  # which have a point or two, for the table
+        if points and name not in LOCAL.values():  # which have a point or two, for the table
             figures = [_figures(entry, lines, panel) for _, entry in points]
             middle = [figure[1] for figure in figures]
             below = [figure[1] - figure[0] for figure in figures]

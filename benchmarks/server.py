@@ -17,11 +17,11 @@ class Server:
     """Where the server listens."""
 
     port: int
-    host: str = "localhost"
+    host: str = "127.0.0.1"
 
     @property
     def url(self) -> str:
-        """What a program on this machine would write."""
+        """Over TCP, as every comparison is made."""
         return f"redis://{self.host}:{self.port}"
 
     def pid(self) -> int:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-from .contenders import BY_TCP
+from .contenders import LOCAL
 from .measure import CallCase, Case, ClientsCase
 from .measure_other import IMPORTS, CameraCase, ImportCase
 from .measure_pubsub import PublishCase, SubscribersCase
@@ -35,7 +35,7 @@ QUICK = {
 }
 
 FRONTS = ("reem", "async")
-TCP = tuple(BY_TCP.values())
+NEARBY = tuple(LOCAL.values())
 DOCUMENTS = (*FRONTS, "original", "redis-py", "redis-asyncio")
 LEAF = ("sub_0", "sub_1", "sub_2", "sub_3", "sub_4", "copy_0_single_key")
 
@@ -53,8 +53,8 @@ def _both(name: str, contenders: tuple[str, ...], value: Spec, **more: Any) -> l
 
 
 def small(grown: Grown) -> list[Case]:
-    """A dictionary of two entries, also on another loop."""
-    everyone = (*DOCUMENTS, *TCP, "async-uvloop", "redis-asyncio-uvloop")
+    """A dictionary of two entries, over TCP, the Unix socket and another loop."""
+    everyone = (*DOCUMENTS, *NEARBY, "async-uvloop", "redis-asyncio-uvloop")
     return _both("small", everyone, {"kind": "small"}, count=4000, limit=1.0)
 
 
@@ -62,10 +62,10 @@ def strings_and_arrays(grown: Grown) -> list[Case]:
     """Chapter 5.1.1: entries against latency."""
     cases: list[Case] = []
     for count in grown(STRINGS):
-        more = TCP if count == STRINGS[-1] else ()
+        more = NEARBY if count == STRINGS[-1] else ()
         cases += _both(f"strings.{count}", (*DOCUMENTS, *more), {"kind": "strings", "count": count})
     for count in grown(ARRAYS):
-        more = TCP if count == ARRAYS[-1] else ()
+        more = NEARBY if count == ARRAYS[-1] else ()
         cases += _both(f"arrays.{count}", (*FRONTS, "original", *more), {"kind": "arrays", "count": count})
     both = ("reem", "reem-static")
     cases.append(
@@ -81,7 +81,7 @@ def array_rates(grown: Grown) -> list[Case]:
     for side in grown(SIDES):
         contenders: tuple[str, ...] = (*DOCUMENTS, "connection")
         if side == SIDES[-1]:
-            contenders += TCP
+            contenders += NEARBY
         value: Spec = {"kind": "array", "shape": [side, side]}
         cases += _both(f"array.{side}", contenders, value, inner=("key",), count=500)
     return cases
@@ -90,7 +90,7 @@ def array_rates(grown: Grown) -> list[Case]:
 def subscribers(grown: Grown) -> list[Case]:
     """Chapter 5.2: subscriber overhead, and peers with one subscriber."""
     fronts = (*FRONTS, "original", "redis-py")
-    everyone = (*fronts, *TCP, "pyzmq", "zenoh")
+    everyone = (*fronts, *NEARBY, "pyzmq", "zenoh")
     cases: list[Case] = [
         PublishCase("publish.small", everyone, payload="small", count=600, gap=0.004),
         PublishCase("publish.frame", everyone, payload="frame", count=45, gap=0.05),
@@ -106,7 +106,7 @@ def subscribers(grown: Grown) -> list[Case]:
 
 def comparison(grown: Grown) -> list[Case]:
     """Chapter 5.3: pottery."""
-    contenders = (*FRONTS, *TCP, "original", "pottery")
+    contenders = (*FRONTS, *NEARBY, "original", "pottery")
     value: Spec = {"kind": "pottery"}
     return [
         CallCase("pottery.set", (*contenders, "redis-py"), operation="set", value=value, one_core=True),
@@ -146,7 +146,7 @@ def crowds(grown: Grown) -> list[Case]:
 def programs(grown: Grown) -> list[Case]:
     """A controller beside a camera, both beside a recorder, and imports."""
     return [
-        CameraCase("camera", (*FRONTS, *TCP, "original", "redis-py", "redis-asyncio")),
+        CameraCase("camera", (*FRONTS, *NEARBY, "original", "redis-py", "redis-asyncio")),
         RecorderCase("recorder", tuple(BESIDE)),
         ImportCase("import", tuple(IMPORTS)),
     ]

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-from .contenders import BY_TCP
+from .contenders import LOCAL
 from .results import Results
 
 Place = tuple[str, str]  # case, contender
@@ -167,13 +167,13 @@ def rows() -> list[Row]:
     return found
 
 
-def by_tcp(row: Row) -> Row | None:
-    """Return the row with REEM by TCP, as the others; None where it does not compare REEM with others."""
+def nearby(row: Row) -> Row | None:
+    """Return the row with REEM at `localhost`, and the others as they are; None where REEM has no part."""
     case, ours = row.ours
-    if ours not in BY_TCP:
+    if ours not in LOCAL:
         return None
-    theirs = row.theirs[0], BY_TCP.get(row.theirs[1], row.theirs[1])
-    return dataclasses.replace(row, ours=(case, BY_TCP[ours]), theirs=theirs)
+    theirs = row.theirs[0], LOCAL.get(row.theirs[1], row.theirs[1])
+    return dataclasses.replace(row, ours=(case, LOCAL[ours]), theirs=theirs)
 
 
 _BARE = {
