@@ -35,13 +35,17 @@ _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
 _SLICE = 1 << 19
 """Bytes of a large value that are sent before giving way."""
+_SMALL_SLICE = 1 << 18
+"""The same once another call was seen under way: the server reads on for as long as it finds something."""
+_NAP, _NAPS = 2e-5, 16
+"""Seconds for which a large value waits at a time for calls under way, and how often: there may always be some."""
 
 
 class _Line:
     """One blocking connection, used by one caller at a time."""
 
-    def __init__(self, options: Options, states: States) -> None:
-        self._states = states
+    def __init__(self, options: Options, states: States, under_way: set[_Line]) -> None:
+        self._states, self._under_way = states, under_way
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
@@ -130,13 +134,14 @@ class _Line:
                 return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
-        """Send large values; bytes that move begin the limit anew."""
+        """Send large values, letting small calls of other threads pass; bytes that move begin the limit anew."""
         if limit / LOOKS != self._limit:
             self._set_limit(limit / LOOKS)
         self._moved, self._left = time.monotonic(), 0
+        self._under_way.discard(self)
+        step, naps = _RECORD if self._tls else _SLICE, _NAPS  # over TLS, nothing is said of a part that was sent
         for piece in pieces:
             view, sent = memoryview(piece), 0
-            step = _RECORD if self._tls else _SLICE  # over TLS, nothing is said of a part that was sent
             while sent < len(view):
                 try:
                     sent += self._socket.send(view[sent : sent + step])
@@ -144,6 +149,10 @@ class _Line:
                 except (BlockingIOError, TimeoutError):
                     self._check_moved(limit)
                 give_way()
+                while naps and self._under_way:
+                    step = min(step, _SMALL_SLICE)
+                    naps -= 1
+                    time.sleep(_NAP)
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""
@@ -201,6 +210,7 @@ class BlockingTransport:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._idle: collections.deque[_Line] = collections.deque()
+        self._under_way: set[_Line] = set()  # lines of calls that have nothing large to send
         self._pid = os.getpid()
         self._closed = False
         self._orders: dict[str, _Locked] = {}
@@ -217,6 +227,7 @@ class BlockingTransport:
             # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
             # descriptors, without a word to the server.)
             self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
+            self._under_way = set()
 
     def _take(self) -> _Line:
         self.check()
@@ -225,20 +236,23 @@ class BlockingTransport:
             try:
                 line = self._idle.pop()
             except IndexError:
-                return self._opened()
+                line = self._opened()
+                break
             if line.fresh():
-                return line
+                break
             line.lost("the server closed an idle connection")
+        self._under_way.add(line)
+        return line
 
     def _opened(self) -> _Line:
         """Return a new connection: through the server's socket, if that is looked for and found."""
         nearby = self._options.nearby
         if nearby is None:
-            return _Line(self._options, self.states)
+            return _Line(self._options, self.states, self._under_way)
         through = self._through(nearby)
         if through is not None:
             return through
-        line = _Line(self._options, self.states)
+        line = _Line(self._options, self.states, self._under_way)
         nearby.learn(line.introduction)
         try:
             through = self._through(nearby)
@@ -255,16 +269,14 @@ class BlockingTransport:
         if way is None:
             return None
         try:
-            return _Line(way, self.states)
+            return _Line(way, self.states, self._under_way)
         except ReemError as error:
             nearby.give_up(way, error)
             return None
 
     def _give(self, line: _Line) -> None:
-        if line.broken:
-            line.close()
-            return
-        if self._closed:
+        self._under_way.discard(line)
+        if line.broken or self._closed:
             line.close()
             return
         self._idle.append(line)
@@ -286,7 +298,8 @@ class BlockingTransport:
         except BaseException:
             line.close()
             raise
-        self._give(line)
+        finally:
+            self._give(line)
 
     @property
     def timeout(self) -> float:

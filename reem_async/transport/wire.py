@@ -11,6 +11,7 @@ import asyncio
 import collections
 import contextlib
 import os
+import socket
 import sys
 import weakref
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ from ..courtesy import give_way
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
-from .options import Options
+from .options import Options, is_this_machine
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import LOOKS, confirmed, moved_last, patience, unsent
@@ -34,6 +35,9 @@ _BUSY = 2.5
 
 _LEISURELY = 0.005
 """A pace from which on nobody waits for what comes."""
+
+_PORTION = 1 << 18
+"""Bytes of a send buffer, by Linux's reckoning twice that, with which loopback TCP takes little at a time."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -115,6 +119,13 @@ class Wire(asyncio.BufferedProtocol):
         _open.add(self)
         self._tls = transport.get_extra_info("ssl_object") is not None
         transport.set_protocol(self)
+
+    def send_in_portions(self) -> None:
+        """Have the kernel take little at a time: loopback TCP takes megabytes, while the event loop stands still."""
+        with contextlib.suppress(OSError):  # gone meanwhile: whoever sends will be told
+            internet = self._socket.family in (socket.AF_INET, socket.AF_INET6)
+            if internet and is_this_machine(self._socket.getpeername()[0]):
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PORTION)
 
     def disown(self) -> None:
         """Give the connection up without touching it: it belongs to the parent process."""
@@ -379,6 +390,8 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
         raise options.refused(error) from error
     wire = Wire(options.timeout, LargeReader() if large else SmallReader())
     wire.take_over(connection)
+    if large:
+        wire.send_in_portions()
     return wire
 
 
