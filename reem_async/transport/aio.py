@@ -21,7 +21,7 @@ from .identity import WHO, who
 from .nearby import Nearby
 from .options import Options
 from .patience import patience
-from .wire import Wire, open_wire
+from .wire import BUFFER, Wire, open_wire
 
 __all__ = ["AsyncTransport"]
 
@@ -29,6 +29,10 @@ _SPARE = 4
 _PING: Command = ("PING",)
 _COURTESIES = 3
 """How often a large value waits for calls that are under way: there may always be some."""
+_COMPANY, _PORTION = 0.1, 1 << 17
+"""After a small call, for so many seconds, loopback TCP gets so many bytes of a large value at a time.
+
+It would take megabytes at once, and the event loop stands still meanwhile."""
 
 
 class AsyncTransport:
@@ -71,6 +75,8 @@ class AsyncTransport:
 
     async def upload(self, wire: Wire, commands: Sequence[Command]) -> list[Reply]:
         """Send what is large. A caller who is cancelled leaves it on its way, with a note of that."""
+        shared = self._lanes.get(False)
+        wire.limit_buffer(_PORTION if shared is not None and shared.idle < _COMPANY else BUFFER)
         arrived: asyncio.Future[list[Reply] | Exception] = wire.begin(commands)
         try:
             outcome = await asyncio.shield(arrived)

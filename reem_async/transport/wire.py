@@ -28,7 +28,7 @@ from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .patience import LOOKS, confirmed, moved_last, patience, unsent
 
-__all__ = ["Wire", "open_wire"]
+__all__ = ["BUFFER", "Wire", "open_wire"]
 
 _BUSY = 2.5
 """Three reads within so many times the pace are much."""
@@ -36,8 +36,8 @@ _BUSY = 2.5
 _LEISURELY = 0.005
 """A pace from which on nobody waits for what comes."""
 
-_PORTION = 1 << 18
-"""Bytes of a send buffer, by Linux's reckoning twice that, with which loopback TCP takes little at a time."""
+BUFFER = 1 << 22
+"""Bytes that Linux takes at once, if its limits are as they come."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -98,7 +98,8 @@ class Wire(asyncio.BufferedProtocol):
         self._transport: asyncio.Transport | None = None
         self._keep: Any = None
         self._socket: Any = None
-        self._tls = False
+        self._tls = self._loopback = False
+        self._buffer = BUFFER
         self._goal = 0  # over TLS: how many bytes the other side has confirmed when it has all of what was written
         self._watch: asyncio.TimerHandle | None = None
         self._last_byte = self._read_before = 0.0
@@ -118,14 +119,14 @@ class Wire(asyncio.BufferedProtocol):
         self._transport, self._socket = transport, transport.get_extra_info("socket")
         _open.add(self)
         self._tls = transport.get_extra_info("ssl_object") is not None
+        self._loopback = _is_loopback(self._socket)
         transport.set_protocol(self)
 
-    def send_in_portions(self) -> None:
-        """Have the kernel take little at a time: loopback TCP takes megabytes, while the event loop stands still."""
-        with contextlib.suppress(OSError):  # gone meanwhile: whoever sends will be told
-            internet = self._socket.family in (socket.AF_INET, socket.AF_INET6)
-            if internet and is_this_machine(self._socket.getpeername()[0]):
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _PORTION)
+    def limit_buffer(self, size: int) -> None:
+        """Have loopback TCP take at most so many bytes at a time; to other machines, and on other sockets, nothing."""
+        if self._loopback and size != self._buffer:
+            self._buffer = size
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
 
     def disown(self) -> None:
         """Give the connection up without touching it: it belongs to the parent process."""
@@ -146,6 +147,11 @@ class Wire(asyncio.BufferedProtocol):
     def busy(self) -> bool:
         """Whether replies are due."""
         return bool(self._due) and self.alive
+
+    @property
+    def idle(self) -> float:
+        """Seconds since a byte was received."""
+        return self._loop.time() - self._last_byte
 
     @property
     def leisurely(self) -> bool:
@@ -390,9 +396,16 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
         raise options.refused(error) from error
     wire = Wire(options.timeout, LargeReader() if large else SmallReader())
     wire.take_over(connection)
-    if large:
-        wire.send_in_portions()
     return wire
+
+
+def _is_loopback(sock: Any) -> bool:
+    if sock.family not in (socket.AF_INET, socket.AF_INET6):
+        return False
+    try:
+        return is_this_machine(sock.getpeername()[0])
+    except OSError:  # gone meanwhile: whoever sends will be told
+        return False
 
 
 def _disown_all() -> None:
