@@ -39,6 +39,9 @@ class EmbeddedServer(Startable):
     which is under RSALv2/SSPL: free to use, but not to be offered to others as a managed service.
 
     Everybody who can log in to this machine can connect to the port: set a password if that is not you alone.
+
+    Up to 64 MiB of memory that it frees stay with it, for the next large value, if its malloc is glibc's and the
+    environment has no GLIBC_TUNABLES.
     """
 
     def __init__(

@@ -355,6 +355,30 @@ class TestData:
             c.set("k", "v")
             assert sorted(p.name for p in server.directory.iterdir()) == ["redis.sock", "server.log"]
 
+    @pytest.mark.skipif(sys.platform != "linux", reason="counted by Linux")
+    @pytest.mark.parametrize("given", [None, "glibc.malloc.trim_threshold=4096:glibc.malloc.mmap_threshold=4096"])
+    def test_pages_of_large_values_are_not_taken_anew_each_time(self, given, monkeypatch):
+        """Unless the user has other wishes for the memory."""
+        monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+        if given:
+            monkeypatch.setenv("GLIBC_TUNABLES", given)
+        with EmbeddedServer() as server, client(server) as c:
+            if c.info("memory")["mem_allocator"] != "libc":
+                pytest.skip("this server has another allocator")
+            value = bytes(8_000_000)
+
+            def faults():
+                fields = pathlib.Path(f"/proc/{server.pid}/stat").read_text().rpartition(")")[2].split()
+                return int(fields[7])
+
+            for _ in range(3):
+                c.set("k", value)
+            before = faults()
+            for _ in range(10):
+                c.set("k", value)
+                c.get("k")
+            assert (faults() - before > 1500) is bool(given)
+
     def test_a_directory_keeps_it(self, tmp_path):
         folder = tmp_path / "new" / "da ta\u00fc"
         for round_ in range(3):
