@@ -17,8 +17,9 @@ import reem
 import reem.recording
 import reem_async
 from reem_async.errors import BadInput, BadKey, BadType, BadValue, MissingKey
-from reem_async.recording import ArrayHandle, Recorder, Replayer, open_log
+from reem_async.recording import ArrayHandle, Recorder, Replayer, feed, open_log
 from reem_async.recording.line import HURRIED, PATIENCE
+from reem_async.recording.recorder import _TICK
 
 IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64, 3)
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
@@ -292,6 +293,38 @@ async def test_a_full_queue_drops_and_says_so(key, apspace, akvs, binterface, fi
         assert_same(log[key("big")].at(log.end), last)
         if recorder.status.dropped:
             assert log.metadata[f"not recorded: {key('big')}"] == str(recorder.status.dropped + recorder.status.skipped)
+
+
+async def test_what_was_dropped_is_in_the_file_though_it_is_just_being_read_when_the_recording_ends(
+    key, apspace, akvs, binterface, file, monkeypatch
+):
+    """The recorder reads keys anew from time to time: what that has begun is waited for."""
+    fetch, name = feed.fetch, key("big")
+
+    async def slowly(*given):
+        await asyncio.sleep(0.3)
+        return await fetch(*given)
+
+    async with Recorder(binterface, [key("*")], file) as recorder:
+        await apspace[name].write({"n": 1})
+        await aeventually(lambda: recorder.status.messages)
+        monkeypatch.setattr(feed, "fetch", slowly)
+        put, refused = recorder.scribe.put, []
+
+        def full_once(operation, size):
+            if operation.role == "update" or (operation.role == "state" and "state" not in refused):
+                refused.append(operation.role)
+                recorder.scribe.behind.add(name)
+                if operation.role == "state":
+                    asyncio.get_running_loop().call_later(_TICK / 20, recorder._catch_up)  # it looks by itself, too
+                return False
+            return put(operation, size)
+
+        monkeypatch.setattr(recorder.scribe, "put", full_once)
+        await apspace[name].write({"n": 2})
+    assert refused
+    with logged(file) as log:
+        assert log[name].at(log.end) == {"n": 2}
 
 
 async def test_a_broken_connection_is_a_gap(key, apspace, akvs, server_url, raw, file):

@@ -334,11 +334,11 @@ class Recorder:
 
     async def _complete(self, deadline: float) -> None:
         """Read anew what was dropped at the last moment: the file is to end with what is there."""
-        while self.scribe.behind and self._line is not None and self._line.wire is not None:
-            if self.scribe.failure is not None or time.monotonic() > deadline:
+        while self._line is not None and self._line.wire is not None:
+            await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
+            if not self.scribe.behind or self.scribe.failure is not None or time.monotonic() > deadline:
                 return
             self._catch_up()
-            await self._settled(deadline - time.monotonic())
             await asyncio.sleep(_TICK / 10)
 
     # What is done from time to time.
