@@ -47,7 +47,7 @@ class Accessor:
     def _assign(self, value: Any) -> None:
         """Write, unless this is the end of `x[key] += n`: Python then assigns the accessor to itself."""
         if not isinstance(value, Accessor):
-            self.write(value)
+            self._interface._run(self._core.write(value))
         elif (value._interface, type(value), value.full_path) != (self._interface, type(self), self.full_path):
             raise BadType(f"an accessor cannot be stored: assign {value!r}.read(), its value")
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .errors import BadData, BadType, MissingKey, PathRefused
 from .plan import Command, Plan
-from .plan.documents import Encoded, Parcel, encode, number_text
+from .plan.documents import Parcel, number_text, plain, walk
 from .plan.paths import Path, counts_from_end, has_index, show, suffix
 from .plan.reads import Sealed, interpret, length, read, type_of
 from .plan.sizes import has_large
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
 
+_NOTHING: frozenset[str] = frozenset()
+
 
 class DocumentReader:
     """Reads one top-level key.
@@ -50,23 +52,26 @@ class DocumentReader:
 
     async def read(self, path: Path) -> Any:
         """Return the value at `path`; raises MissingKey."""
-        at = self.session.readers
+        session = self.session
+        at = session.readers
         if counts_from_end(path):
             path, at = await self._resolved(path)
+        if session.ships.asynchronous:
+            await session.ships.ready()
         try:
-            sealed = await self.sealed(path, at)
+            sealed: Sealed = await session.run(read(self.keys, path, session.ships, session.memory), at)
             return await opened(sealed) if sealed.crates else sealed.holder[0]
         except BadData:
-            if at is self.session.transport:
+            if at is session.transport:
                 raise
         # From a replica of a node that gives up a slot, arrays may have gone before their document.
         return await opened(await self.sealed(path))
 
-    async def sealed(self, path: Path, at: Transport | None = None) -> Sealed:
-        """Return what the server has at `path`, or that `at` which to ask, ships' replies not yet interpreted."""
+    async def sealed(self, path: Path) -> Sealed:
+        """Return what the server has at `path`, ships' replies not yet interpreted."""
         if self.session.ships.asynchronous:
             await self.session.ships.ready()
-        sealed: Sealed = await self.session.run(read(self.keys, path, self.session.ships, self.session.memory), at)
+        sealed: Sealed = await self.session.run(read(self.keys, path, self.session.ships, self.session.memory))
         return sealed
 
     async def type_at(self, path: Path) -> type:
@@ -154,31 +159,44 @@ class DocumentWriter:
         """Store `value` at `path`: one transaction."""
         if counts_from_end(path):
             path = await self._from_front(path, PathRefused)
+        text = plain(value, len(path))
+        if text is not None:
+            await self._set(path, text, ())
+            return
         unique = _unique() if has_index(path) else ""
-        encoded, loaded = await self._prepared(path, value, unique)
+        text, loaded = await self._walked(path, value, unique)
         if loaded and await self._let_pass(loaded):
             # Another task may have changed an array meanwhile; all that is stored is to be of one instant.
-            encoded, loaded = await self._prepared(path, value, unique)
-        await self._set(path, encoded, loaded)
+            text, loaded = await self._walked(path, value, unique)
+        await self._set(path, text, loaded)
 
     async def _let_pass(self, loaded: tuple[Loaded, ...]) -> bool:
         """Let small calls that are under way be answered before a large one; returns whether it waited."""
         return any(has_large(each.commands) for each in loaded) and await self.session.transport.let_pass()
 
-    async def _settled(self) -> None:
-        """Wait for large values that cancelled calls have left on their way, over another connection."""
-        if not self.session.transport.is_settled(self.keys.document):
-            await self.session.transport.settle(self.keys.document)
+    def _is_settled(self) -> bool:
+        """Return whether large values that cancelled calls have left on their way, over another connection, are there.
+
+        If not, `_settle` waits for them; there is nearly never anything to wait for, and a coroutine costs time.
+        """
+        return self.session.transport.is_settled(self.keys.document)
+
+    async def _settle(self) -> None:
+        await self.session.transport.settle(self.keys.document)
 
     async def _from_front(self, path: Path, error: type[Exception]) -> Path:
-        await self._settled()
+        if not self._is_settled():
+            await self._settle()
         return await resolved(self, path, error)
 
-    async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
-        await self._settled()
+    async def _set(self, path: Path, text: bytes, loaded: tuple[Loaded, ...]) -> None:
+        if not self._is_settled():
+            await self._settle()
         if loaded:
             await self._check_place(path, loaded)
-        await self._change(set_change(self.keys, path, encoded.text, loaded, looks=self._looks(path, loaded)))
+        it = set_change(self.keys, path, text, loaded, looks=not self.static or self._looks(path, loaded))
+        await self.session.run(change(it, self.session.memory))
+        self._saw_shape(path, loaded)
 
     async def delete(self, path: Path) -> None:
         """Remove what is at `path`."""
@@ -188,7 +206,8 @@ class DocumentWriter:
         self.session.memory.forget_shapes(self.keys.document)
 
     async def _delete(self, path: Path) -> None:
-        await self._settled()
+        if not self._is_settled():
+            await self._settle()
         await self.session.run(change(delete_change(self.keys, path), self.session.memory))
 
     async def extend(self, path: Path, values: Sequence[Any]) -> None:
@@ -199,14 +218,15 @@ class DocumentWriter:
         texts: list[bytes] = []
         loaded: list[Loaded] = []
         for number, value in enumerate(values):
-            encoded, parcels = await self._prepared((*path, -1), value, f"{unique}.{number}")
-            texts.append(encoded.text)
+            text, parcels = await self._prepared((*path, -1), value, f"{unique}.{number}")
+            texts.append(text)
             loaded.extend(parcels)
         if texts:
             await self._append(path, texts, tuple(loaded))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
-        await self._settled()
+        if not self._is_settled():
+            await self._settle()
         await self._check_list(path, loaded)
         await self.session.run(change(append_change(self.keys, path, texts, loaded), self.session.memory))
 
@@ -247,7 +267,8 @@ class DocumentWriter:
         return await self._calculated(plan(lambda: ()))
 
     async def _calculated(self, plan: Plan) -> Any:
-        await self._settled()
+        if not self._is_settled():
+            await self._settle()
         try:
             return await self.session.run(plan)
         except BaseException:  # it may have been applied or not
@@ -256,25 +277,25 @@ class DocumentWriter:
 
     async def exchange(self, path: Path, value: Any, before: Sealed) -> None:
         """Store `value` at `path` if what is there is still `before`; raises Conflict."""
-        encoded, loaded = await self._prepared(path, value, _unique())
-        await self._exchange(set_change(self.keys, path, encoded.text, loaded), before)
+        text, loaded = await self._prepared(path, value, _unique())
+        await self._exchange(set_change(self.keys, path, text, loaded), before)
 
     async def _exchange(self, it: Change, before: Sealed) -> None:
-        await self._settled()
+        if not self._is_settled():
+            await self._settle()
         gone = tuple(crate.placeholder.suffix.encode() for crate, _, _ in before.crates)
         it = it._replace(gone=gone)
         await self.session.run(exchange(it, before.commands, before.raw, self.session.memory))
 
-    async def _change(self, it: Change) -> None:
-        """Make a change that sets a value."""
-        memory = self.session.memory
-        await self.session.run(change(it, memory))
-        if not has_index(it.path):
-            memory.saw_shape(it.keys.document, it.path, frozenset([each.suffix for each in it.loaded]))
+    def _saw_shape(self, path: Path, loaded: tuple[Loaded, ...]) -> None:
+        """Note where the arrays of a value are that was set."""
+        if not has_index(path):
+            suffixes = frozenset([each.suffix for each in loaded]) if loaded else _NOTHING
+            self.session.memory.saw_shape(self.keys.document, path, suffixes)
 
     def _looks(self, path: Path, loaded: tuple[Loaded, ...]) -> bool:
-        """Return whether to look for arrays that are replaced: not where the shape is vouched for; raises BadType."""
-        if not self.static or has_index(path):
+        """Return whether to look for arrays that are replaced though the shape is vouched for; raises BadType."""
+        if has_index(path):
             return True
         known = self.session.memory.shape(self.keys.document, path)
         if known is None:
@@ -290,8 +311,13 @@ class DocumentWriter:
             "track_schema_changes(False) says that the shape never changes; switch it back on for this write"
         )
 
-    async def _prepared(self, path: Path, value: Any, unique: str) -> tuple[Encoded, tuple[Loaded, ...]]:
+    async def _prepared(self, path: Path, value: Any, unique: str) -> tuple[bytes, tuple[Loaded, ...]]:
         """Encode `value`, refusing what cannot be stored, and have the ships record their commands."""
+        text = plain(value, len(path))
+        return (text, ()) if text is not None else await self._walked(path, value, unique)
+
+    async def _walked(self, path: Path, value: Any, unique: str) -> tuple[bytes, tuple[Loaded, ...]]:
+        """Do so with a value that is not plain JSON."""
         ships = self.session.ships
         fits: Any = ships.fits
         if ships.asynchronous:
@@ -301,14 +327,12 @@ class DocumentWriter:
         def name(inner: Path) -> str:
             return suffix(path + inner) + (f"~{unique}" if unique else "")
 
-        encoded = encode(value, (self.name, *path), fits, name)
-        if not encoded.parcels:
-            return encoded, ()
+        encoded = walk(value, (self.name, *path), fits, name)
         loaded = [
             self._packed(parcel) if parcel.ship.blob is not None else await self._recorded(parcel)
             for parcel in encoded.parcels
         ]
-        return encoded, tuple(loaded)
+        return encoded.text, tuple(loaded)
 
     def _packed(self, parcel: Parcel) -> Loaded:
         blob = parcel.ship.blob.pack(parcel.value)

@@ -11,7 +11,6 @@ from .accessor import Accessor
 from .document import DocumentWriter
 from .errors import WriteOnly
 from .plan import Command, Plan
-from .plan.documents import Encoded
 from .plan.notices import announce, published, with_value
 from .plan.paths import Path, show
 from .plan.reads import Sealed
@@ -32,32 +31,36 @@ class DocumentPublisher(DocumentWriter):
         """Return False: a later call to the same key would overtake it."""
         return False
 
-    async def _set(self, path: Path, encoded: Encoded, loaded: tuple[Loaded, ...]) -> None:
+    async def _set(self, path: Path, text: bytes, loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            await self._settled()
+            if not self._is_settled():
+                await self._settle()
             if loaded:
                 await self._check_place(path, loaded)
-            looks, stamp = self._looks(path, loaded), self._stamp(path)
+            looks, stamp = not self.static or self._looks(path, loaded), self._stamp(path)
             it = set_change(
                 self.keys,
                 path,
-                encoded.text,
+                text,
                 loaded,
                 looks=looks,
-                notices=self._notice(stamp, with_value(*stamp, encoded.text, loaded)),
+                notices=self._notice(stamp, with_value(*stamp, text, loaded)),
                 retraction=lambda: self._announced(path),
             )
-            await self._change(it)
+            await self.session.run(change(it, self.session.memory))
+            self._saw_shape(path, loaded)
 
     async def _delete(self, path: Path) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            await self._settled()
+            if not self._is_settled():
+                await self._settle()
             it = delete_change(self.keys, path, notices=self._announced(path, deleted=True))
             await self.session.run(change(it, self.session.memory))
 
     async def _append(self, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...]) -> None:
         async with self.session.transport.ordered(self.keys.channel):
-            await self._settled()
+            if not self._is_settled():
+                await self._settle()
             await self._check_list(path, loaded)
             it = append_change(self.keys, path, texts, loaded, notices=self._announced(path))
             await self.session.run(change(it, self.session.memory))

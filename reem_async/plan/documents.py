@@ -25,7 +25,7 @@ from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
-__all__ = ["DEEPEST", "Encoded", "Fits", "Parcel", "encode", "number_text"]
+__all__ = ["DEEPEST", "Encoded", "Fits", "Parcel", "encode", "number_text", "plain", "walk"]
 
 DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
@@ -87,13 +87,22 @@ def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> 
     Raises:
         BadType, BadValue, BadKey, TooDeep: What cannot be stored, with its path and what to do.
     """
+    text = plain(value, len(place) - 1)
+    return Encoded(text) if text is not None else walk(value, place, fits, name)
+
+
+def plain(value: Any, above: int) -> bytes | None:
+    """Return `value` as JSON if it is known to stay what it is that way; else None: `walk` through it.
+
+    Args:
+        value: What to store.
+        above: Levels that there are above it in its document.
+    """
     try:
         text = orjson.dumps(value, option=_OPTIONS)
     except TypeError:
-        return _walk(value, place, fits, name)
-    if _may_be_changed(text, value, len(place) - 1):
-        return _walk(value, place, fits, name)
-    return Encoded(text)
+        return None
+    return None if _may_be_changed(text, value, above) else text
 
 
 def number_text(value: float, place: Path) -> bytes:
@@ -121,8 +130,8 @@ def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
     Each search begins with one byte, which is found at memory speed: most documents lack it.
     """
     return (
-        placeholders.marked(text)
-        or may_lose(text)
+        (b"$" in text and placeholders.marked(text))
+        or ((b"." in text or b"-" in text or b"+" in text) and may_lose(text))
         or _may_be_deep(text, value, DEEPEST - above)
         or _may_be_converted(text, value)
     )
@@ -179,7 +188,8 @@ def _items(container: Any) -> Iterable[Any]:
     return container.values() if isinstance(container, dict) else container
 
 
-def _walk(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
+def walk(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
+    """Do as `encode`, with a look at every node."""
     walker = _Walker(place, fits, name)
     tree = walker.convert(value, ())
     return Encoded(orjson.dumps(tree), tuple(walker.parcels))

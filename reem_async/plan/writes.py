@@ -89,9 +89,18 @@ _STORED_UNSEEN: list[Reply] = [b"OK"]
 """The usual replies to a write without arrays, with a look at the registry and without: there is nothing more to do."""
 
 
-def set_change(keys: Keys, path: Path, text: bytes, loaded: tuple[Loaded, ...], **more: Any) -> Change:
+def set_change(
+    keys: Keys,
+    path: Path,
+    text: bytes,
+    loaded: tuple[Loaded, ...],
+    looks: bool = True,
+    notices: Sequence[Command] = (),
+    retraction: Callable[[], Sequence[Command]] | None = None,
+) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
-    return Change(keys, path, ("JSON.SET", keys.document, to_jsonpath(path), text), _judged_set, loaded, **more)
+    command = ("JSON.SET", keys.document, to_jsonpath(path), text)
+    return Change(keys, path, command, _judged_set, loaded, True, looks, None, notices, retraction)
 
 
 def _judged_set(reply: Reply) -> Any:
@@ -160,14 +169,14 @@ def change(it: Change, memory: Memory) -> Plan:
         it: The change.
         memory: What is known of the server.
     """
-    return _change_exactly(it, memory) if _moves(it, memory) else _change(it, memory)
+    return _change_exactly(it, memory) if has_index(it.path) and _moves(it, memory) else _change(it, memory)
 
 
 def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
     """Plan the transaction; if the connection is `held`, it watches keys, and `given_up` is next if one changed."""
     memory.forget_numbers(it.keys.document)
     known = memory.members(it.keys.document)
-    stale = _stale(it, known)
+    stale = _stale(it, known) if known or it.gone else []
     commands: list[Command] = []
     after: list[Command] = []
     if it.loaded or stale:
@@ -192,19 +201,13 @@ def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callabl
             return None
         return _Outcome(it, memory, commands, replies, main).next()
 
-    return Plan(commands, decode, atomic=len(commands) > (2 if it.looks else 1) or held, held=held)
+    return Plan(commands, decode, len(commands) > (2 if it.looks else 1) or held, held)
 
 
 def _moves(it: Change, memory: Memory) -> bool:
-    """Return whether it may replace something that has moved from the place after which it is named."""
+    """Return whether it, in a list, may replace something that has moved from the place after which it is named."""
     known = memory.members(it.keys.document)
-    return (
-        bool(known)
-        and it.replaces
-        and it.looks
-        and has_index(it.path)
-        and any(may_hold(it.path, _place(member)) for member in known)
-    )
+    return it.replaces and it.looks and any(may_hold(it.path, _place(member)) for member in known)
 
 
 def _change_exactly(it: Change, memory: Memory, coming: Sequence[Staged] = ()) -> Plan:
@@ -253,7 +256,7 @@ def _send(it: Change, coming: Sequence[Staged], then: Callable[[], Plan]) -> Pla
 
 def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
     """Return the known keys that only what is replaced can refer to, and that are not written again."""
-    if not it.replaces or not it.looks or not (known or it.gone):
+    if not it.replaces or not it.looks:
         return []
     written = {each.suffix.encode() for each in it.loaded}
     if it.gone is not None:

@@ -107,7 +107,8 @@ async def drive(transport: Transport, plan: Plan) -> Any:
                 if isinstance(outcome, _Raised):
                     raise outcome.error
             else:
-                replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
+                commands = wire_commands(plan) if plan.atomic else plan.commands
+                replies = await transport.roundtrip(commands, bulk=plan.bulk)
                 outcome = decoded(plan, replies)
         except WrongKind as error:
             raise await _named(transport, error) from None

@@ -122,16 +122,14 @@ class _Line:
         replies: list[Reply] = []
         gets = reader.gets
         while True:
-            reply = gets()
-            if reply is MORE:
-                received = receive(reader.target())
-                if not received:
-                    raise ConnectionResetError("closed by the server")
-                reader.received(received)
-                continue
-            replies.append(reply)
-            if len(replies) == count:
-                return replies
+            received = receive(reader.target())
+            if not received:
+                raise ConnectionResetError("closed by the server")
+            reader.received(received)
+            while (reply := gets()) is not MORE:
+                replies.append(reply)
+                if len(replies) == count:
+                    return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
         """Send large values, letting small calls of other threads pass; bytes that move begin the limit anew."""
@@ -222,16 +220,17 @@ class BlockingTransport:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
 
-    def _notice_fork(self) -> None:
-        if self._pid != os.getpid():
-            # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
-            # descriptors, without a word to the server.)
-            self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
-            self._under_way = set()
+    def _forked(self) -> None:
+        # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
+        # descriptors, without a word to the server.)
+        self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
+        self._under_way = set()
 
     def _take(self) -> _Line:
-        self.check()
-        self._notice_fork()
+        if self._closed:
+            self.check()
+        if self._pid != os.getpid():
+            self._forked()
         while True:
             try:
                 line = self._idle.pop()
@@ -331,7 +330,8 @@ class BlockingTransport:
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""
-        self._notice_fork()
+        if self._pid != os.getpid():
+            self._forked()
         return self._orders.get(key) or self._orders.setdefault(key, _Locked())
 
     async def close(self) -> None:
