@@ -31,6 +31,7 @@ CONTENDERS = {
     "redis-asyncio": Contender("redis.asyncio", "redis_asyncio", "#a0a0a0"),
     "redis-asyncio-uvloop": Contender("redis.asyncio on uvloop", "redis_asyncio", "#c8c8c8", loop="uvloop"),
     "connection": Contender("bare connection, header and buffer", "connection", "#222222"),
+    "floor": Contender("bare sockets, bytes made before", "floor", "#000000"),
     "pottery": Contender("pottery", "pottery_dict", "#8a5fbf"),
     "pyzmq": Contender("pyzmq", "pyzmq_pubsub", "#e0a030"),
     "zenoh": Contender("zenoh over TCP", "zenoh_pubsub", "#b5651d"),

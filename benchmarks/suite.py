@@ -54,7 +54,7 @@ def _both(name: str, contenders: tuple[str, ...], value: Spec, **more: Any) -> l
 
 def small(grown: Grown) -> list[Case]:
     """A dictionary of two entries, over TCP, the Unix socket and another loop."""
-    everyone = (*DOCUMENTS, *NEARBY, "async-uvloop", "redis-asyncio-uvloop")
+    everyone = (*DOCUMENTS, *NEARBY, "async-uvloop", "redis-asyncio-uvloop", "floor")
     return _both("small", everyone, {"kind": "small"}, count=4000, limit=1.0)
 
 
@@ -62,7 +62,7 @@ def strings_and_arrays(grown: Grown) -> list[Case]:
     """Chapter 5.1.1: entries against latency."""
     cases: list[Case] = []
     for count in grown(STRINGS):
-        more = NEARBY if count == STRINGS[-1] else ()
+        more = (*NEARBY, "floor") if count == STRINGS[-1] else ()
         cases += _both(f"strings.{count}", (*DOCUMENTS, *more), {"kind": "strings", "count": count})
     for count in grown(ARRAYS):
         more = NEARBY if count == ARRAYS[-1] else ()
@@ -90,7 +90,7 @@ def array_rates(grown: Grown) -> list[Case]:
 def subscribers(grown: Grown) -> list[Case]:
     """Chapter 5.2: subscriber overhead, and peers with one subscriber."""
     fronts = (*FRONTS, "original", "redis-py")
-    everyone = (*fronts, *NEARBY, "pyzmq", "zenoh")
+    everyone = (*fronts, *NEARBY, "pyzmq", "zenoh", "floor")
     cases: list[Case] = [
         PublishCase("publish.small", everyone, payload="small", count=600, gap=0.004),
         PublishCase("publish.frame", everyone, payload="frame", count=45, gap=0.05),

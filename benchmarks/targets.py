@@ -192,3 +192,8 @@ def bare(row: Row) -> Row | None:
         return None
     theirs = (row.theirs[0], client) if row.theirs[1] == row.ours[1] else row.theirs
     return dataclasses.replace(row, ours=(row.ours[0], client), theirs=theirs)
+
+
+def floor(row: Row) -> Row | None:
+    """Return the row with bare sockets in REEM's place; None where they were not measured by themselves."""
+    return None if row.throughput else dataclasses.replace(row, ours=(row.ours[0], "floor"))

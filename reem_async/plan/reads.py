@@ -102,7 +102,7 @@ def read(keys: Keys, path: Path, ships: Ships, memory: Memory, also: tuple[Comma
 
 def present(reply: Reply, keys: Keys, path: Path) -> bytes:
     """Return the text of a reply to JSON.GET; raise MissingKey if there is nothing."""
-    text: bytes | None = checked(reply, keys, path)
+    text: bytes | None = reply if type(reply) is bytes else checked(reply, keys, path)
     if text is None or text == b"[]":
         raise missing(keys, path)
     return text

@@ -9,8 +9,6 @@ from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, 
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
-import anyio
-
 from ..background import in_background
 from ..errors import InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
@@ -55,7 +53,7 @@ class AsyncTransport:
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
         self._leaving: set[Wire] = set()
-        self._orders: dict[str, anyio.Lock] = {}
+        self._orders: dict[str, asyncio.Lock] = {}
         self._left: dict[str, set[asyncio.Future[Any]]] = {}
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
@@ -271,7 +269,7 @@ class AsyncTransport:
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
         # A free one is taken at once; else the event loop would make a turn before anything is sent.
-        return self._orders.get(key) or self._orders.setdefault(key, anyio.Lock(fast_acquire=True))
+        return self._orders.get(key) or self._orders.setdefault(key, asyncio.Lock())
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""
