@@ -118,11 +118,11 @@ def growth(grown: Grown) -> list[Case]:
     """How cost grows beyond what the manual shows."""
     cases: list[Case] = []
     for count in grown(ENTRIES):
-        cases += _both(f"entries.{count}", DOCUMENTS, {"kind": "strings", "count": count}, limit=0.5)
-    cases += _both("floats.1000", DOCUMENTS, {"kind": "floats", "count": 1000}, limit=0.5)
+        cases += _both(f"entries.{count}", DOCUMENTS, {"kind": "strings", "count": count}, limit=0.4)
+    cases += _both("floats.1000", DOCUMENTS, {"kind": "floats", "count": 1000}, limit=0.4)
     for count in grown(BYTES):
         value: Spec = {"kind": "bytes", "count": count}
-        cases += _both(f"bytes.{count}", (*DOCUMENTS, "connection"), value, inner=("key",), limit=0.5)
+        cases += _both(f"bytes.{count}", (*DOCUMENTS, "connection"), value, inner=("key",), limit=0.4)
     return cases
 
 

@@ -9,7 +9,6 @@ exactly, and name the path of what it refuses.
 from __future__ import annotations
 
 import datetime
-import decimal
 import enum
 import marshal
 import math
@@ -308,23 +307,27 @@ class _Walker:
         return self.convert(plain, path)
 
     def _refusal(self, value: Any, path: Path) -> BadType:
-        remedy = next((text for kinds, text in _REMEDIES if isinstance(value, kinds)), _ANY_REMEDY)
         return BadType(
-            f"{show(self._place + path)}: {shorten(value)} ({type(value).__name__}) cannot be stored; {remedy}"
+            f"{show(self._place + path)}: {shorten(value)} ({type(value).__name__}) cannot be stored; {_remedy(value)}"
         )
 
 
-_ANY_REMEDY = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
-_REMEDIES: tuple[tuple[Any, str], ...] = (
-    (enum.Enum, "store its .value or .name"),
-    ((set, frozenset), "use a list, such as sorted(value)"),
-    (complex, "use [value.real, value.imag] or a numpy array"),
-    (decimal.Decimal, "use float(value) or str(value)"),
-    ((datetime.datetime, datetime.date), "use value.timestamp(), integer nanoseconds, or value.isoformat()"),
-    (datetime.timedelta, "use value.total_seconds()"),
-    (np.ndarray, "add NumpyShip() to the interface's ships"),
-    ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
-)
+def _remedy(value: Any) -> str:
+    """Return what to do with a value that cannot be stored."""
+    import numbers  # whoever stores what can be stored need not wait for it
+
+    remedies: tuple[tuple[Any, str], ...] = (
+        (enum.Enum, "store its .value or .name"),
+        ((set, frozenset), "use a list, such as sorted(value)"),
+        (complex, "use [value.real, value.imag] or a numpy array"),
+        (numbers.Number, "use float(value) or str(value)"),
+        ((datetime.datetime, datetime.date), "use value.timestamp(), integer nanoseconds, or value.isoformat()"),
+        (datetime.timedelta, "use value.total_seconds()"),
+        (np.ndarray, "add NumpyShip() to the interface's ships"),
+        ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
+    )
+    anything = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
+    return next((text for kinds, text in remedies if isinstance(value, kinds)), anything)
 
 
 def _check_int(value: int, place: Path) -> int:
