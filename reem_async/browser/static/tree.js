@@ -111,7 +111,7 @@ export class Tree {
   newRow(node) {
     const twist = el("button", { class: "twist", tabIndex: -1, type: "button", "aria-label": `Open or close ${node.label}` }, icon(RIGHT));
     const leaf = el("span", { class: "leaf" });
-    const key = el("span", { class: "key" }, twist, leaf, el("bdi", {}, node.label));
+    const key = el("span", { class: "key", title: node.label }, twist, leaf, el("bdi", {}, node.label));
     const value = el("bdi", { class: "value" }), size = el("span", { class: "size" }), age = el("span", { class: "age" });
     const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "" }, key, value, size, age);
     row.parts = { key, twist, leaf, value, size, age };
