@@ -179,7 +179,7 @@ class Wire(asyncio.BufferedProtocol):
         if not self._outbox:
             self._loop.call_soon(self._flush)
         # A view of an array is copied: its owner may change it before this turn is over.
-        self._outbox.extend(bytes(piece) if type(piece) is memoryview else piece for piece in pieces)
+        self._outbox += [bytes(piece) if type(piece) is memoryview else piece for piece in pieces]
 
     def leave(self, channel: bytes) -> None:
         """Unsubscribe from a sharded channel.
@@ -273,9 +273,10 @@ class Wire(asyncio.BufferedProtocol):
         before, self._read_before, self._last_byte = self._read_before, self._last_byte, self._loop.time()
         try:
             self._reader.received(nbytes)
+            leisurely = self.leisurely
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
-                if self.leisurely:
+                if leisurely:
                     give_way()
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
