@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DocumentReader", "DocumentWriter", "opened"]
 
-_NOTHING: frozenset[str] = frozenset()
+_NO_ARRAYS: frozenset[str] = frozenset()
 
 
 class DocumentReader:
@@ -290,7 +290,7 @@ class DocumentWriter:
     def _saw_shape(self, path: Path, loaded: tuple[Loaded, ...]) -> None:
         """Note where the arrays of a value are that was set."""
         if not has_index(path):
-            suffixes = frozenset([each.suffix for each in loaded]) if loaded else _NOTHING
+            suffixes = frozenset([each.suffix for each in loaded]) if loaded else _NO_ARRAYS
             self.session.memory.saw_shape(self.keys.document, path, suffixes)
 
     def _looks(self, path: Path, loaded: tuple[Loaded, ...]) -> bool:

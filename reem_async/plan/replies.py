@@ -84,7 +84,7 @@ def decoded(plan: Plan, replies: list[Reply]) -> Any:
         BadData: The replies are of a shape that no server sends to these commands.
     """
     try:
-        return plan.decode(unwrap(plan, replies) if plan.atomic else replies)
+        return plan.decode(unwrap(plan, replies))
     except (ReemError, RedisError):
         raise
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:

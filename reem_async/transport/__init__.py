@@ -107,8 +107,7 @@ async def drive(transport: Transport, plan: Plan) -> Any:
                 if isinstance(outcome, _Raised):
                     raise outcome.error
             else:
-                commands = wire_commands(plan) if plan.atomic else plan.commands
-                replies = await transport.roundtrip(commands, bulk=plan.bulk)
+                replies = await transport.roundtrip(wire_commands(plan), bulk=plan.bulk)
                 outcome = decoded(plan, replies)
         except WrongKind as error:
             raise await _named(transport, error) from None
