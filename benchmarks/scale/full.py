@@ -71,16 +71,16 @@ async def script(topic: Topic, namespace: str, sharded: bool) -> Script:
     session = RedisInterface("127.0.0.1", namespace=namespace).session  # never connected
     await session.ships.ready()
     writer = DocumentPublisher(session, topic.name)
-    encoded, loaded = await writer._prepared((), VALUES[topic.value](1), "")
+    text, loaded = await writer._prepared((), VALUES[topic.value](1), "")
     keys = keys_of(topic.name, namespace, 0, sharded)
     stamp = "0" * 12, 1, time.time(), ()
-    notices = published(keys, *stamp[:2], with_value(*stamp, encoded.text, loaded))
-    commands = wire_commands(change(set_change(keys, (), encoded.text, loaded, notices=notices), Memory()))
+    notices = published(keys, *stamp[:2], with_value(*stamp, text, loaded))
+    commands = wire_commands(change(set_change(keys, (), text, loaded, notices=notices), Memory()))
     watch = bytes_of([("WATCH", *keys_in(commands))]) if sharded else b""
     fetch = b""
     if loaded:  # too large for the notice
         look = read(keys, (), session.ships, Memory(), (("GET", keys.last),))
-        fetch = bytes_of(wire_commands(look.decode([b"[" + encoded.text + b"]"])))
+        fetch = bytes_of(wire_commands(look.decode([b"[" + text + b"]"])))
     return Script(topic, keys.channel, watch, bytes_of(commands), fetch)
 
 
