@@ -62,7 +62,10 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class CallCase(Case):
-    """One read or write, over and over: `rounds` blocks per contender, in rotating order."""
+    """One read or write, over and over: `rounds` blocks per contender, in rotating order.
+
+    Many short ones: where a machine is slow for a second, all contenders meet that second alike.
+    """
 
     operation: str = "get"
     value: Spec = dataclasses.field(default_factory=lambda: {"kind": "small"})
@@ -72,8 +75,7 @@ class CallCase(Case):
     limit: float = 0.6
     width: int = 0  # callers at once; 0 for one after the other
     one_core: bool = False
-
-    rounds = 5
+    rounds: int = 15
 
     def measure(self, bench: Bench) -> Found:
         """Prepare all contenders, then go round among those that could."""

@@ -66,7 +66,7 @@ IMPORTS = {
 class ImportCase(Case):
     """Whole processes that import one thing and end, in turn."""
 
-    times: int = 15
+    times: int = 12
 
     def measure(self, bench: Bench) -> Found:
         """Wall time of each process."""

@@ -43,7 +43,7 @@ class RecorderCase(Case):
     """
 
     seconds: float = 2.0
-    rounds: int = 6
+    rounds: int = 5
 
     def measure(self, bench: Bench) -> Found:
         """Yield what the writers' calls took beside each of the others."""

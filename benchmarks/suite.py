@@ -97,7 +97,7 @@ def subscribers(grown: Grown) -> list[Case]:
     ]
     for total in grown(tuple(SUBSCRIBERS)):
         processes, each = SUBSCRIBERS[total]
-        messages, gap = (200, 0.02) if total <= 100 else (20, 0.2)
+        messages, gap = (20, 0.2) if total > 100 else (200, 0.02 if total > 10 else 0.01)
         cases.append(
             SubscribersCase(f"subscribers.{total}", fronts, processes=processes, each=each, messages=messages, gap=gap)
         )
@@ -122,7 +122,8 @@ def growth(grown: Grown) -> list[Case]:
     cases += _both("floats.1000", DOCUMENTS, {"kind": "floats", "count": 1000}, limit=0.4)
     for count in grown(BYTES):
         value: Spec = {"kind": "bytes", "count": count}
-        cases += _both(f"bytes.{count}", (*DOCUMENTS, "connection"), value, inner=("key",), limit=0.4)
+        rounds = 15 if count < 1_000_000 else 5  # of the largest, no block has less than two
+        cases += _both(f"bytes.{count}", (*DOCUMENTS, "connection"), value, inner=("key",), limit=0.4, rounds=rounds)
     return cases
 
 
