@@ -49,8 +49,8 @@ class Update:
         path: What was updated, such as "callback_channel.number".
         data: The whole structure below the channel after the update, None if it is gone; the
             containers are the receiver's own, arrays are read-only.
-        value: What was written: the value at `path`, or the part of it below the channel; None if
-            it was deleted.
+        value: What was written: the value at `path`, or the part of it below the channel (`data` itself, if
+            that is all of it); None if it was deleted.
         initial: This is the value that was there when following began.
         time: When it was published, in seconds since 1970 on the publisher's clock; None for a value
             that was read and not published: the initial one, and the one after a broken connection.
@@ -341,30 +341,25 @@ class Follower:
         self._losses.clear()
         missed = 0 if initial else self._heard.lost()[1]
         for mailbox in self.mailboxes:
-            data, value = self.value(), self.value()
-            path = show((self.keys.name, *self.path, *self.rest))
-            mailbox.put(Update(path, data, value, initial=initial, gap=not initial, missed=missed))
+            data, path = self.value(), show((self.keys.name, *self.path, *self.rest))
+            mailbox.put(Update(path, data, data, initial=initial, gap=not initial, missed=missed))
 
     def _emit(self, notice: Notice) -> None:
         if self._losses:
             self._recall(notice)
         path, (gap, missed) = show((self.keys.name, *notice.path)), self._heard.lost()
         stamp = notice.time, notice.publisher, notice.sequence
-        whole = self.at()
-        part = whole if self.rest else self.at(notice.path[len(self.path) :])
+        inner = () if self.rest else notice.path[len(self.path) :]
         for mailbox in self.mailboxes:
-            data, value = _handed_out(whole), _handed_out(part)
+            data = self.value()
+            value = self.value(inner) if inner else data
             mailbox.put(Update(path, data, value, False, *stamp, gap, missed))
 
     def value(self, inner: Path = ()) -> Any:
         """Return a copy of what is at `inner` below what is followed, None if nothing is. Any thread may."""
-        return _handed_out(self.at(inner))
+        found = self.at(inner)
+        return None if found is MISSING else copied(found)
 
     def at(self, inner: Path = ()) -> Any:
         """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
         return get(self.tree, (*self.rest, *inner))
-
-
-def _handed_out(found: Any) -> Any:
-    """Return a copy for a user, None for what is not there."""
-    return None if found is MISSING else copied(found)

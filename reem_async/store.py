@@ -73,20 +73,17 @@ class KeyValueStore:
         self.interface: RedisInterface = (
             interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
         )
-        self._entries: dict[str, tuple[DocumentReader, DocumentWriter]] = {}
+        self._tops: dict[str, Accessor] = {}
         self._static = False
 
     def __getitem__(self, key: str) -> Accessor:
-        return self._accessor(*self._entry(key), ())
-
-    def _entry(self, key: object) -> tuple[DocumentReader, DocumentWriter]:
-        if type(key) is str and (known := self._entries.get(key)):
+        if type(key) is str and (known := self._tops.get(key)) is not None:
             return known
         session = self.interface.session
         name = session.keys(key).name
-        entry = DocumentReader(session, name), self._writer(session, name)
-        entry[1].static = self._static
-        return self._entries.setdefault(name, entry)
+        writer = self._writer(session, name)
+        writer.static = self._static
+        return self._tops.setdefault(name, self._accessor(DocumentReader(session, name), writer, ()))
 
     def __setitem__(self, key: str, value: Any) -> None:
         raise BadType(f"assignment cannot wait for the server; use: await store[{key!r}].write(value)")
@@ -100,7 +97,8 @@ class KeyValueStore:
     def at(self, path: str) -> Accessor:
         """Return the accessor of a dotted path such as "foo.bar" or "foo.tiles[2]"; sends nothing."""
         key, *rest = parse(path) or ("",)
-        return self._accessor(*self._entry(key), tuple(rest))
+        top = self[key]  # type: ignore[index]
+        return self._accessor(top._reader, top._writer, tuple(rest))
 
     async def get(self, path: str, default: Any = _NOTHING) -> Any:
         """Return the value at a dotted path, or `default` if given and nothing is there.
@@ -141,9 +139,9 @@ class KeyValueStore:
         """
         if keys is None:
             self._static = not set_value
-            keys = list(self._entries)
+            keys = list(self._tops)
         for key in keys:
-            self._entry(key)[1].static = not set_value
+            self[key]._writer.static = not set_value
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface,)
