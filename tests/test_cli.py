@@ -180,6 +180,8 @@ def test_wrong_usage(cli):
     assert "No such option" in cli.error(2, "get", "foo", "--ouput", "x")
     assert "Missing argument" in cli.error(2, "get")
     assert "write it like foo.bar[0]" in cli.error(2, "get", "foo..x")
+    assert "'foo[' is not a path, at character 3" in cli.error(2, "get", "foo[")
+    assert "'.foo[' is not a path, at character 4" in cli.error(2, "get", ".foo[")
     assert "redis://" in cli.error(2, "ls", "--url", "http://nowhere")
 
 
@@ -194,6 +196,16 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
     said = cli.error(1, "ls", "--url", cli.url.replace("//", "//nobody:hidden-4711@"))
     assert "does not take this user name and password" in said
     assert "hidden" not in said
+
+
+def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
+    """No server answers under this name; only the words matter."""
+    cli.url = "redis://robot.invalid:6379"
+    warning, error = cli.process("ls", PYTHONWARNINGS="").stderr.splitlines()
+    assert warning.startswith("reem ls: warning: the connection to robot.invalid:6379 is not encrypted")
+    silent = warning.rpartition("silence this: ")[2]
+    assert silent.startswith("PYTHONWARNINGS=")
+    assert cli.process("ls", PYTHONWARNINGS=silent.partition("=")[2]).stderr.splitlines() == [error]
 
 
 def test_completion_of_top_level_keys(cli, kvs):

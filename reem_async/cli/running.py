@@ -10,8 +10,9 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import Awaitable, Callable, Sequence
-from contextlib import suppress
+import warnings
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import typer
@@ -73,7 +74,8 @@ def guarded(name: str, work: Callable[[], int | None], *, live: bool = False) ->
     from reem_async.errors import BadInput, MissingKey, RedisError, ReemError
 
     try:
-        code = work() or 0
+        with _warnings_in_words(name):
+            code = work() or 0
         sys.stdout.flush()
     except (KeyboardInterrupt, asyncio.CancelledError):
         return 0 if live else INTERRUPTED
@@ -146,6 +148,18 @@ def complain(name: str, message: str, code: int) -> int:
     return code
 
 
+@contextmanager
+def _warnings_in_words(name: str) -> Iterator[None]:
+    """Show warnings as one line each, without the place in the code that Python adds."""
+
+    def show(message: Warning | str, *_: object, **__: object) -> None:
+        complain(name, "warning: " + (message if isinstance(message, str) else for_users(message)), 0)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
+
+
 def for_users(error: Exception) -> str:
     """Return the message of an error, in the words of the command line."""
     if type(error).__module__ == "builtins" and isinstance(error, OSError) and error.strerror and error.filename:
@@ -153,6 +167,7 @@ def for_users(error: Exception) -> str:
     text = str(error) or type(error).__name__
     for of_library, of_command in (
         ("RedisInterface('redis://host:port')", "--url redis://host:port or REEM_URL"),
+        ("warnings.filterwarnings('ignore', category=reem.InsecureConnection)", "PYTHONWARNINGS=ignore::UserWarning"),
         ("use store['a']['b'] for such keys", 'write it like foo.bar[0]; a key with a dot in it: foo["a.b"]'),
         (
             "RedisInterface(..., username=..., password=...)",

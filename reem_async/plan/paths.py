@@ -122,12 +122,14 @@ def parse_suffix(text: str) -> Path:
     return _parse_short(text) if len(text) <= _SHORT else _split(text, _TOKEN)
 
 
-def _split(text: str, tokens: re.Pattern[str]) -> Path:
+def _split(text: str, tokens: re.Pattern[str], added: int = 0) -> Path:
+    """Return the path in `text`, whose first `added` characters its user has not typed."""
     position, path = 0, []
     while position < len(text) and not (tokens is _TOKEN and text[position] == "~"):
         token = tokens.match(text, position)
         if token is None:
-            raise BadKey(f"{shorten(text)} is not a path, at character {position}; write it like foo.bar[0]")
+            where = max(position - added, 0)
+            raise BadKey(f"{shorten(text[added:])} is not a path, at character {where}; write it like foo.bar[0]")
         path.append(_element(token))
         position = token.end()
     return tuple(path)
@@ -160,8 +162,8 @@ def parse(text: str) -> Path:
         raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
     if text in ("", "."):
         return ()
-    tail = text if text[0] in ".[" else "." + text
-    return tuple(check_element(key, ()) for key in _split(tail, _TYPED))
+    found = _split(text, _TYPED) if text[0] in ".[" else _split("." + text, _TYPED, 1)
+    return tuple(check_element(key, ()) for key in found)
 
 
 def show(path: Path) -> str:
