@@ -61,7 +61,8 @@ class Replayer:
         remap: New names for top-level keys.
 
     Raises:
-        BadValue: A rate or range that cannot be. BadKey: A name that cannot be.
+        BadValue: A rate or range that cannot be, patterns or names of which nothing was recorded, or two keys that
+            would become one. BadKey: A name that cannot be.
     """
 
     def __init__(
@@ -82,7 +83,8 @@ class Replayer:
         self.end = log.end if end is None else seconds(nanoseconds(end))
         if self.start > self.end:
             raise BadValue(
-                f"the replay would end before it starts; the recording goes from {log.start!r} to {log.end!r}"
+                f"the replay would end before it starts; the recording is {log.duration:.3f} s long, "
+                f"from {log.start!r} to {log.end!r}"
             )
         self._log = log
         self._rate = rate
@@ -90,6 +92,7 @@ class Replayer:
         self._texts = list(patterns)
         self._patterns: list[Pattern] = [parse_pattern(text) for text in patterns]
         self._remap = {_name(old): _name(new) for old, new in (remap or {}).items()}
+        self._check_names(log.names())
         self._space = PublishSpace(interface)
         self._session = interface.session
         self._updates: Iterator[LogUpdate] | None = None
@@ -97,6 +100,26 @@ class Replayer:
         self._names: set[str] = set()
         self._published = self._refused = self._rounds = 0
         self._lag = self._most_lag = 0.0
+
+    def _check_names(self, recorded: Sequence[str]) -> None:
+        """Raise BadValue if patterns or new names mean nothing, or if two keys would become one."""
+        chosen = [name for name in recorded if self._is_chosen(name)]
+        missing = [old for old in self._remap if old not in chosen]
+        if recorded and not chosen:
+            missing = self._texts
+        if missing:
+            raise BadValue(f"nothing is played of {', '.join(missing)}; recorded are {', '.join(recorded):.200}")
+        origin: dict[str, str] = {}
+        for name in chosen:
+            new = self._remap.get(name, name)
+            if new in origin:
+                raise BadValue(
+                    f"both {origin[new]} and {name} would be played as {new}; choose other names, or patterns"
+                )
+            origin[new] = name
+
+    def _is_chosen(self, name: str) -> bool:
+        return any(pattern.concerns((name,)) for pattern in self._patterns)
 
     @property
     def status(self) -> ReplayStatus:
@@ -160,7 +183,7 @@ class Replayer:
         self._updates = iter(self._log.updates(after, self.end, self._texts))
 
     def _whole(self, name: str) -> Any:
-        if not any(pattern.concerns((name,)) for pattern in self._patterns):
+        if not self._is_chosen(name):
             return MISSING
         try:
             return pruned(self._log.value_at((name,), self.start), (name,), self._patterns)
