@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import contextlib
 import os
@@ -156,6 +157,30 @@ async def test_bad_arguments(log, other):
             Replayer(other, log, **arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"patterns": ["nobody"]}, r"nothing is played of nobody; recorded are .*arm"),
+        ({"remap": {"nobody": "b"}}, r"nothing is played of nobody; recorded are .*arm"),
+        ({"patterns": ["ARM"], "remap": {"LATE": "b"}}, r"nothing is played of .*late"),
+        ({"remap": {"ARM": "LATE"}}, r"both .*arm and .*late would be played as .*late"),
+        ({"remap": {"ARM": "b", "LATE": "b"}}, r"both .*arm and .*late would be played as b;"),
+    ],
+)
+async def test_names_that_mean_nothing_or_two_things(names, log, other, arguments, message):
+    text = repr(arguments).replace("ARM", names("arm")).replace("LATE", names("late"))
+    with pytest.raises(BadValue, match=message):
+        Replayer(other, log, **ast.literal_eval(text))
+
+
+async def test_keys_may_swap_names(names, log, akvs, other):
+    swapped = {names("arm"): names("late"), names("late"): names("arm")}
+    await Replayer(other, log, rate=1e6, remap=swapped).play()
+    assert_same(await akvs[names("late")].read(), log[names("arm")].at(log.end))
+    assert await akvs.get(names("arm"), "gone") == "gone"  # as the other one is at the end
+    await akvs[names("late")].delete()
+
+
 async def test_samples_replay_with_their_parents(key, akvs, other, server_url, tmp_path):
     await akvs[key("a")].write({"x": {"y": 1, "z": 2}})
     async with reem_async.RedisInterface(server_url) as own:
@@ -192,6 +217,38 @@ def test_export_npz(names, log, tmp_path):
         assert_same(arrays[f"{names('arm')}.image.time"], times)
         assert arrays[f"{names('arm')}.n"].tolist() == list(range(26))
         assert_same(arrays[f"{names('late')}[1].frame"], FRAME[None])
+
+
+LONG = 2**62 + 1
+"""An integer that no float64 holds."""
+
+
+@pytest.fixture
+async def mixed(key, apspace, server_url, tmp_path):
+    """A recording of numbers that no one dtype of numpy holds exactly, and of some that one does."""
+    async with reem_async.RedisInterface(server_url) as own, Recorder(own, [key()], tmp_path / "mixed.mcap"):
+        for long, short, flags, item in ((LONG, 1, True, [LONG, 0.5]), (0.5, 0.5, 1, [1, 0.5]), (1, 2, 0, [2, 1])):
+            await apspace[key()].write({"long": long, "short": short, "flags": flags, "item": item})
+    with open_log(tmp_path / "mixed.mcap") as log:
+        yield log
+
+
+def test_npz_has_no_number_that_is_not_exact(key, mixed, tmp_path):
+    result = export(mixed, "npz", tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as arrays:
+        assert_same(arrays[f"{key()}.short"], np.array([1, 0.5, 2]))
+        assert sorted(arrays) == [f"{key()}.short", f"{key()}.short.time"]
+    assert sorted(result.left_out) == [f"{key()}.flags", f"{key()}.item", f"{key()}.long"]
+    assert "exactly" in result.left_out[f"{key()}.long"]
+
+
+def test_parquet_has_no_number_that_is_not_exact(key, mixed, tmp_path):
+    parquet = pytest.importorskip("pyarrow.parquet")
+    export(mixed, "parquet", tmp_path / "a.parquet")
+    table = parquet.read_table(tmp_path / "a.parquet")
+    assert table[f"{key()}.long"].to_pylist() == [str(LONG), "0.5", "1"]
+    assert table[f"{key()}.short"].to_pylist() == [1.0, 0.5, 2.0]
+    assert table[f"{key()}.item[0]"].to_pylist() == [LONG, 1, 2]
 
 
 def test_export_parquet(names, log, tmp_path):

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..errors import BadValue
 from ..plan.paths import Path, suffix
+from .history import EXACT, numbers
 from .log import Log
 from .stored import Stored, is_inline
 
@@ -136,13 +137,21 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
             result.rows += len(batch)
 
 
+class _Long(int):
+    """The kind of ints that floats would round."""
+
+
 def _kind(value: Any) -> type:
     """Return the type of a cell; ints that no column of integers holds are text."""
-    return str if type(value) is int and not -(2**63) <= value < 2**63 else type(value)
+    if type(value) is not int or -EXACT <= value <= EXACT:
+        return type(value)
+    return _Long if -(2**63) <= value < 2**63 else str
 
 
 def _form(kinds: set[type]) -> type:
-    """Return the one type that holds values of all these."""
+    """Return the one type that holds values of all these exactly."""
+    if kinds and kinds <= {int, _Long}:
+        return int
     if len(kinds) == 1:
         return next(iter(kinds))
     return float if kinds == {int, float} else str
@@ -160,7 +169,9 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
         for path in _array_paths(log, patterns, result):
             times, form, count = _shape(log, path)
             if form is None:
-                result.left_out[_name(path)] = "its type or shape changes, or it cannot be read"
+                result.left_out[_name(path)] = (
+                    "its type or shape changes, no dtype holds it exactly, or it cannot be read"
+                )
                 continue
             result.rows += count
             result.columns.append(_name(path))
@@ -214,17 +225,29 @@ def _shape(log: Log, path: Path) -> tuple[np.ndarray[Any, Any], Form | None, int
     """Return the times of a path's values, the dtype and shape that fit all (None if none does), and how many."""
     times: list[float] = []
     forms: set[Form] = set()
+    largest = 0
     for time, value in log[path].values():
         times.append(time)
-        array = np.asarray(value) if isinstance(value, bool | int | float | str | list | np.ndarray) else None
+        array = _array(value)
         if array is None or array.dtype.hasobject:
             return np.array(times), None, 0
         forms.add((array.dtype, array.shape))
+        if array.dtype.kind in "iu" and array.size:
+            largest = max(largest, int(array.max()), -int(array.min()))
     kinds = {dtype.kind for dtype, _ in forms}
     if len({shape for _, shape in forms}) != 1 or not (len(forms) == 1 or kinds <= set("iuf") or kinds == {"U"}):
         return np.array(times), None, 0
     dtype = np.result_type(*[dtype for dtype, _ in forms])
+    if dtype.kind == "f" and largest > EXACT:
+        return np.array(times), None, 0
     return np.array(times), (dtype, next(iter(forms))[1]), len(times)
+
+
+def _array(value: Any) -> np.ndarray[Any, Any] | None:
+    """Return one value as an array that holds it exactly, None if there is none."""
+    if isinstance(value, list):
+        return numbers(value) if value else np.empty(0)
+    return np.asarray(value) if isinstance(value, bool | int | float | str | np.ndarray) else None
 
 
 FORMATS: dict[str, Callable[[Log, FilePath, Sequence[str], Export], None]] = {

@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["stacked"]
+__all__ = ["EXACT", "numbers", "stacked"]
+
+EXACT = 2**53
+"""Integers up to this size are floats without loss."""
 
 
 def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
@@ -22,15 +25,15 @@ def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
         return np.stack(values) if len(forms) == 1 else values
     if kinds == {list}:
         lengths = {len(value) for value in values}
-        numbers = (
-            _numbers([item for value in values for item in value]) if len(lengths) == 1 and lengths != {0} else None
-        )
-        return values if numbers is None else numbers.reshape(len(values), -1)
-    numbers = _numbers(values)
-    return values if numbers is None else numbers
+        if len(lengths) != 1 or lengths == {0}:
+            return values
+        flat = numbers([item for value in values for item in value])
+        return values if flat is None else flat.reshape(len(values), -1)
+    flat = numbers(values)
+    return values if flat is None else flat
 
 
-def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
+def numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
     """Return numbers as an array that holds them all exactly, None if there is none."""
     kinds = set(map(type, values))
     if kinds == {bool}:
@@ -42,6 +45,6 @@ def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
         return np.array(values, np.uint64) if low >= 0 else None
     if kinds == {float}:
         return np.array(values, np.float64)
-    if kinds == {int, float} and all(type(value) is float or abs(value) <= 2**53 for value in values):
+    if kinds == {int, float} and all(type(value) is float or abs(value) <= EXACT for value in values):
         return np.array(values, np.float64)
     return None
