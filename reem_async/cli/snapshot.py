@@ -249,7 +249,7 @@ def _listed(path: Path, check: bool, as_json: bool) -> int:
         except (BadData, OSError) as error:
             damaged[str(file)] = str(error)
     found.sort(key=lambda it: (it.time, it.path.name))
-    _show_files(found, damaged, as_json)
+    _show_files(found, damaged, path, as_json)
     return FAILED if damaged else 0
 
 
@@ -269,7 +269,7 @@ def _candidates(directory: Path) -> Iterator[Path]:
         yield file
 
 
-def _show_files(found: list[Snapshot], damaged: dict[str, str], as_json: bool) -> None:
+def _show_files(found: list[Snapshot], damaged: dict[str, str], directory: Path, as_json: bool) -> None:
     if as_json:
         for it in found:
             emit_json(_facts(it))
@@ -281,7 +281,7 @@ def _show_files(found: list[Snapshot], damaged: dict[str, str], as_json: bool) -
         rows.insert(0, ["name", "kind", "taken", "size", "keys"])
     columns(rows, ["cyan", "", "", "", ""], frozenset({3, 4}))
     if not rows and not damaged:
-        note("No snapshots here; `reem snapshot save` makes one.")
+        note(clean(f"No snapshots in {directory.resolve()}; `reem snapshot save` makes one."))
     for error in damaged.values():
         note(f"damaged: {error}")
 

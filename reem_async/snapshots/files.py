@@ -151,7 +151,9 @@ def _is_automatic(path: Path) -> bool:
 def check_target(path: Path, *, overwrite: bool) -> None:
     """Raise what would only show after the work: FileExistsError, NotADirectoryError, IsADirectoryError."""
     if path.is_dir():
-        raise IsADirectoryError(f"{path} is a directory; name a file in it")
+        raise IsADirectoryError(
+            f"{path} is a directory; name a file in it, or use --directory, which names one by time"
+        )
     if not path.parent.is_dir():
         raise NotADirectoryError(f"{path}: there is no directory {path.parent}; make it first")
     if path.exists() and not overwrite:
