@@ -163,3 +163,40 @@ def test_the_rate_is_that_of_the_last_seconds(history):
     assert history.rate("k", 20.0) == pytest.approx(10.0, abs=0.5)
     assert history.rate("k", 40.0) is None
     assert history.rate("other", 20.0) is None
+
+
+def test_what_is_deleted_and_comes_back_differs(history):
+    history.begin("k", b'{"a":1}')
+    assert history.differs("k", None, 1.0)
+    history.add(("k",), MISSING, 0, 1.0)
+    history.remember("k", None)
+    assert history.differs("k", b'{"a":1}', 2.0)
+
+
+def test_a_text_that_was_seen_before_a_published_change_differs(history):
+    history.begin("k", b'{"a":1}')
+    history.add(("k", "a"), 2, 8, 1.0)
+    assert history.differs("k", b'{"a":1}', 2.0)
+
+
+def test_of_a_long_text_nothing_is_known_until_it_changes(history):
+    texts = [b'"%b"' % (each * 300_000) for each in (b"a", b"b")]
+    history.begin("k", texts[0])
+    assert history.tree(("k",), 1.0) is UNKNOWN
+    assert not history.differs("k", texts[0], 1.0)
+    history.remember("k", texts[0])
+    assert not history.differs("k", texts[0], 2.0)
+    assert history.differs("k", texts[1], 3.0)
+
+
+def test_what_was_announced_and_then_found_is_one_change(history):
+    history.add(("cam",), {}, 0, 9.0)
+    for when in (10.0, 10.5):
+        history.add(("cam", "image"), PENDING, 0, when)
+        history.add(("cam", "image"), when, 8, when + 0.1, answer=True)
+    assert history.times(("cam", "image")) == [9.0, 10.0, 10.5]
+    assert history.times(()) == [9.0, 10.0, 10.5]
+    assert history.rate("cam", 11.0, over=1.5) == pytest.approx(2 / 1.5)
+    assert history.step(11.0, False, ("cam", "image")) == 10.6, "from then on there was something else to be seen"
+    assert history.step(10.6, False, ("cam", "image")) == 10.1
+    assert history.step(10.6, False, ()) == 10.1

@@ -17,6 +17,7 @@ from conftest import assert_same, eventually, python
 from PIL import Image
 
 import reem
+from reem_async.browser.downloads import file_of
 from reem_async.server import EmbeddedServer
 
 
@@ -170,9 +171,18 @@ def test_downloads(ask, robot):
     whole = ask.http.get(f"/view/{robot}", params={"format": "json"}).json()
     assert whole["depth"] == [[0.5, None], [2.0, 3.0]]
     assert whole["image"] == IMAGE.tolist()
-    assert whole["raw"] == {"type": "bytes", "what": "bytes", "bytes": 3}
-    for path, kind in (("n", "npy"), ("s", "csv"), ("n", "exe"), ("image", "csv"), ("raw", "png")):
+    assert whole["raw"] == "AAH/"
+    assert get("raw", format="bin").content == b"\x00\x01\xff"
+    assert 'filename="' + robot + ".image_0" in get("image", format="csv", slice="0,:,:").headers["content-disposition"]
+    for path, kind in (("n", "npy"), ("s", "csv"), ("n", "exe"), ("image", "csv"), ("raw", "png"), ("n", "bin")):
         assert get(path, format=kind).status_code == 400, (path, kind)
+
+
+def test_what_json_cannot_hold_is_refused_and_not_left_out(ask, kvs, key):
+    kvs[key()] = {"z": np.array([1j])}
+    answer = ask.http.get(f"/view/{key()}", params={"format": "json"})
+    assert answer.status_code == 400
+    assert f"{key()}.z" in answer.json()["error"]
 
 
 def test_formulas_in_csv_are_quoted(ask, kvs, key):
@@ -267,6 +277,53 @@ def test_what_is_only_stored_is_noticed_too(ask, kvs, key):
     assert ask.rows(key())["x"]["time"] > at
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda number: {"img": np.full((20, 20), number, np.uint8)},
+        lambda number: np.full(5, number),
+        lambda number: {"n": number, "blob": "x" * 300_000},
+        lambda number: {"raw": bytes([number])},
+    ],
+)
+def test_the_past_of_what_is_only_stored_is_not_the_present(page, ask, kvs, key, make):
+    """Arrays of the same shape leave the document's text as it is; that of long ones is not kept at first."""
+    name, (_, source) = key(), page
+    known = {}
+    kvs[name] = make(0)
+    eventually(lambda: name in source.history.names)
+    time.sleep(1.5)  # what it holds has been looked at
+    for number in range(1, 5):
+        before = len(source.history.times((name,)))
+        kvs[name] = make(number)
+        eventually(lambda before=before: len(source.history.times((name,))) > before)
+        now = time.time()
+        eventually(lambda now=now: content(ask, name, now) is not None)
+        known[now] = number
+    found = {at: content(ask, name, at) for at in known}
+    assert found == {at: content_of(make(number)) for at, number in known.items()}
+
+
+def content(ask, name, at):
+    """What is shown of the past, None if it is not kept."""
+    answer = ask.http.get(f"/view/{name}", params={"format": "json", "at": at})
+    return answer.json() if answer.status_code == 200 else None
+
+
+def content_of(value):
+    return orjson.loads(file_of(value, ("x",), "json", None)[0])
+
+
+def test_what_comes_back_as_it_was_is_there_again(ask, kvs, key):
+    kvs[key()] = {"inner_name": 1}
+    eventually(lambda: key() in ask.rows(at=time.time()))
+    del kvs[key()]
+    eventually(lambda: key() not in ask.rows(at=time.time()))
+    kvs[key()] = {"inner_name": 1}
+    eventually(lambda: key() in ask.rows(at=time.time()))
+    assert any("inner_name" in node["address"] for node in ask.json("search", q=f"{key()}.inner")["found"])
+
+
 def test_events_name_what_changed_and_are_few(ask, pspace, key):
     pspace[key()] = {"x": 0}
     with ask.http.stream("GET", "/api/events") as stream:
@@ -299,10 +356,16 @@ def test_a_server_that_goes_away_is_said_and_so_is_its_return(tmp_path):
         port = server.port
         with reem.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
             reem.KeyValueStore(interface)["a"] = 1
+            reem.KeyValueStore(interface)["d"] = {"fixed": [1, 2]}
         with served(live(f"redis://127.0.0.1:{port}")) as (address, _), client_of(address) as ask:
             assert ask.rows()["a"]["text"] == "1"
+            eventually(lambda: ask.rows("d", at=time.time())["fixed"]["text"] == "[1, 2]")
+            at = time.time()
             server.stop()
             eventually(lambda: "no server answers" in ask.json("tree")["lost"])
+            assert ask.rows(at=at)["a"]["text"] == "1", "the past is known without the server"
+            assert ask.rows("d", at=at)["fixed"]["text"] == "[1, 2]"
+            assert content(ask, "d", at) == {"fixed": [1, 2]}
             assert ask.ask("node", path="a").status_code == 503
             with EmbeddedServer(port, tmp_path / "data"):
                 eventually(lambda: ask.json("tree")["lost"] == "")

@@ -305,6 +305,119 @@ def test_what_is_gone_is_said_and_comes_back(visit, pspace, kvs, key):
     expect(page.locator(".note")).to_contain_text("nothing is stored")
 
 
+def test_what_is_typed_is_not_lost_when_the_type_changes(visit, pspace, key):
+    pspace[key("mode")] = 1
+    page = visit.open(f"/view/{key('mode')}")
+    page.get_by_text("Edit", exact=True).click()
+    area = page.get_by_label("New value, as JSON")
+    expect(area).to_have_value("1")
+    area.fill("[7, 8")
+    for value in (1.5, "text", None):
+        pspace[key("mode")] = value
+        time.sleep(0.7)
+    expect(page.locator(".note")).to_contain_text("null now")
+    assert area.input_value() == "[7, 8"
+    page.get_by_text("Edit", exact=True).click()
+    expect(page.locator(".big")).to_have_text("null")
+    expect(page.locator(".note")).to_be_hidden()
+
+
+def test_the_keyboards_place_in_the_tree_is_kept_when_rows_above_vanish(visit, pspace, kvs, key):
+    pspace[key("a_first")] = 1
+    kvs[key("b_second")] = 2
+    page = visit.open("/")
+    row(page, key("b_second")).focus()
+    del pspace[key("a_first")]
+    expect(row(page, key("a_first"))).to_have_count(0)
+    expect(row(page, key("b_second"))).to_be_focused()
+
+
+def test_numbers_have_a_line_in_the_tree(visit, pspace, key):
+    page = visit.open("/")
+    for number in (1.0, 3.0, -2.0):
+        pspace[key()] = number
+        expect(row(page, key()).locator(".value")).to_have_text(str(number))
+    drawn = "it => it.getContext('2d').getImageData(0, 0, it.width, it.height).data.some(each => each)"
+    assert row(page, key()).locator("canvas.spark").evaluate(drawn)
+    pspace[key()] = "text"
+    expect(row(page, key()).locator("canvas.spark")).to_be_hidden()
+
+
+@pytest.mark.parametrize(
+    ("value", "step", "text"),
+    [
+        (-4e17, 1e17, "-4e+17"),
+        (5_000_020, 20, "5000020"),
+        (1.795424e9, 10, "1795424000"),
+        (-123456.7, 0.1, "-123456.7"),
+        (-122.4194, 0.0001, "-122.4194"),
+        (1.23e-9, 1e-11, "1.23e-9"),
+        (1e-20, 0.1, "0"),
+        (-9.1e18, 1e16, "-9.10e+18"),
+    ],
+)
+def test_ticks_tell_themselves_from_each_other(visit, value, step, text):
+    page = visit.open("/")
+    assert page.evaluate(f"import('/static/plot.js').then(it => it.tickText({value!r}, {step!r}))") == text
+
+
+def test_the_labels_of_an_axis_have_room(visit, kvs, key):
+    kvs[key()] = np.linspace(-123456.7, -123456.1, 50)
+    page = visit.open(f"/view/{key()}")
+    page.get_by_role("tab", name="Lines").click()
+    expect(page.locator("canvas.plot")).to_be_visible()
+    # Nothing is drawn at the left edge: what would be cut off begins there.
+    clear = "it => it.getContext('2d').getImageData(0, 0, 2, it.height).data.every(each => !each)"
+    eventually(lambda: page.locator("canvas.plot").evaluate("it => it.width > 300"))
+    assert page.locator("canvas.plot").evaluate(clear)
+
+
+def test_a_stray_percent_in_the_address_is_said(visit):
+    page = visit.open("/view/100%25%")
+    expect(page.locator(".note")).to_contain_text("nothing is stored")
+    expect(page.locator("#dot")).to_have_class("dot ok")
+
+
+def test_search_on_a_phone_covers_the_value(visit, kvs, key):
+    kvs[key("arm")] = {"joint": 1}
+    page = visit.open(f"/view/{key('arm')}.joint")
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.locator("#search").fill(key("arm"))
+    row(page, key("arm")).click()
+    expect(page.locator("#view")).to_be_visible()
+    expect(page.locator("h1")).to_have_text(key("arm"))
+
+
+def test_downloads_are_whole_and_say_why_there_is_none(visit, kvs, key, tmp_path):
+    image = np.arange(60 * 40 * 3, dtype=np.uint8).reshape(60, 40, 3)
+    kvs[key()] = {"image": image, "z": np.array([1j]), "mixed": [1, "a"]}
+    page = visit.open(f"/view/{key()}.image")
+    page.get_by_role("tab", name="Table").click()
+    with page.expect_download() as done:
+        page.get_by_role("link", name="npy").click()
+    done.value.save_as(tmp_path / "a.npy")
+    assert (np.load(tmp_path / "a.npy") == image).all()
+    with page.expect_download() as done:
+        page.get_by_role("link", name="csv").click()
+    assert done.value.suggested_filename.startswith(f"{key()}.image[")
+    page = visit.open(f"/view/{key()}.mixed")
+    page.get_by_role("link", name="npy").click()
+    expect(page.locator("#toast")).to_contain_text("not an array")
+    visit.said.clear()  # the browser notes each answer of 400 there
+
+
+def test_the_scale_of_colours_is_there_again_after_other_tabs(visit, kvs, key):
+    kvs[key()] = np.linspace(0, 1, 400).reshape(20, 20)
+    page = visit.open(f"/view/{key()}")
+    drawn = """it => {
+        const blank = Object.assign(document.createElement("canvas"), { width: it.width, height: it.height });
+        return it.toDataURL() !== blank.toDataURL();
+    }"""
+    for tab in ("Image", "Lines", "Image"):
+        page.get_by_role("tab", name=tab).click()
+    eventually(lambda: page.locator(".scale canvas").evaluate(drawn))
+
+
 def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, key):
     kvs[key("a_rather_long_name_of_a_key")] = {"x": list(range(40)), "text": "word " * 200}
     name = key("a_rather_long_name_of_a_key")

@@ -196,6 +196,9 @@ def test_writes_that_make_no_sense_are_refused(write, robot, kvs):
         (b'{"path":1,"value":2}', 400),
         (b" " * 70_000, 413),
         (b"NaN", 400),
+        (b'{"path":"%b.n","value":NaN}' % robot.encode(), 400),
+        (b'{"path":"%b.n","value":18446744073709551616}' % robot.encode(), 400),
+        (b'{"path":"%b.n","value":%b}' % (robot.encode(), b"[" * 30_000), 400),
     ):
         assert write("", None, content=content).status_code == status, content[:20]
     assert kvs[robot]["n"].read() == 1

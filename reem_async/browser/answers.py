@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -131,6 +132,11 @@ async def body_of(request: Request) -> Any:
         if len(body) > LARGEST_BODY:
             raise Refused(413, f"more than {LARGEST_BODY} bytes; use Python for large values")
     try:
-        return orjson.loads(bytes(body))
-    except orjson.JSONDecodeError as error:
+        # The standard library's parser keeps integers of any size, which the store then refuses by name.
+        return json.loads(bytes(body), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
         raise Refused(400, f"this is not JSON: {error}") from None
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number in JSON")

@@ -111,7 +111,9 @@ class _Pages:
         value = (await self._source.value(path, at_of(request))).value
         chosen = request.query_params.get("slice")
         content, media_type = await anyio.to_thread.run_sync(lambda: file_of(value, path, kind, chosen))
-        return Response(content, headers={"content-disposition": disposition(path, kind)}, media_type=media_type)
+        return Response(
+            content, headers={"content-disposition": disposition(path, kind, chosen)}, media_type=media_type
+        )
 
     async def static(self, request: Request) -> Response:
         """Return one of the known files."""

@@ -1,7 +1,8 @@
-"""Values as files: `/view/<path>?format=json`, `npy`, `csv` or `png`."""
+"""Values as files: `/view/<path>?format=json`, `npy`, `csv`, `png` or `bin`."""
 
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import re
@@ -21,7 +22,8 @@ from .trees import Leaf, leaf_of
 
 __all__ = ["FORMATS", "disposition", "file_of"]
 
-_LONGEST_LIST = 10_000
+_LONGEST_LIST = 1_000_000
+"""Numbers of an array up to which it is written as a list."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
@@ -44,28 +46,37 @@ def file_of(value: Any, path: Path, kind: str, chosen: str | None) -> tuple[byte
     return make(value, path, chosen), media_type
 
 
-def disposition(path: Path, kind: str) -> str:
-    """Return the header that gives a file its name."""
-    name = _UNSAFE.sub("_", address(path)).strip("._") or "value"
-    return f"attachment; filename=\"{name[:80]}.{kind}\"; filename*=UTF-8''{quote(address(path)[:80] + '.' + kind, '')}"
+def disposition(path: Path, kind: str, chosen: str | None = None) -> str:
+    """Return the header that gives a file its name; that of a part of an array says which."""
+    whole = address(path)[:80] + (f"[{chosen[:40]}]" if chosen else "")
+    name = _UNSAFE.sub("_", whole).strip("._") or "value"
+    return f"attachment; filename=\"{name}.{kind}\"; filename*=UTF-8''{quote(f'{whole}.{kind}', '')}"
 
 
 def _json(value: Any, path: Path, chosen: str | None) -> bytes:
-    return orjson.dumps(_plain(value), option=orjson.OPT_INDENT_2)
+    return orjson.dumps(_plain(value, path), option=orjson.OPT_INDENT_2)
 
 
-def _plain(value: Any) -> Any:
-    """Return a value for JSON: short arrays as lists, of all else what it is."""
+def _plain(value: Any, path: Path) -> Any:
+    """Return a value for JSON: arrays of numbers as lists, bytes as base64, as `reem get --json` writes them."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _plain(item, (*path, key)) for key, item in value.items()}
     if isinstance(value, list):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST and value.dtype.kind in "biuf":
-        return value.tolist()
+        return [_plain(item, (*path, index)) for index, item in enumerate(value)]
     if value is None or isinstance(value, str | bool | int | float):
         return value
+    if isinstance(value, bytes):
+        return base64.b64encode(value).decode()
+    if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST and value.dtype.kind in "biufU":
+        return value.tolist()
     leaf = leaf_of(value)
-    return {"type": leaf.label, "what": leaf.summary, "bytes": leaf.size}
+    raise BadType(f"{show(path)}, {leaf.label} {leaf.summary}, is nothing for JSON; choose npy for it, or use Python")
+
+
+def _bin(value: Any, path: Path, chosen: str | None) -> bytes:
+    if not isinstance(value, bytes):
+        raise BadType(f"{show(path)} is of type {type(value).__name__}, not bytes; use another format")
+    return value
 
 
 def _npy(value: Any, path: Path, chosen: str | None) -> bytes:
@@ -132,5 +143,6 @@ FORMATS: dict[str, tuple[Callable[[Any, Path, str | None], bytes], str]] = {
     "npy": (_npy, "application/octet-stream"),
     "csv": (_csv, "text/csv; charset=utf-8"),
     "png": (_png, "image/png"),
+    "bin": (_bin, "application/octet-stream"),
 }
 """What a value can be downloaded as."""

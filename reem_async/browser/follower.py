@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import time
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from typing import Any
+
+import numpy as np
 
 from ..catalog import names, outline
 from ..connection import RedisInterface
@@ -14,12 +18,13 @@ from ..document import DocumentReader
 from ..errors import BadData, MissingKey, RedisError, ReemError
 from ..monitor import ANNOUNCED, Event, Monitor
 from ..plan.paths import Path
+from ..plan.placeholders import marked
 from ..plan.trees import MISSING
 from ..policy import Last
 from .history import History
 from .peek import document_texts
 from .timeline import PENDING
-from .trees import Leaf, tree_of, tree_of_outline, walk, weight
+from .trees import Leaf, leaf_of, strip, tree_of, tree_of_outline, walk, weight
 
 __all__ = ["Follower"]
 
@@ -32,12 +37,14 @@ _LOOK_KEYS = 400
 
 _BATCH = 100
 _LOOK_BYTES = 1 << 20
-"""Bytes of documents a second that looking may cost the server."""
+"""Bytes of documents a second that looking may cost the server, and as many of arrays."""
 
 _LARGE = 1 << 18
-"""Bytes of a document from which it is looked at seldom."""
+"""Bytes of a document from which it is looked at less often: a quarter of the time that its bytes allow."""
 
-_SELDOM = 60.0
+_LARGEST_LOOK = 32 << 20
+"""Bytes of arrays in a document up to which they are read again to see whether they have changed."""
+
 _MOST_HEARD = 100_000
 _QUIET_SECONDS = 1.0
 """A key that was just published need not be looked at: what is read may be older than what was heard."""
@@ -74,6 +81,7 @@ class Follower:
 
     Attributes:
         names: The top-level keys, sorted.
+        doubtful: Keys with more arrays than are read again: what only a KeyValueStore writes is not noticed.
         lost: Why the server cannot be read at the moment; empty if all is well.
     """
 
@@ -81,6 +89,7 @@ class Follower:
         self._interface = interface
         self._history = history
         self._allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
+        self._looks = Allowance(_LOOK_BYTES, _LARGEST_LOOK)
         self._monitor = Monitor(interface, policy=Last(_WAITING))
         self._dirty: dict[Path, None] = {}
         self._news = asyncio.Event()
@@ -88,6 +97,9 @@ class Follower:
         self._shown: dict[str, None] = {}
         self._heard: dict[str, float] = {}
         self._seldom: dict[str, float] = {}
+        self._unsure: dict[str, int] = {}  # keys whose arrays are to be looked at, and how many bytes these are
+        self._digests: dict[str, bytes] = {}
+        self.doubtful: set[str] = set()
         self._turn = 0
         self._complete = False
         self.names: list[str] = []
@@ -132,6 +144,7 @@ class Follower:
         if len(self._heard) > _MOST_HEARD:
             self._heard.clear()
         self._heard[name] = time.monotonic()
+        self._digests.pop(name, None)
         if len(event.path) == 1 and event.deleted:
             self._forget(name)
         elif len(event.path) == 1 or name not in self._history.names:
@@ -173,11 +186,11 @@ class Follower:
         reader = DocumentReader(self._interface.session, str(path[0]))
         try:
             tree = tree_of_outline(await outline(self._interface, path))
-            if self._allowance.take(sum([it.size for _, it in walk(tree, ()) if isinstance(it, Leaf)])):
+            if self._allowance.take(_array_bytes(tree)):
                 tree = await reader.read(path[1:])
         except MissingKey:
             tree = MISSING
-        self._history.add(path, tree, weight(tree), time.time())
+        self._history.add(path, tree, weight(tree), time.time(), answer=True)
 
     # --- what is not published
 
@@ -208,7 +221,9 @@ class Follower:
         gone = set(self.names).difference(present)
         appeared = set(present).difference(self.names)
         self.names = present
-        return await self._compare([*appeared, *gone, *self._chosen(present)])
+        seen = await self._compare([*appeared, *gone, *self._chosen(present)])
+        await self._look_at_arrays()
+        return seen
 
     def _chosen(self, present: Sequence[str]) -> list[str]:
         """Return the keys whose turn it is, those that somebody sees first; all of them at the beginning."""
@@ -237,20 +252,68 @@ class Follower:
 
     def _compare_one(self, name: str, text: bytes | None) -> None:
         if text is not None and len(text) > _LARGE:
-            self._seldom[name] = time.monotonic() + _SELDOM
+            self._seldom[name] = time.monotonic() + 4 * len(text) / _LOOK_BYTES
         if not self._history.knows(name):
             self._history.begin(name, None if self._complete else text)
         with suppress(BadData):
-            if not self._history.differs(name, text, time.time()):
-                return
+            if self._history.differs(name, text, time.time()):
+                self._differs(name, text)
+            elif text is not None and name not in self._unsure and marked(text):
+                self._unsure[name] = _array_bytes(tree_of(text, name))
+        self._history.remember(name, text)
+
+    def _differs(self, name: str, text: bytes | None) -> None:
+        when = time.time()
+        self._digests.pop(name, None)
         if text is None:
-            self._history.add((name,), MISSING, 0, time.time())
-        elif b"$ship " in text:
+            self._history.add((name,), MISSING, 0, when)
+        elif marked(text):
+            self._history.add((name,), PENDING, 0, when)
             self._dirty.setdefault((name,))
             self._news.set()
+        elif len(text) <= _LARGE or self._allowance.take(len(text)):
+            self._history.add((name,), tree_of(text, name), len(text), when)
         else:
-            with suppress(ReemError):
-                self._history.add((name,), tree_of(text, name), len(text), time.time())
+            self._history.add((name,), PENDING, 0, when)
+
+    async def _look_at_arrays(self) -> None:
+        """Read the arrays of documents whose text is the same: what is only stored is told by nothing else."""
+        while self._unsure:
+            name, size = next(iter(self._unsure.items()))
+            if size > _LARGEST_LOOK:
+                self.doubtful.add(name)
+            elif not self._looks.take(size):
+                return  # those behind it wait too, else it never had its turn
+            else:
+                self.doubtful.discard(name)
+                with suppress(ReemError):
+                    await self._look_at_arrays_of(name)
+            self._unsure.pop(name, None)
+
+    async def _look_at_arrays_of(self, name: str) -> None:
+        heard, before = self._heard.get(name), self._digests.get(name)
+        tree = await DocumentReader(self._interface.session, name).read(())
+        found = await asyncio.to_thread(_digest, tree)
+        if self._heard.get(name) != heard:
+            return  # published meanwhile: this may be older
+        self._digests[name] = found
+        if before is not None and before != found:
+            kept = tree if self._allowance.take(_array_bytes(tree)) else strip(tree)
+            self._history.add((name,), kept, weight(kept), time.time())
+
+
+def _array_bytes(tree: Any) -> int:
+    """Return how many bytes the arrays in a tree have."""
+    return sum([leaf_of(it).size for _, it in walk(tree, ()) if isinstance(it, Leaf | np.ndarray | bytes)])
+
+
+def _digest(tree: Any) -> bytes:
+    """Return what tells the arrays in a tree from others of the same shapes at the same places."""
+    total = hashlib.blake2b(digest_size=16)
+    for _, it in walk(tree, ()):
+        if isinstance(it, np.ndarray | bytes):
+            total.update(it if isinstance(it, bytes) else it.tobytes())
+    return total.digest()
 
 
 def _place(ordered: Sequence[str], name: str) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import secrets
 import socket
@@ -13,7 +14,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["LOOPBACK", "Guard", "is_loopback", "new_token", "own_names", "same_origin"]
+__all__ = ["LOOPBACK", "Guard", "is_loopback", "new_token", "own_address", "own_names", "same_origin"]
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 """The names under which a browser on this machine reaches it."""
@@ -51,6 +52,18 @@ def own_names() -> frozenset[str]:
     """Return the names of this machine, beside its addresses, that a browser elsewhere may use."""
     name = socket.gethostname().lower()
     return LOOPBACK | {name, name.partition(".")[0], f"{name.partition('.')[0]}.local", socket.getfqdn().lower()}
+
+
+def own_address(bound: str) -> str:
+    """Return the address of this machine at which others reach what is bound to all of them; nothing is sent.
+
+    Which one the kernel would use to reach the world; without any network, the name of this machine.
+    """
+    family, far = (socket.AF_INET6, "2001:db8::1") if ":" in bound else (socket.AF_INET, "192.0.2.1")
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((far, 9))  # of a datagram socket, only a choice of addresses
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
 
 
 def same_origin(headers: Headers) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from bisect import bisect_right
 from collections import Counter, deque
@@ -11,7 +12,7 @@ from typing import Any
 
 from ..plan.paths import Path
 from ..plan.trees import MISSING
-from .timeline import UNKNOWN, Change, Kept, Timeline
+from .timeline import PENDING, UNKNOWN, Change, Kept, Timeline
 from .trees import same, tree_of
 
 __all__ = ["History"]
@@ -51,10 +52,13 @@ class History:
 
     # --- what happened
 
-    def add(self, path: Path, value: Any, size: int, when: float) -> None:
-        """Note a change: `value` is what is at `path` since; MISSING or PENDING stand for what they say."""
+    def add(self, path: Path, value: Any, size: int, when: float, *, answer: bool = False) -> None:
+        """Note a change: `value` is what is at `path` since; MISSING or PENDING stand for what they say.
+
+        It may be the `answer` to one that was PENDING.
+        """
         line = self._line(str(path[0]))
-        change = Change(when, path, value, size + _OVERHEAD)
+        change = Change(when, path, value, size + _OVERHEAD, answer)
         line.add(change)
         self._all.append(change)
         self.bytes += change.size
@@ -69,17 +73,27 @@ class History:
         self.bytes += line.base_size + _OVERHEAD
 
     def differs(self, name: str, text: bytes | None, when: float) -> bool:
-        """Return whether a document's text, read just now, is not what the changes led to; remembers it."""
+        """Return whether a document's text, read just now, is not what the changes led to.
+
+        Of a long one nothing is known at first: it differs from when on it was `remember`ed.
+        """
         line = self._lines.get(name)
         if line is None:
             return text is not None
-        if text is not None and (len(text) > _LARGEST_TEXT or line.text == text):
+        if text is None:
+            return line.state(when) is not MISSING
+        if line.text == _mark(text):
             return False
         state = line.state(when)
-        if text is None:
-            return state is not MISSING
-        line.text = text
-        return state is MISSING or state is UNKNOWN or not same(tree_of(text, name), state)
+        if state is UNKNOWN:
+            return line.text is not None or len(text) <= _LARGEST_TEXT
+        return state is MISSING or not same(tree_of(text, name), state)
+
+    def remember(self, name: str, text: bytes | None) -> None:
+        """Note what was read last, and is in the changes."""
+        line = self._lines.get(name)
+        if line is not None:
+            line.text = None if text is None else _mark(text)
 
     def _line(self, name: str) -> Timeline:
         if name not in self._lines:
@@ -169,7 +183,7 @@ class History:
         if line is None:
             return None
         over = min(over, max(at - self.start, 1.0))
-        count = line.upto(at) - line.upto(at - over)
+        count = sum([not change.answer for change in line.changes[line.upto(at - over) : line.upto(at)]])
         return count / over if count else None
 
     def between(self, since: float, until: float) -> Iterator[Change]:
@@ -188,13 +202,19 @@ class History:
     def times(self, path: Path) -> list[float]:
         """Return when there were changes that concern `path` (all of them for the root), in order."""
         if not path:
-            return [change.time for change in self._all]
+            return [change.time for change in self._all if not change.answer]
         line = self._lines.get(str(path[0]))
         return line.times(path) if line else []
 
+    def _seen(self, path: Path) -> list[float]:
+        if not path:
+            return [change.time for change in self._all if change.value is not PENDING]
+        line = self._lines.get(str(path[0]))
+        return line.seen(path) if line else []
+
     def step(self, at: float, forward: bool, path: Path) -> float | None:
-        """Return the instant of the next change after `at`, or of the last one before it."""
-        times = self.times(path)
+        """Return the next instant after `at`, or the last one before it, from which on something else is to be seen."""
+        times = self._seen(path)
         if forward:
             index = bisect_right(times, at + 1e-6)
             return times[index] if index < len(times) else None
@@ -210,3 +230,8 @@ class History:
             tree = line.state(at)
             if tree is not UNKNOWN and tree is not MISSING:
                 yield name, tree
+
+
+def _mark(text: bytes) -> bytes:
+    """Return what tells a text from others: itself, or a digest of a long one."""
+    return text if len(text) <= _LARGEST_TEXT else hashlib.blake2b(text, digest_size=16).digest()

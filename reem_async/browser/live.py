@@ -7,6 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from redis.exceptions import ConnectionError as RedisConnectionError
+
 from ..catalog import outline
 from ..connection import RedisInterface
 from ..document import DocumentReader
@@ -87,7 +89,12 @@ class LiveSource:
         """Return what is at each path: three round trips at most."""
         when = time.time() if at is None else at
         now = [path for path in paths if at is None or self.history.unchanged(str(path[0]), at)]
-        found = dict(zip(now, await self._peek(now), strict=True))
+        try:
+            found = dict(zip(now, await self._peek(now), strict=True))
+        except (RedisConnectionError, OSError):
+            if at is None:
+                raise
+            found = {}  # the past is known without a server
         for path in paths:
             if path not in found:
                 found[path] = self._past(path, when)
@@ -127,10 +134,14 @@ class LiveSource:
 
     async def _keys(self, path: Path, at: float | None) -> Sequence[str | int]:
         if at is None or self.history.unchanged(str(path[0]), at):
-            keys = await keys_at(self.interface.session, path)
-            if keys is None:
-                raise MissingKey(f"nothing is stored at {show(path)}, or nothing is below it")
-            return range(keys) if isinstance(keys, int) else keys
+            try:
+                keys = await keys_at(self.interface.session, path)
+                if keys is None:
+                    raise MissingKey(f"nothing is stored at {show(path)}, or nothing is below it")
+                return range(keys) if isinstance(keys, int) else keys
+            except (RedisConnectionError, OSError):
+                if at is None:
+                    raise
         value = self.history.tree(path, at)
         if value is UNKNOWN:
             raise NotKept(f"{show(path)} was too large to be kept, so its past cannot be shown")
@@ -142,8 +153,13 @@ class LiveSource:
 
     async def value(self, path: Path, at: float | None) -> Sample:
         """Return the value at a path, arrays included; readings of the same moment are shared."""
-        if at is None or self.history.unchanged(str(path[0]), at):
-            return Sample(await self._read(path))
+        name = str(path[0])
+        if at is None or (self.history.unchanged(name, at) and name not in self._follower.doubtful):
+            try:
+                return Sample(await self._read(path))
+            except (RedisConnectionError, OSError):
+                if at is None:
+                    raise
         kept = self.history.kept(path, at)
         if kept.value is UNKNOWN:
             raise NotKept(f"{show(path)} is not kept for this instant")
@@ -181,7 +197,7 @@ class LiveSource:
         if node.count is None and node.kind not in ("str", "int", "float", "bool", "NoneType"):
             raise BadType(f"{show(path)} is of type {node.kind}, which a page cannot write; use Python")
         if node.count is not None and await self._has_leaves(path):
-            raise BadType(f"{show(path)} holds arrays, which a page cannot write; edit what is below it")
+            raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
         accessor: Any = self._space
         for key in path:
             accessor = accessor[key]

@@ -118,7 +118,7 @@ class LogSource:
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
         """Return Python that reads a path from the recording."""
-        code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path)!r})\n"
+        code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path.resolve())!r})\n"
         when = "log.end" if at is None else repr(at)
         return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
 

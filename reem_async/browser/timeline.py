@@ -32,12 +32,14 @@ class Change(NamedTuple):
         path: What changed, top-level key first.
         value: What is there since; MISSING if it was removed, PENDING if it is not known.
         size: About how many bytes this takes in memory.
+        answer: It is what was found where a change was announced before: not one more change.
     """
 
     time: float
     path: Path
     value: Any
     size: int
+    answer: bool = False
 
 
 class Kept(NamedTuple):
@@ -60,7 +62,7 @@ class Timeline:
 
     Attributes:
         changes: The changes since, oldest first.
-        text: The document's text when it was last looked at.
+        text: The document's text when it was last looked at, a digest of a long one; None if it changed since.
         base_size: About how many bytes `base` takes.
         whole: All of the key is known, after the last change at least.
     """
@@ -81,6 +83,7 @@ class Timeline:
     def add(self, change: Change) -> None:
         """Append a change; times never go back."""
         number = self._gone + len(self.changes)
+        self.text = None
         self.changes.append(change)
         self._times.append(max(change.time, self._times[-1] if self._times else 0.0))
         (self._pending if change.value is PENDING else self._known).add(change.path, number)
@@ -167,7 +170,12 @@ class Timeline:
     def times(self, path: Path) -> list[float]:
         """Return when there were changes that concern `path`, in order."""
         numbers = self._known.of(path) + self._pending.of(path)
-        return sorted([self._times[number - self._gone] for number in numbers])
+        answers = {number for number in numbers if self.changes[number - self._gone].answer}
+        return sorted([self._times[number - self._gone] for number in numbers if number not in answers])
+
+    def seen(self, path: Path) -> list[float]:
+        """Return from when on there was something else to be seen at `path`, in order."""
+        return [self._times[number - self._gone] for number in self._known.of(path)]
 
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
         """Yield what was at `path`, at `start` and after each change that may have changed it."""

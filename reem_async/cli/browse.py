@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.cli.options import DEFAULT_URL, Namespace, Url
-from reem_async.cli.running import CALL_SECONDS, Refused, address_of, guarded
+from reem_async.cli.running import CALL_SECONDS, USAGE, Refused, address_of, guarded
 
 if TYPE_CHECKING:
     from reem_async.browser import Source
@@ -63,6 +63,8 @@ def browse(
 
     def work() -> int | None:
         _check_packages(log)
+        if log is not None and allow_write:
+            raise Refused("a recording is not changed: leave out --allow-write, or --log", USAGE)
         asyncio.run(_serve(_source(url, namespace, log, buffer, memory), host, port, allow_write, open_))
         return None
 
@@ -118,10 +120,10 @@ def _has_screen() -> bool:
 
 
 def _address(host: str, port: int, token: str | None) -> str:
-    from reem_async.browser.guard import own_names
+    from reem_async.browser.guard import own_address
 
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
-        host = max(own_names(), key=len)
+        host = own_address(host)
     name = f"[{host}]" if ":" in host else host
     return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
 

@@ -18,7 +18,11 @@ export class ArrayView {
     parent.append(this.tabs, this.tools, this.stage, this.late, this.facts);
   }
 
-  chosen() { return this.slices[this.view]; }
+  // What part of it a file of this format holds: a table and a picture have two axes, the others all of it.
+  chosen(format) { return { csv: this.slices.table, png: this.slices.image }[format]; }
+
+  // Whether there can be such a file.
+  offers(format) { return !this.about || { csv: "table", png: "image" }[format] === undefined || { csv: "table", png: "image" }[format] in this.about.views; }
 
   async update(node, signal) {
     const about = await getJson("array", { path: this.address, at: this.app.at }, signal);
@@ -124,6 +128,7 @@ export class ArrayView {
   imageStage() {
     this.img = el("img", { alt: `Picture of the array at ${this.address}` });
     this.scale = el("canvas", { width: 256, height: 1 });
+    this.scaleShown = null;
     this.lowText = el("span");
     this.highText = el("span");
     this.scaleBox = el("div", { class: "scale" }, this.lowText, this.scale, this.highText);

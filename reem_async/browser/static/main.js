@@ -52,6 +52,7 @@ const app = {
     this.path = address;
     if (push) history.pushState(null, "", this.url());
     document.body.classList.toggle("has-view", address !== "");
+    document.body.classList.remove("searching");
     document.title = `${address || config.title} · REEM`;
     view.show(address);
     time.loadActivity();
@@ -120,6 +121,7 @@ class Finder {
 
   changed() {
     this.element.replaceChildren();
+    document.body.classList.toggle("searching", this.shown);
     this.element.classList.toggle("found", this.shown);
     tree.rows.clear();
     app.refresh();
@@ -129,8 +131,12 @@ class Finder {
     const text = this.box.value.trim();
     const answer = await getJson("search", { q: text, at: app.at });
     if (text !== this.box.value.trim()) return;
-    tree.branches = new Map([["", { address: "", total: answer.found.length, start: 0, nodes: answer.found.map((node) => ({ ...node, label: node.shown, count: null, text: node.text || (node.count === null ? "" : `${node.count} items`) })) }]]);
-    if (answer.found.length) { tree.render(); return; }
+    tree.branches = new Map([["", { address: "", total: answer.found.length, start: 0, nodes: answer.found.map((node) => ({ ...node, label: node.shown, count: null, text: node.text || (node.count === null ? "" : `${node.count} ${node.count === 1 ? "item" : "items"}`) })) }]]);
+    if (answer.found.length) {
+      tree.render();
+      if (answer.found.length >= answer.most) this.element.append(el("p", { class: "hint empty" }, `The first ${answer.most}; more letters find less.`));
+      return;
+    }
     this.element.replaceChildren(el("p", { class: "empty" }, `No key has “${text}” in its name.`));
   }
 
@@ -163,16 +169,33 @@ function listen() {
   };
   events.onerror = () => {
     lost("page", "the program behind this page (reem browse) does not answer. Trying again…");
-    if (events.readyState === EventSource.CLOSED) setTimeout(listen, 2000);
+    if (events.readyState === EventSource.CLOSED) refused().then(() => setTimeout(listen, 2000));
   };
 }
 
+// Why there are no events: each start of the program has a token of its own.
+async function refused() {
+  try {
+    await getJson("activity", {});
+  } catch (error) {
+    if (error.status === 403) lost("page", "this page is of an earlier start of reem browse. Open the address that it prints now.");
+  }
+}
+
 setInterval(() => {
-  if (performance.now() - app.heard > SILENCE && !document.hidden) lost("page", "the program behind this page (reem browse) is silent. Trying again…");
+  if (!troubles.has("page") && performance.now() - app.heard > SILENCE && !document.hidden) lost("page", "the program behind this page (reem browse) is silent. Trying again…");
 }, 1000);
 
+function decoded(text) {
+  try {
+    return decodeURIComponent(text);
+  } catch { // a stray %: the program says that there is no such path
+    return text;
+  }
+}
+
 function route() {
-  const address = location.pathname.startsWith("/view/") ? decodeURIComponent(location.pathname.slice(6)) : "";
+  const address = location.pathname.startsWith("/view/") ? decoded(location.pathname.slice(6)) : "";
   const at = Number(new URLSearchParams(location.search).get("at"));
   app.at = at ? Math.min(Math.max(at, app.span.start), app.span.end) : null;
   app.go(address, false);
@@ -183,6 +206,7 @@ function onKey(event) {
   if (event.ctrlKey || event.metaKey || event.altKey || typing || document.querySelector("dialog[open]")) return;
   const pressed = event.target.closest?.("button, summary, a");
   if (event.key === "/") { finder.box.focus(); finder.box.select(); }
+  else if (event.key === "Escape" && finder.shown) finder.clear();
   else if (event.key === "?") document.getElementById("help").showModal();
   else if (event.key === "ArrowLeft") time.step(false, event.shiftKey);
   else if (event.key === "ArrowRight") time.step(true, event.shiftKey);

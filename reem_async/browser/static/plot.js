@@ -1,12 +1,12 @@
 // Lines and bars on a canvas: axes, a crosshair with the values under it, and a mark for the instant shown.
 import { clockText, el, numberText } from "./util.js";
 
-const LEFT = 62, RIGHT = 12, TOP = 10, BOTTOM = 24;
+const NARROW = 40, RIGHT = 12, TOP = 10, BOTTOM = 24;
 
 const MINUTES = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 21600, 86400];
 
 function ticks(low, high, most, clock = false) {
-  const span = high - low || 1;
+  const span = Math.min(high - low || 1, Number.MAX_VALUE);
   const raw = span / Math.max(most, 1);
   const power = 10 ** Math.floor(Math.log10(raw));
   const steps = clock && raw > 1 ? MINUTES : [1, 2, 5, 10].map((each) => each * power);
@@ -16,9 +16,12 @@ function ticks(low, high, most, clock = false) {
   return { step, found };
 }
 
-function tickText(value, step) {
-  const digits = Math.max(0, Math.min(8, -Math.floor(Math.log10(step) + 1e-9)));
-  return Math.abs(value) >= 1e6 || (step < 1e-6 && value !== 0) ? value.toExponential(2) : value.toFixed(digits);
+// Enough digits to tell one tick from the next.
+export function tickText(value, step) {
+  if (Math.abs(value) < step * 1e-6) return "0";
+  const least = Math.floor(Math.log10(step) + 1e-9), most = Math.floor(Math.log10(Math.abs(value)));
+  if (most < 12 && least >= -8) return value.toFixed(Math.max(0, -least));
+  return value.toExponential(Math.max(0, Math.min(15, most - least)));
 }
 
 export class Plot {
@@ -31,6 +34,7 @@ export class Plot {
     this.data = { names: [], times: [], lines: [] };
     this.hover = null;
     this.cursor = null;
+    this.left = NARROW;
     new ResizeObserver(() => this.draw()).observe(this.canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
     this.canvas.addEventListener("pointermove", (event) => this.point(event));
@@ -47,7 +51,7 @@ export class Plot {
 
   xAt(event) {
     const box = this.canvas.getBoundingClientRect();
-    const part = (event.clientX - box.left - LEFT) / Math.max(box.width - LEFT - RIGHT, 1);
+    const part = (event.clientX - box.left - this.left) / Math.max(box.width - this.left - RIGHT, 1);
     return this.x0 + Math.min(Math.max(part, 0), 1) * (this.x1 - this.x0);
   }
 
@@ -68,9 +72,9 @@ export class Plot {
       if (value > high) high = value;
     }
     if (low > high) [low, high] = [0, 1];
-    const pad = (high - low) * 0.06 || Math.abs(high) * 0.05 || 1;
-    this.y0 = low - pad;
-    this.y1 = high + pad;
+    const pad = (high / 2 - low / 2) * 0.12 || Math.abs(high) * 0.05 || 1;
+    this.y0 = Math.max(low - pad, -Number.MAX_VALUE);
+    this.y1 = Math.min(high + pad, Number.MAX_VALUE);
     this.low = low;
     this.high = high;
   }
@@ -95,34 +99,37 @@ export class Plot {
   colour(name) { return this.style.getPropertyValue(name).trim(); }
 
   place(width, height) {
-    const x = (value) => LEFT + ((value - this.x0) / (this.x1 - this.x0)) * (width - LEFT - RIGHT);
-    const y = (value) => height - BOTTOM - ((value - this.y0) / (this.y1 - this.y0)) * (height - TOP - BOTTOM);
+    const x = (value) => this.left + ((value - this.x0) / (this.x1 - this.x0)) * (width - this.left - RIGHT);
+    // Halves: the whole way from -1e308 to 1e308 is infinite.
+    const y = (value) => height - BOTTOM - ((value / 2 - this.y0 / 2) / (this.y1 / 2 - this.y0 / 2)) * (height - TOP - BOTTOM);
     return { x, y };
   }
 
   axes(context, width, height) {
-    const { x, y } = this.place(width, height);
     context.font = `11px ${this.colour("--mono")}`;
+    const rows = ticks(this.y0, this.y1, (height - TOP - BOTTOM) / 45);
+    const words = rows.found.map((at) => tickText(at, rows.step));
+    this.left = Math.max(NARROW, ...words.map((word) => Math.ceil(context.measureText(word).width) + 14));
+    const { x, y } = this.place(width, height);
     context.strokeStyle = this.colour("--line");
     context.fillStyle = this.colour("--faint");
     context.lineWidth = 1;
     context.textAlign = "right";
     context.textBaseline = "middle";
-    const rows = ticks(this.y0, this.y1, (height - TOP - BOTTOM) / 45);
-    for (const at of rows.found) {
+    rows.found.forEach((at, index) => {
       context.beginPath();
-      context.moveTo(LEFT, Math.round(y(at)) + 0.5);
+      context.moveTo(this.left, Math.round(y(at)) + 0.5);
       context.lineTo(width - RIGHT, Math.round(y(at)) + 0.5);
       context.stroke();
-      context.fillText(tickText(at, rows.step), LEFT - 7, y(at));
-    }
+      context.fillText(words[index], this.left - 7, y(at));
+    });
     context.textBaseline = "top";
     context.textAlign = "center";
     const clock = Boolean(this.options.time), offset = clock ? Math.floor(this.x0 / 3600) * 3600 : 0;
-    const columns = ticks(this.x0 - offset, this.x1 - offset, (width - LEFT - RIGHT) / 90, clock);
+    const columns = ticks(this.x0 - offset, this.x1 - offset, (width - this.left - RIGHT) / 90, clock);
     for (const at of columns.found) {
       const text = clock ? clockText(at + offset + 1e-6, columns.step < 1 ? 1 : 0) : tickText(at, columns.step);
-      const where = Math.min(Math.max(x(at + offset), LEFT + 14), width - RIGHT - 28);
+      const where = Math.min(Math.max(x(at + offset), this.left + 14), width - RIGHT - 28);
       context.fillText(text, where, height - BOTTOM + 7);
     }
   }

@@ -1,7 +1,9 @@
 // The tree of keys: rows made once and changed in place, branches loaded when they are opened, long ones in pages.
-import { addressUrl, ageText, bytesText, el, getJson, icon, setText, store, stored } from "./util.js";
+import { Spark } from "./spark.js";
+import { addressUrl, ageText, bytesText, el, getJson, icon, setText, store, stored, toast } from "./util.js";
 
 const PAGE = 100;
+const BRANCHES = 90; // the program answers for 100 at a time
 const PLAIN = ["int", "float", "bool", "NoneType"];
 const RIGHT = "M5 2l6 6-6 6z";
 
@@ -36,17 +38,14 @@ export class Tree {
     this.collect(this.root, 1, wanted, 0);
     const root = this.branches.get(this.root);
     if (!wanted.length) wanted.push(this.emptiness(root));
+    const kept = new Set(wanted);
+    // What is gone goes first: a row that is moved would lose the keyboard's focus.
+    for (const it of [...this.element.childNodes]) if (!kept.has(it)) it.remove();
     let position = this.element.firstChild;
     for (const it of wanted) {
       if (it === position) position = position.nextSibling;
       else this.element.insertBefore(it, position);
     }
-    while (position) {
-      const next = position.nextSibling;
-      position.remove();
-      position = next;
-    }
-    const kept = new Set(wanted);
     for (const [address, row] of this.rows) if (!kept.has(row)) this.rows.delete(address);
     this.focusable(wanted);
   }
@@ -96,6 +95,7 @@ export class Tree {
     parts.value.className = `value is-${node.text.startsWith("[") && container ? "float" : node.kind.replace(/\W/g, "")}`;
     parts.value.title = `${node.kind}  ${node.text}`;
     setText(parts.size, container || PLAIN.includes(node.kind) ? "" : bytesText(node.size));
+    parts.spark.show(node, this.app.now());
     this.age(parts.age, node);
     return row;
   }
@@ -112,9 +112,10 @@ export class Tree {
     const twist = el("button", { class: "twist", tabIndex: -1, type: "button", "aria-label": `Open or close ${node.label}` }, icon(RIGHT));
     const leaf = el("span", { class: "leaf" });
     const key = el("span", { class: "key", title: node.label }, twist, leaf, el("bdi", {}, node.label));
-    const value = el("bdi", { class: "value" }), size = el("span", { class: "size" }), age = el("span", { class: "age" });
-    const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "" }, key, value, size, age);
-    row.parts = { key, twist, leaf, value, size, age };
+    const value = el("bdi", { class: "value" }), size = el("span"), age = el("span", { class: "age" });
+    const spark = new Spark();
+    const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "" }, key, value, el("span", { class: "size" }, size, spark.canvas), age);
+    row.parts = { key, twist, leaf, value, size, spark, age };
     row.address = node.address;
     row.dataset.address = node.address;
     return row;
@@ -149,10 +150,11 @@ export class Tree {
   }
 
   toggle(address, open = !this.open.has(address)) {
+    if (open && this.open.size >= BRANCHES) return toast(`${BRANCHES} branches are open: close one first`);
     if (open) this.open.set(address, 0);
     else this.open.delete(address);
     this.save();
-    this.app.refresh();
+    return this.app.refresh();
   }
 
   onClick(event) {

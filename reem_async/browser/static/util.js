@@ -51,8 +51,12 @@ async function checked(response) {
 }
 
 async function ask(what, values, signal) {
+  return fetched(`/api/${what}?${query(values)}`, { signal });
+}
+
+export async function fetched(url, options) {
   try {
-    return await checked(await fetch(`/api/${what}?${query(values)}`, { signal }));
+    return await checked(await fetch(url, options));
   } catch (error) {
     if (error instanceof ApiError || error.name === "AbortError") throw error;
     throw new ApiError("The program behind this page does not answer.", 0);
@@ -75,11 +79,16 @@ export async function postWrite(path, valueText, key) {
   // The text goes as it is: numbers beyond 2^53 would change in JavaScript.
   const body = `{"path":${JSON.stringify(path)},"value":${valueText}}`;
   const headers = { "content-type": "application/json", "x-reem-key": key };
-  return checked(await fetch("/api/write", { method: "POST", headers, body }));
+  return fetched("/api/write", { method: "POST", headers, body });
 }
 
 export function setText(it, text) {
   if (it.textContent !== text) it.textContent = text;
+}
+
+// Text whose characters all show, as the program's own texts have it.
+export function visible(text) {
+  return text.replace(/[\u0000-\u001f\u007f-\u009f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]/g, (it) => `\\u${it.charCodeAt(0).toString(16).padStart(4, "0")}`);
 }
 
 export function bytesText(count) {

@@ -2,10 +2,11 @@
 import { ArrayView } from "./arrays.js";
 import { Plot } from "./plot.js";
 import { Tree } from "./tree.js";
-import { addressUrl, ageText, bytesText, copy, el, getJson, getPicture, postWrite, query, setText, toast } from "./util.js";
+import { addressUrl, ageText, bytesText, copy, el, fetched, getJson, getPicture, postWrite, query, setText, toast, visible } from "./util.js";
 
 const NAMES = { NoneType: "null", str: "text", int: "whole number", float: "number", bool: "true or false", numpy: "array" };
 const SCALARS = ["str", "int", "float", "bool", "NoneType"];
+const NUMBERS = ["int", "float", "bool"];
 
 export class View {
   constructor(element, app) {
@@ -37,11 +38,15 @@ export class View {
       const node = await getJson("node", { path: address, at: app.at }, signal);
       if (address !== this.address) return;
       if (node.address !== address) { app.go(node.address, false); history.replaceState(null, "", app.url()); return; }
-      const shape = `${node.kind}|${node.kind === "numpy" ? node.text : ""}`;
-      if (shape !== this.shape) this.build(node, shape);
+      const shape = `${NUMBERS.includes(node.kind) ? "number" : node.kind}|${node.kind === "numpy" ? node.text : ""}`;
+      const kept = this.editor?.open && this.shape !== "missing" && shape !== this.shape; // what is being typed is not lost
+      if (shape !== this.shape && !kept) this.build(node, shape);
       this.facts(node);
-      this.note.hidden = true;
-      await this.body.update(node, signal);
+      this.main.classList.remove("gone");
+      this.note.hidden = !kept;
+      if (kept) setText(this.note, `It is ${NAMES[node.kind] ?? node.kind} now: ${node.text}. It is shown again once Edit is closed.`);
+      else await this.body.update(node, signal);
+      this.offer();
     } catch (error) {
       if (error.name === "AbortError" || address !== this.address) return;
       if (![400, 404, 409, 422].includes(error.status)) throw error;
@@ -58,16 +63,19 @@ export class View {
     }
     setText(this.note, message);
     this.note.hidden = false;
+    setText(this.what, "");
+    this.main.classList.add("gone");
   }
 
   frame(node) {
     const crumbs = [];
-    const parts = this.address.match(/\.?[^.[\]"]+|\[\d+\]|\[?"(?:[^"\\]|\\.)*"\]?/g) ?? [this.address];
+    const parts = this.address.match(/\.?[^.[\]"]+|\[-?\d+\]|\[?"(?:[^"\\]|\\.)*"\]?/g) ?? [this.address];
     let upto = "";
     parts.forEach((part, index) => {
       upto += part;
       const here = upto.replace(/^\./, "");
-      crumbs.push(index === parts.length - 1 ? el("bdi", {}, part) : el("a", { class: "crumb", href: addressUrl(here), "data-go": here }, el("bdi", {}, part)));
+      const name = el("bdi", {}, visible(part));
+      crumbs.push(index === parts.length - 1 ? name : el("a", { class: "crumb", href: addressUrl(here), "data-go": here }, name));
     });
     this.what = el("span", { class: "what" });
     this.note = el("p", { class: "note", role: "status", hidden: true });
@@ -93,18 +101,43 @@ export class View {
     setText(this.what, words.filter(Boolean).join(" · "));
     this.node = node;
     if (this.editor) this.editor.hidden = this.app.at !== null;
-    if (this.downloads) for (const link of this.downloads) link.href = this.link(link.dataset.format);
+    this.snippet?.(node.snippets ?? {});
+  }
+
+  // The files that there can be of what is shown now.
+  offer() {
+    for (const link of this.downloads ?? []) {
+      link.href = this.link(link.dataset.format);
+      link.hidden = !(this.body?.offers?.(link.dataset.format) ?? true);
+    }
   }
 
   link(format) {
-    return `/view/${encodeURIComponent(this.address)}?${query({ format, at: this.app.at, slice: format === "json" ? null : this.body?.chosen?.() })}`;
+    return `/view/${encodeURIComponent(this.address)}?${query({ format, at: this.app.at, slice: this.body?.chosen?.(format) })}`;
+  }
+
+  // Fetched here and not by the browser, which would not tell why there is no such file.
+  async save(event) {
+    event.preventDefault();
+    const link = event.currentTarget;
+    try {
+      const response = await fetched(link.href);
+      const name = /filename\*=UTF-8''([^;]*)/.exec(response.headers.get("content-disposition") ?? "")?.[1];
+      const url = URL.createObjectURL(await response.blob());
+      const file = el("a", { href: url, download: name ? decodeURIComponent(name) : "" });
+      file.click();
+      setTimeout(() => URL.revokeObjectURL(url), 60000);
+    } catch (error) {
+      toast(error.message);
+    }
   }
 
   extras(node) {
     const extras = [];
-    if (this.app.config.write && [...SCALARS, "dict", "list"].includes(node.kind)) extras.push((this.editor = this.editCard()));
-    const formats = { numpy: ["npy", "csv", "png", "json"], list: ["json", "csv", "npy"] }[node.kind] ?? ["json"];
-    this.downloads = formats.map((format) => el("a", { "data-format": format, href: this.linkFirst(format), download: "" }, format));
+    this.editor = this.snippet = null;
+    if (this.app.config.write && [...SCALARS, "dict", "list"].includes(node.kind) && node.editable !== false) extras.push((this.editor = this.editCard()));
+    const formats = { numpy: ["npy", "csv", "png", "json"], list: ["json", "csv", "npy"], bytes: ["bin", "json"] }[node.kind] ?? ["json"];
+    this.downloads = formats.map((format) => el("a", { "data-format": format, href: this.linkFirst(format), onclick: (event) => this.save(event) }, format));
     const snippet = Object.keys(node.snippets ?? {}).length ? this.snippetCard(node.snippets) : null;
     const files = el("div", { class: "card row2" }, el("span", { class: "what" }, "Download"), ...this.downloads);
     return [...extras, snippet, files].filter(Boolean);
@@ -114,6 +147,7 @@ export class View {
 
   snippetCard(snippets) {
     const names = Object.keys(snippets), code = el("pre", {}, snippets[names[0]]);
+    this.snippet = (newer) => { snippets = newer; setText(code, snippets[choose.value] ?? ""); };
     const choose = el("select", { "aria-label": "Front", onchange: () => { code.textContent = snippets[choose.value]; } }, ...names.map((name) => el("option", { value: name }, name)));
     return el("details", { class: "card" }, el("summary", {}, "Read it with Python"),
       el("div", { class: "tools" }, choose), el("div", { class: "snippet" }, code, el("button", { type: "button", onclick: () => copy(code.textContent) }, "Copy")));
@@ -122,14 +156,23 @@ export class View {
   editCard() {
     const area = el("textarea", { "aria-label": "New value, as JSON", spellcheck: false, rows: 3 });
     const write = el("button", { type: "button", class: "primary", onclick: () => this.write(area.value) }, "Write…");
-    const card = el("details", { class: "card edit", ontoggle: async () => { if (card.open) area.value = await this.jsonText(); } },
+    const card = el("details", { class: "card edit", ontoggle: () => card.open ? this.attempt(async () => { area.value = await this.jsonText(); }) : this.app.refresh() },
       el("summary", {}, "Edit"), area, el("div", { class: "tools" }, write, el("span", {}, "JSON, such as 1.5, true, \"text\" or {\"a\": [1, 2]}")));
     return card;
   }
 
   async jsonText() {
     if (SCALARS.includes(this.node.kind) && this.node.kind !== "str") return this.node.text;
-    return (await fetch(this.linkFirst("json"))).text();
+    return (await fetched(this.linkFirst("json"))).text();
+  }
+
+  async attempt(work) {
+    try {
+      return await work();
+    } catch (error) {
+      toast(error.message);
+      return undefined;
+    }
   }
 
   async write(text) {
@@ -139,21 +182,21 @@ export class View {
       toast(`Not JSON: ${error.message}`);
       return;
     }
+    const before = await this.attempt(() => this.jsonText());
+    if (before === undefined) return;
     const dialog = document.getElementById("confirm");
-    document.getElementById("confirm-path").textContent = this.address;
-    document.getElementById("confirm-old").textContent = (await this.jsonText()).slice(0, 2000);
+    document.getElementById("confirm-path").textContent = visible(this.address);
+    document.getElementById("confirm-old").textContent = before.slice(0, 2000);
     document.getElementById("confirm-new").textContent = text.slice(0, 2000);
     dialog.returnValue = "no";
     dialog.showModal();
     await new Promise((done) => dialog.addEventListener("close", done, { once: true }));
     if (dialog.returnValue !== "yes") return;
-    try {
+    await this.attempt(async () => {
       await postWrite(this.address, text, this.app.config.key);
       toast("Written");
       this.app.refresh();
-    } catch (error) {
-      toast(error.message);
-    }
+    });
   }
 }
 
@@ -231,8 +274,8 @@ class ListBody {
   }
 
   async update(node, signal) {
-    this.course.card.hidden = true;
     if (node.text) await this.course.update(signal);
+    else this.course.card.hidden = true;
     await this.tree.update(node, signal);
   }
 }
@@ -243,7 +286,7 @@ class BytesBody {
     this.address = address;
     this.image = el("img", { alt: `Picture at ${address}` });
     this.picture = el("div", { class: "picture", hidden: true }, this.image);
-    this.dump = el("pre", {});
+    this.dump = el("pre", { class: "bytes" });
     this.hex = el("details", { class: "card", open: true }, el("summary", {}, "Bytes"), this.dump);
     parent.append(this.picture, this.hex);
   }
