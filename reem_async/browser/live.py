@@ -7,12 +7,10 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from redis.exceptions import ConnectionError as RedisConnectionError
-
 from ..catalog import outline
 from ..connection import RedisInterface
 from ..document import DocumentReader
-from ..errors import BadType, MissingKey
+from ..errors import BadType, ConnectionLost, MissingKey, NotConnected, ServerNotReady
 from ..plan.paths import Path, show
 from ..plan.trees import MISSING
 from ..publish import PublishSpace
@@ -35,13 +33,16 @@ _SHARED_SECONDS = 0.2
 
 _WALKED = 200_000
 
+_AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
+"""What is raised while the server cannot be asked: its past is known all the same."""
+
 
 class LiveSource:
     """What a server holds, and what it held in the last seconds.
 
     Sees every update that is published. What a KeyValueStore writes is seen when the server is looked
-    at, about twice a second for some hundreds of keys. Arrays of the past are kept as far as the
-    budget allows.
+    at, about twice a second for some hundreds of keys, long documents and arrays as often as 1 MB a second
+    allows. Arrays of the past are kept as far as the budget allows.
 
     Args:
         interface: The server; closed with the source.
@@ -91,7 +92,7 @@ class LiveSource:
         now = [path for path in paths if at is None or self.history.unchanged(str(path[0]), at)]
         try:
             found = dict(zip(now, await self._peek(now), strict=True))
-        except (RedisConnectionError, OSError):
+        except _AWAY:
             if at is None:
                 raise
             found = {}  # the past is known without a server
@@ -139,7 +140,7 @@ class LiveSource:
                 if keys is None:
                     raise MissingKey(f"nothing is stored at {show(path)}, or nothing is below it")
                 return range(keys) if isinstance(keys, int) else keys
-            except (RedisConnectionError, OSError):
+            except _AWAY:
                 if at is None:
                     raise
         value = self.history.tree(path, at)
@@ -157,7 +158,7 @@ class LiveSource:
         if at is None or (self.history.unchanged(name, at) and name not in self._follower.doubtful):
             try:
                 return Sample(await self._read(path))
-            except (RedisConnectionError, OSError):
+            except _AWAY:
                 if at is None:
                     raise
         kept = self.history.kept(path, at)

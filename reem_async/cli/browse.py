@@ -52,7 +52,8 @@ def browse(
     The page is updated as things change. The slider goes back through the last seconds, or through a recording.
     Arrays are shown as images, lines, tables and histograms. It can only look, unless --allow-write is given.
 
-    What programs publish is kept for the slider; what they only store is looked at about twice a second.
+    What programs publish is kept for the slider; what they only store is looked at about twice a second, arrays as
+    often as 1 MB a second allows.
 
     Examples:
       reem browse
