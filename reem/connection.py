@@ -171,7 +171,11 @@ class RedisInterface:
         """Run one of the core's coroutines on a store to its end and return the result."""
         if self._direct.session.ships.asynchronous or self._background.inside:
             return self._wait(coroutine)
-        return finish(coroutine)
+        try:
+            return finish(coroutine)
+        except BaseException:
+            self._direct.session.transport.broken_off()
+            raise
 
     def _wait(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on the background loop and return the result."""

@@ -77,6 +77,9 @@ class KeyValueStore:
         self._static = False
 
     def __getitem__(self, key: str) -> Accessor:
+        return self._top(key)
+
+    def _top(self, key: object) -> Accessor:
         if type(key) is str and (known := self._tops.get(key)) is not None:
             return known
         session = self.interface.session
@@ -97,7 +100,7 @@ class KeyValueStore:
     def at(self, path: str) -> Accessor:
         """Return the accessor of a dotted path such as "foo.bar" or "foo.tiles[2]"; sends nothing."""
         key, *rest = parse(path) or ("",)
-        top = self[key]  # type: ignore[index]
+        top = self._top(key)
         return self._accessor(top._reader, top._writer, tuple(rest))
 
     async def get(self, path: str, default: Any = _NOTHING) -> Any:
@@ -141,7 +144,7 @@ class KeyValueStore:
             self._static = not set_value
             keys = list(self._tops)
         for key in keys:
-            self[key]._writer.static = not set_value
+            self._top(key)._writer.static = not set_value
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface,)

@@ -419,6 +419,65 @@ def test_ctrl_c_interrupts_a_blocking_call(server_url, key, blocked):
         process.communicate()
 
 
+def test_ctrl_c_anywhere_in_a_publish_keeps_no_other_thread_from_publishing(server_url, key):
+    """Also right after the lock was taken that keeps updates in order, and before it is given back.
+
+    (Python warns of coroutines that were interrupted before their first step.)
+    """
+    code = (
+        "import concurrent.futures, random, signal, sys, reem\n"
+        "url, key = sys.argv[1:]\n"
+        "armed = False\n"
+        "def ring(*_):\n"
+        "    global armed\n"
+        "    if armed: armed = False; raise KeyboardInterrupt\n"
+        "signal.signal(signal.SIGALRM, ring)\n"
+        "pspace, interrupts = reem.PublishSpace(reem.RedisInterface(url)), 0\n"
+        "with concurrent.futures.ThreadPoolExecutor(1) as other:\n"
+        "    for number in range(1500):\n"
+        "        try:\n"
+        "            try:\n"
+        "                armed = True\n"
+        "                signal.setitimer(signal.ITIMER_REAL, random.uniform(1e-5, 1.5e-4))\n"
+        "                pspace[key] = number\n"
+        "            finally:\n"
+        "                armed = False\n"
+        "                signal.setitimer(signal.ITIMER_REAL, 0)\n"
+        "        except KeyboardInterrupt:\n"
+        "            interrupts += 1\n"
+        "            if not interrupts % 3: other.submit(pspace[key].write, -number).result(10)\n"
+        "            pspace[key] = 0\n"
+        "print(interrupts > 200, interrupts)\n"
+    )
+    done = python(code, server_url, key(), flags=("-W", "ignore::RuntimeWarning"))
+    assert (done.stdout[:4], done.stderr) == ("True", "")
+
+
+def test_publishing_in_a_handler_of_signals_does_not_wait_for_itself(server_url, key):
+    """The publish that it interrupts is ended after it, and others go on."""
+    code = (
+        "import signal, sys, threading, reem\n"
+        "url, key = sys.argv[1:]\n"
+        "pspace, rings = reem.PublishSpace(reem.RedisInterface(url)), 0\n"
+        "def ring(*_):\n"
+        "    global rings\n"
+        "    rings += 1\n"
+        "    pspace[key] = 'bell'\n"
+        "    try: pspace[key]['no']['where'] = 1\n"
+        "    except reem.ReemError: pass\n"
+        "pspace[key] = 0\n"
+        "signal.signal(signal.SIGALRM, ring)\n"
+        "signal.setitimer(signal.ITIMER_REAL, 0.003, 0.003)\n"
+        "while rings < 50: pspace[key] = rings\n"
+        "signal.setitimer(signal.ITIMER_REAL, 0)\n"
+        "thread = threading.Thread(target=pspace[key].write, args=['end'], daemon=True)\n"
+        "thread.start(); thread.join(10)\n"
+        "print(thread.is_alive())\n"
+    )
+    done = python(code, server_url, key(), flags=())
+    assert (done.stdout, done.stderr) == ("False\n", "")
+
+
 def test_two_blocking_processes_count_together(kvs, key, server_url):
     """Increments happen on the server."""
     kvs[key()] = {"n": 0}

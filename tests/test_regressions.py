@@ -7,6 +7,7 @@ import contextlib
 import enum
 import secrets
 import socket
+import threading
 import time
 import traceback
 import zlib
@@ -17,7 +18,7 @@ from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent, url_
 
 import reem
 import reem_async
-from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected
+from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, WrongLoop
 
 A = np.arange(3.0)
 
@@ -428,3 +429,57 @@ def test_a_foreign_type_under_a_ships_key_is_bad_data_with_the_path(open_front, 
         front.read([key()])
     front.write([key(), "d", "v"], 5)
     assert_no_orphans(raw, key())
+
+
+def test_a_publish_from_another_event_loop_is_refused_though_one_is_under_way(server_url, key):
+    """And the loop that owns the interface goes on."""
+    pspace = reem_async.PublishSpace(reem_async.RedisInterface(server_url))
+    refused, begun, enough = [], threading.Event(), threading.Event()
+
+    async def own():
+        while not enough.is_set():
+            await asyncio.gather(*[pspace[key()].write(number) for number in range(20)])
+            begun.set()
+        await pspace.interface.close()
+
+    async def strange():
+        await asyncio.wait_for(pspace[key()].write(-1), 5)
+
+    def elsewhere():
+        begun.wait()
+        for _ in range(30):
+            with pytest.raises(WrongLoop):
+                asyncio.run(strange())
+            refused.append(1)
+        enough.set()
+
+    thread = threading.Thread(target=elsewhere)
+    thread.start()
+    try:
+        asyncio.run(asyncio.wait_for(own(), 30))
+    finally:
+        enough.set()
+        thread.join()
+    assert len(refused) == 30
+
+
+class Prefixed(reem_async.KeyValueStore):
+    """What a program may do to the names of its keys."""
+
+    def __getitem__(self, key):
+        return super().__getitem__("pre_" + key)
+
+
+async def test_a_store_with_its_own_names_still_vouches_for_shapes(server_url, key):
+    """`track_schema_changes` means keys that the store has met, whatever a subclass makes of names."""
+    async with reem_async.RedisInterface(server_url) as interface:
+        store = Prefixed(interface)
+        await store[key()].write({"a": A})
+        store.track_schema_changes(False)
+        try:
+            await store[key()].write({"a": A})
+            with pytest.raises(BadType, match="never changes"):
+                await store[key()].write({"a": 1})
+            assert store.at(key("b")).full_path == (key("b"),)
+        finally:
+            await store[key()].delete()

@@ -168,7 +168,7 @@ async def _array_reads(interface: RedisInterface) -> Finding:
     """Time reading 1 MB, which expires by itself should this program be killed."""
     transport = interface.session.transport
     key = interface.session.keys(f"reem-doctor-{secrets.token_hex(4)}").tag + ".array"
-    (stored,) = await transport.roundtrip([("SET", key, bytes(_ARRAY_BYTES), "EX", 60)])
+    (stored,) = await transport.roundtrip([("SET", key, bytes(_ARRAY_BYTES), "EX", "60")])
     if isinstance(stored, Exception):
         return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "a user who may write can tell")
     try:

@@ -63,7 +63,7 @@ def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, ever
     expires, since it only matters while a snapshot is on its way. In a cluster a notice goes to those who
     know the key; `everywhere` it goes to all nodes besides, for those who look for keys.
     """
-    noted: Command = ("SET", keys.last, f"{publisher} {sequence}", "EX", 60)
+    noted: Command = ("SET", keys.last, f"{publisher} {sequence}", "EX", "60")
     told: Command = (keys.publish, keys.channel, payload)
     return [noted, ("PUBLISH", keys.channel, payload), told] if everywhere else [noted, told]
 

@@ -9,7 +9,7 @@ from . import Plan, Reply
 
 __all__ = ["documents"]
 
-_PAGE = 1000
+_PAGE = "1000"
 
 
 def documents(glob: str, cursor: Any = b"0") -> Plan:

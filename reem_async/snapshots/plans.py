@@ -20,7 +20,7 @@ __all__ = ["DOCUMENT", "dump", "put", "scan", "shown", "strangers", "types"]
 DOCUMENT = "ReJSON-RL"
 """What TYPE says of a JSON document."""
 
-_PAGE = 1000
+_PAGE = "1000"
 _TRIES = 50
 
 

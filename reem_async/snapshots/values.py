@@ -174,7 +174,7 @@ KINDS: dict[str, Kind] = {
         lambda key, pieces: _in_parts("HSET", key, pieces),
     ),
     "list": Kind(
-        ("LRANGE", KEY, 0, -1),
+        ("LRANGE", KEY, "0", "-1"),
         list,
         lambda key, pieces: _in_parts("RPUSH", key, pieces),
     ),
@@ -184,7 +184,7 @@ KINDS: dict[str, Kind] = {
         lambda key, pieces: _in_parts("SADD", key, pieces),
     ),
     "zset": Kind(
-        ("ZRANGE", KEY, 0, -1, "WITHSCORES"),
+        ("ZRANGE", KEY, "0", "-1", "WITHSCORES"),
         _scored,
         lambda key, pieces: _in_parts("ZADD", key, _turned(pieces)),
     ),

@@ -81,6 +81,10 @@ class Transport(Held, Protocol):
         """Return a lock: what is sent inside arrives in the order of entering, per `key`."""
         ...
 
+    def broken_off(self) -> None:
+        """Give back what a call of this thread holds that was broken off between two steps, by Ctrl-C for example."""
+        ...
+
     def check(self) -> None:
         """Raise if this cannot be used here: closed, or bound to another event loop."""
         ...

@@ -268,8 +268,12 @@ class AsyncTransport:
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
-        # A free one is taken at once; else the event loop would make a turn before anything is sent.
+        if self._loop is not asyncio.get_running_loop() or self._pid != os.getpid():
+            self.check()  # a lock of another event loop, or of the parent process, is no lock here
         return self._orders.get(key) or self._orders.setdefault(key, asyncio.Lock())
+
+    def broken_off(self) -> None:
+        """Do nothing: in an event loop calls end by being cancelled, which gives everything back."""
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection whose pushed messages go to `on_push`."""

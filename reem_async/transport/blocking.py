@@ -7,6 +7,7 @@ the core over this transport is run to its end by a single step.
 from __future__ import annotations
 
 import collections
+import contextlib
 import os
 import select
 import socket
@@ -240,7 +241,6 @@ class BlockingTransport:
             if line.fresh():
                 break
             line.lost("the server closed an idle connection")
-        self._under_way.add(line)
         return line
 
     def _opened(self) -> _Line:
@@ -284,6 +284,7 @@ class BlockingTransport:
         """Send `commands` on a free connection and return their replies."""
         line = self._take()
         try:
+            self._under_way.add(line)
             return line.exchange(commands, bulk)
         finally:
             self._give(line)
@@ -293,6 +294,7 @@ class BlockingTransport:
         """Lend a connection; it is broken if the caller leaves with an error."""
         line = self._take()
         try:
+            self._under_way.add(line)
             yield line
         except BaseException:
             line.close()
@@ -334,6 +336,11 @@ class BlockingTransport:
             self._forked()
         return self._orders.get(key) or self._orders.setdefault(key, _Locked())
 
+    def broken_off(self) -> None:
+        """Give back what a call of this thread holds that ended in an exception of somebody else's: Ctrl-C, mostly."""
+        for order in list(self._orders.values()):
+            order.let_go()
+
     async def close(self) -> None:
         """Close all connections that are not in use; the others are closed when given back."""
         self._closed = True
@@ -347,15 +354,28 @@ class BlockingTransport:
 
 
 class _Locked:
-    """A thread lock with the face of an asynchronous one; waiting for it blocks the thread."""
+    """A thread lock with the face of an asynchronous one; waiting for it blocks the thread.
+
+    Ctrl-C may come between any two steps, also just after it was taken, or before it is given back: `let_go` is for
+    that. And a thread that has it, in a handler of signals for example, does not wait for itself.
+    """
 
     __slots__ = ("_lock",)
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     async def __aenter__(self) -> None:
         self._lock.acquire()
 
     async def __aexit__(self, *_: Any) -> None:
-        self._lock.release()
+        try:
+            self._lock.release()
+        except RuntimeError:  # a call in a handler of signals has let go of all
+            return
+
+    def let_go(self) -> None:
+        """Give it back if this thread still has it."""
+        with contextlib.suppress(RuntimeError):
+            while True:
+                self._lock.release()

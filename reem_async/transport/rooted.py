@@ -42,6 +42,10 @@ class Rooted(ABC):
         """Return the lock of `key`."""
         return self._root.ordered(key)
 
+    def broken_off(self) -> None:
+        """Give back what a call of this thread holds."""
+        self._root.broken_off()
+
     def check(self) -> None:
         """Raise if this cannot be used here."""
         self._root.check()
