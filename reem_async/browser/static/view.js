@@ -39,7 +39,7 @@ export class View {
       if (address !== this.address) return;
       if (node.address !== address) { app.go(node.address, false); history.replaceState(null, "", app.url()); return; }
       const shape = `${NUMBERS.includes(node.kind) ? "number" : node.kind}|${node.kind === "numpy" ? node.text : ""}`;
-      const kept = this.editor?.open && this.shape !== "missing" && shape !== this.shape; // what is being typed is not lost
+      const kept = app.at === null && this.editor?.open && this.shape !== "missing" && shape !== this.shape; // what is being typed is not lost
       if (shape !== this.shape && !kept) this.build(node, shape);
       this.facts(node);
       this.main.classList.remove("gone");
