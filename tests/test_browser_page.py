@@ -343,6 +343,12 @@ def test_numbers_have_a_line_in_the_tree(visit, pspace, key):
     expect(row(page, key()).locator("canvas.spark")).to_be_hidden()
 
 
+def test_lines_of_complex_numbers_say_what_they_are(visit, kvs, key):
+    kvs[key()] = np.exp(1j * np.arange(50))
+    page = visit.open(f"/view/{key()}")
+    expect(page.locator("#view")).to_contain_text("The magnitude of complex numbers.")
+
+
 @pytest.mark.parametrize(
     ("value", "step", "text"),
     [

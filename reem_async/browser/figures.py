@@ -53,10 +53,14 @@ def cell(item: Any) -> str:
 
 
 def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
-    """Return an array of one axis, or its columns, as lines: the extremes of each part where there are too many."""
+    """Return an array of one axis, or its columns, as lines: the extremes of each part where there are too many.
+
+    Of complex numbers it is the magnitude, and `magnitude` says so.
+    """
     if plane.ndim not in (1, 2) or plane.dtype.kind not in "biufc":
         raise BadValue(f"an array of {plane.dtype} {list(plane.shape)} is no line; choose axes with an index")
-    if plane.dtype.kind == "c":
+    magnitude = plane.dtype.kind == "c"
+    if magnitude:
         plane = np.abs(plane)
     columns = plane.reshape(-1, 1) if plane.ndim == 1 else plane
     total = columns.shape[1]
@@ -68,6 +72,7 @@ def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
         "times": places,
         "lines": [[_finite(item) for item in column] for column in picked.T.tolist()],
         "more": total - columns.shape[1],
+        "magnitude": magnitude,
     }
 
 

@@ -179,8 +179,9 @@ export class ArrayView {
     const data = await getJson("line", values, signal);
     if (this.view !== "line") return;
     this.plot.set(data);
-    this.more.hidden = !data.more;
-    setText(this.more, `${data.more} more columns are not drawn.`);
+    const said = [data.magnitude && "The magnitude of complex numbers.", data.more && `${data.more} more columns are not drawn.`].filter(Boolean);
+    this.more.hidden = !said.length;
+    setText(this.more, said.join(" "));
   }
 
   histogramStage() { this.plot = new Histogram(this.stage, { label: "Histogram" }); }
