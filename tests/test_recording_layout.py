@@ -305,7 +305,9 @@ def test_only_what_patterns_name_is_kept():
     assert pruned(tree, ("robot",), patterns) == {"left": {"battery": 5}, "right": {"battery": 6}}
     assert pruned(5, ("robot", "left", "battery"), patterns) == 5
     assert pruned(tree, ("robot",), [parse_pattern("robot")]) is tree
-    assert pruned({"x": 1}, ("robot",), patterns) is MISSING
+    assert pruned({"x": 1}, ("robot",), patterns) == {}  # an update of robot.left needs it
+    assert pruned({"left": 1}, ("robot",), patterns) == {}
+    assert pruned(1, ("robot",), patterns) is MISSING
     assert pruned(tree, ("arm",), patterns) is MISSING
 
 

@@ -146,8 +146,6 @@ def export(
     """
 
     def work() -> int:
-        from reem_async.cli.running import USAGE, Refused
-
         target = output or file.with_suffix(f".{to}")
         with tools("open_log")(file) as log:
             from reem_async.recording.export import export as write
@@ -155,18 +153,19 @@ def export(
             result = write(log, to, target, patterns or ["*"])
         for path, why in result.left_out.items():
             note(f"left out: {path}: {why}")
-        if not result.columns:
-            raise Refused("nothing was exported", USAGE)
+        if result.time != "time":
+            note(f"the column of instants is {result.time}: time is a path of the recording")
+        if result.unreadable:
+            note(f"{result.unreadable} updates are damaged or were not recorded (see reem log info --verify)")
         if as_json:
-            emit_json(
-                {"file": str(target), "rows": result.rows, "columns": result.columns, "left_out": result.left_out}
-            )
+            names = ("rows", "columns", "left_out", "time", "unreadable")
+            emit_json({"file": str(target)} | {name: getattr(result, name) for name in names})
         else:
             emit(
                 clean(
                     f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(target.stat().st_size)}"
                 )
             )
-        return 0
+        return 1 if result.unreadable else 0
 
     _guard("log export", work)

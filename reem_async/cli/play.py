@@ -79,7 +79,7 @@ def play(
                         await replayer.play()
             finally:
                 _end(replayer.status, file, as_json)
-        return 0
+            return 1 if replayer.status.unreadable else 0
 
     run("play", work, url, namespace, live=True)
 
@@ -172,7 +172,7 @@ async def _draw(replayer: Replayer) -> None:
 
 
 def _fields(status: ReplayStatus) -> dict[str, float]:
-    names = ("position", "published", "refused", "lag", "most_lag", "rounds")
+    names = ("position", "published", "refused", "lag", "most_lag", "rounds", "unreadable")
     return {name: round(getattr(status, name), 6) for name in names}
 
 
@@ -184,6 +184,8 @@ def _end(status: ReplayStatus, file: Path, as_json: bool) -> None:
     text = f"{file}: {status.published} published"
     if status.refused:
         text += f", {status.refused} refused by the server (nothing there to write into)"
+    if status.unreadable:
+        text += f"; {status.unreadable} damaged or not recorded and left out (see reem log info --verify)"
     if status.most_lag > _NOTICED_LAG:
         text += f"; the server was slower than the pace, at most {status.most_lag:.2f} s behind"
     emit(clean(text))

@@ -120,7 +120,7 @@ class Container:
         try:
             self.size = os.fstat(self._file.fileno()).st_size
             if self._file.read(len(_MAGIC)) != _MAGIC:
-                raise DamagedRecording(f"{path} is not an MCAP file")
+                raise DamagedRecording(f"{path} is not an MCAP file; give one that `reem record` wrote")
             self._data = mmap.mmap(self._file.fileno(), 0, access=mmap.ACCESS_READ)
             chunks = self._summarized()
             self.indexed = chunks is not None
@@ -346,6 +346,8 @@ class Container:
             if text[position] != _MESSAGE_INDEX or length != size + 6 or size % 16 or position + 15 + size > len(text):
                 return None
             pairs = np.frombuffer(text, "<u8", size // 8, position + 15).reshape(-1, 2)
+            if not _is_sound(pairs[:, 0], info):
+                return None
             index[channel] = pairs[:, 0], pairs[:, 1]
             position += 9 + length
         return index if info.channels == index.keys() else None
@@ -380,8 +382,24 @@ class Container:
     def verify(self) -> int:
         """Read every chunk; return how many records of the file are damaged."""
         for info in self.chunks:
-            self.content(info)
+            content = self.content(info)
+            made = None if content is None or not info.index_length else self._take_records(content)
+            with self._lock:
+                if made is not None and not _same(self._read_index(info), made):
+                    self.damaged += info.number not in self._remade
+                    self._remade.add(info.number)
+                    self._indexes[info.number] = made
         return self.damaged
+
+
+def _same(one: Index | None, other: Index) -> bool:
+    return one is not None and one.keys() == other.keys() and all(np.array_equal(one[key], other[key]) for key in one)
+
+
+def _is_sound(times: np.ndarray[Any, Any], info: ChunkInfo) -> bool:
+    """Return whether these can be the times of a channel's messages in a chunk."""
+    within = len(times) == 0 or (info.start <= int(times[0]) and int(times[-1]) <= info.end)
+    return within and bool((times[1:] >= times[:-1]).all())
 
 
 def _records(content: bytes) -> Iterator[tuple[int, int, int]]:

@@ -6,7 +6,7 @@ import csv
 import io
 import itertools
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path as FilePath
 from typing import Any
@@ -31,12 +31,24 @@ class Export:
         rows: Rows written, or instants of all paths together.
         columns: What was written, by name.
         left_out: What this format cannot hold, by path, and why.
+        time: The name of the column of instants: "time", unless there is a path of this name.
+        unreadable: How many updates were left out, since they are damaged or of a type that was not recorded.
     """
 
     def __init__(self) -> None:
         self.rows = 0
         self.columns: list[str] = []
         self.left_out: dict[str, str] = {}
+        self.time = "time"
+        self.unreadable = 0
+
+    def begin(self, columns: Iterable[str]) -> None:
+        """Take the names of the columns; raises BadValue if there is none."""
+        self.columns = list(columns)
+        if not self.columns:
+            raise BadValue("nothing of this can be exported so: no number or text was recorded under these patterns")
+        while self.time in self.columns:
+            self.time = f"_{self.time}"
 
 
 def export(log: Log, kind: str, target: str | FilePath, patterns: Sequence[str] = ("*",)) -> Export:
@@ -46,19 +58,30 @@ def export(log: Log, kind: str, target: str | FilePath, patterns: Sequence[str] 
         log: The recording.
         kind: "csv" or "parquet": a row for each update, a column for each number or text, empty where it
             was not updated; arrays of more than 64 numbers are left out. "npz": for each path an array of all
-            its values, time first, and `path.time`.
-        target: The file; it must not exist.
+            its values, time first, and `path.time`. Deletions have no row.
+        target: The file; it must not exist. It appears once it is complete.
         patterns: Which paths.
 
     Raises:
         BadValue: Another kind, the file exists, or there is nothing to write.
+        OSError: It cannot be written.
     """
     if kind not in FORMATS:
         raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
-    if FilePath(target).exists():
+    target = FilePath(target)
+    if target.exists():
         raise BadValue(f"{target} is there already; choose another name")
-    result = Export()
-    FORMATS[kind](log, FilePath(target), patterns, result)
+    result, part = Export(), target.with_name(f"{target.name}.part")
+    try:
+        FORMATS[kind](log, part, patterns, result)
+        part.replace(target)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(target)) from error
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    result.unreadable = log.unreadable
     return result
 
 
@@ -92,19 +115,13 @@ def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
     columns: dict[str, None] = {}
     for _, cells in _rows(log, patterns, result):
         columns.update(dict.fromkeys(cells))
-    result.columns = _found(list(columns))
-    with target.open("x", newline="", encoding="utf-8") as file:
+    result.begin(columns)
+    with target.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["time", *result.columns])
+        writer.writerow([result.time, *result.columns])
         for time, cells in _rows(log, patterns, Export()):
             result.rows += 1
             writer.writerow([f"{time:.6f}", *[cells.get(name) for name in result.columns]])
-
-
-def _found(columns: list[str]) -> list[str]:
-    if not columns:
-        raise BadValue("nothing of this can be exported so: no number or text was recorded under these patterns")
-    return columns
 
 
 def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
@@ -117,7 +134,7 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
     for _, cells in _rows(log, patterns, result):
         for name, value in cells.items():
             kinds.setdefault(name, set()).add(_kind(value))
-    result.columns = _found(list(kinds))
+    result.begin(kinds)
     forms = {name: _form(found - {type(None)}) for name, found in kinds.items()}
     arrow = {
         bool: pyarrow.bool_(),
@@ -125,12 +142,12 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
         float: pyarrow.float64(),
         str: pyarrow.string(),
     }
-    fields = [("time", pyarrow.timestamp("us", "UTC")), *[(name, arrow[forms[name]]) for name in result.columns]]
+    fields = [(result.time, pyarrow.timestamp("us", "UTC")), *[(name, arrow[forms[name]]) for name in result.columns]]
     schema = pyarrow.schema(fields)
     rows = _rows(log, patterns, Export())
     with parquet.ParquetWriter(target, schema) as writer:
         while batch := list(itertools.islice(rows, _ROWS)):
-            data = {"time": [round(time * 1e6) for time, _ in batch]}
+            data: dict[str, list[Any]] = {result.time: [round(time * 1e6) for time, _ in batch]}
             for name in result.columns:
                 data[name] = [_cell(cells.get(name), forms[name]) for _, cells in batch]
             writer.write_table(pyarrow.table(data, schema=schema))
@@ -165,7 +182,7 @@ def _cell(value: Any, form: type) -> Any:
 
 def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
     """Write each path as it is read, array by array: a recording may be larger than memory."""
-    with zipfile.ZipFile(target, "x", zipfile.ZIP_STORED, allowZip64=True) as archive:
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for path in _array_paths(log, patterns, result):
             times, form, count = _shape(log, path)
             if form is None:
@@ -186,9 +203,7 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
                 np.lib.format.write_array_header_2_0(file, header)
                 for _, value in itertools.islice(log[path].values(), count):
                     file.write(np.ascontiguousarray(np.asarray(value, dtype)).tobytes())
-    if not result.columns:
-        target.unlink()
-        _found([])
+    result.begin(result.columns)
 
 
 def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
@@ -247,6 +262,8 @@ def _array(value: Any) -> np.ndarray[Any, Any] | None:
     """Return one value as an array that holds it exactly, None if there is none."""
     if isinstance(value, list):
         return numbers(value) if value else np.empty(0)
+    if isinstance(value, str) and value.endswith("\0"):  # numpy would take that for padding
+        return None
     return np.asarray(value) if isinstance(value, bool | int | float | str | np.ndarray) else None
 
 

@@ -15,16 +15,16 @@ import time
 from typing import Any, Protocol
 
 from ..background import in_background
-from ..errors import BadData, RedisError
+from ..errors import BadData, RedisError, WrongKind
 from ..monitor import ANNOUNCED, Event
 from ..plan.paths import Path, below, show
 from ..plan.patterns import Pattern
-from ..plan.trees import MISSING
+from ..plan.trees import MISSING, get
 from ..session import Session
 from .fetch import fetch
 from .scribe import Operation, Scribe
 from .state import pruned
-from .times import AFTER, Arrivals, Clock
+from .times import AFTER, Arrivals, Clock, published
 
 __all__ = ["Collector", "Feed", "Item"]
 
@@ -91,7 +91,7 @@ class Feed:
 
     Attributes:
         busy: The task that fetches, None if there is nothing to fetch.
-        news: Something was published since the last keyframe.
+        news: The whole was published since the last keyframe.
         next_read: When it may be read again for nothing, on the monotonic clock.
     """
 
@@ -103,6 +103,7 @@ class Feed:
         self._heard: dict[str, int] = {}
         self._since: list[tuple[str, int, int]] = []  # notices that arrived while a fetch was on its way
         self._known = False
+        self._complaint = ""  # why it could not be read the last time
         self._last_large = 0  # the log time of the last update that was fetched
         self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
         self.busy: asyncio.Task[None] | None = None
@@ -112,13 +113,13 @@ class Feed:
     def on_event(self, event: Event) -> None:
         """Take one update."""
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
-        stamp = self._collector.clock.stamp(arrived), round(event.time * 1e6) * 1000, event.sequence
+        stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
         self._heard[event.publisher] = event.sequence
         if len(self._heard) > 1000:
             del self._heard[next(iter(self._heard))]
         if self.busy is not None:
             self._since.append((event.publisher, event.sequence, stamp[0]))
-        self.news = True
+        self.news = self.news or len(event.path) == 1
         if event.missed:  # a broken connection is noticed by the recorder, for all keys
             self.lost(event.missed)
         elif not self._known and len(event.path) > 1:
@@ -196,45 +197,88 @@ class Feed:
                 self._since.clear()
                 last = self._items[-1].stamp[0]  # what has been announced until now is older than the reply
                 value, size, publisher, number = await fetch(collector.session, self._keys, head.path[1:])
-            if number and self._heard.get(publisher, 0) < number:
+            # What deleted it may not have been heard of yet: that there is nothing has no number.
+            if value is MISSING or (number and self._heard.get(publisher, 0) < number):
                 await collector.fence()
         except (RedisError, OSError, BadData) as error:
             self._give_up(head, error)
             return False
         known = [log for who, count, log in self._since if who == publisher and count == number]
-        self.next_read = time.monotonic() + size / _READ_RATE
-        self._place(head, value, size, max([last, *known]))
+        self._complaint = ""
+        if head.role == "state":
+            self.next_read = time.monotonic() + size / _READ_RATE
+        covered = max([last, *known])
+        if head.role == "update" and self._is_overtaken(head, value, covered):
+            collector.scribe.counts.skip(self._items.popleft().path)
+        else:
+            self._place(head, value, size, covered)
         return True
 
+    def _is_overtaken(self, head: Item, value: Any, covered: int) -> bool:
+        """Return whether what was fetched is not what an update announced, but what others made of its place since.
+
+        That there is nothing may be what an update did that had not been heard of when it was fetched.
+        """
+        overtaken = False
+        for item in self._items:
+            included = item.stamp[0] <= covered
+            if item is head or item.role not in ("update", "delete") or item.kind != "pub":
+                continue
+            if item.path == head.path and item.value is ANNOUNCED:
+                overtaken = overtaken and not included  # if it is included, what was fetched is its value
+            elif below(head.path, item.path) and (included or value is MISSING):
+                overtaken = True
+        return overtaken
+
     def _give_up(self, head: Item, error: Exception) -> None:
-        """Leave out what cannot be fetched; the key is read anew later."""
-        logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
+        """Leave out what cannot be fetched; the key is read anew later: soon, or at a keyframe if it is no value."""
+        if self._complaint != str(error):
+            logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
+        counts, first, self._complaint = self._collector.scribe.counts, not self._complaint, str(error)
         self._items.popleft()
         if head.role == "update":
-            self._collector.scribe.counts.skip(head.path)
-        self._collector.scribe.behind.add(self._name)
+            counts.skip(head.path)
+        elif first:
+            counts.lose(head.path)
+        if not isinstance(error, BadData | WrongKind):
+            self._collector.scribe.behind.add(self._name)
 
     def _place(self, head: Item, value: Any, size: int, covered: int) -> None:
-        """Emit a fetched value as that of the newest update it includes; the older ones of its path are skipped."""
+        """Emit a fetched value as that of the newest update it includes; the older ones of its path are skipped.
+
+        A state comes behind all that it includes, and brings the values of those that were only announced.
+        """
         items = [self._items.popleft() for _ in range(self._newest(head, covered) + 1)]
         announced = [item for item in items if item.path == head.path and item.value is ANNOUNCED]
         target = head if head.role == "state" else announced[-1]
         stamp = target.stamp
         if target is not items[-1] or target.role == "state":  # it goes behind all that it includes
             stamp = items[-1].stamp[0] + AFTER, *target.stamp[1:]
-        kept = []
-        for item in items:
+        kept: list[Item] = []
+        keyframes: list[Item] = []  # these come behind all, since they have what was fetched
+        for place, item in enumerate(items):
             if item is target:
                 continue
-            if item.role != "keyframe" and not below(item.path, head.path):
+            if item.role == "keyframe":
+                keyframes.append(dataclasses.replace(item, stamp=(max(item.stamp[0], stamp[0]), *item.stamp[1:])))
+            elif not below(item.path, head.path):
                 kept.append(item)
             elif item.value is not ANNOUNCED:
                 self._emit(item)
             elif item.role == "update":
-                self._collector.scribe.counts.skip(item.path)
+                self._emit_part(
+                    item, items[place + 1 :], get(value, item.path[1:]) if target.role == "state" else MISSING
+                )
         role = "delete" if value is MISSING and target.role == "update" else target.role
         self._emit(dataclasses.replace(target, role=role, value=value, size=size, stamp=stamp))
-        self._items.extendleft(reversed(kept))
+        self._items.extendleft(reversed(kept + keyframes))
+
+    def _emit_part(self, item: Item, later: list[Item], value: Any) -> None:
+        """Emit an update with what a state has in its place, if that is its value; else it is skipped."""
+        if value is MISSING or any(below(it.path, item.path) or below(item.path, it.path) for it in later):
+            self._collector.scribe.counts.skip(item.path)
+        else:
+            self._emit(dataclasses.replace(item, value=value))
 
     def _newest(self, head: Item, covered: int) -> int:
         """Return the place of the last item that a fetched value includes."""
@@ -244,6 +288,6 @@ class Feed:
                 break
             if head.role == "state" or (item.role != "keyframe" and below(item.path, head.path)):
                 newest = place
-            elif item.role != "keyframe" and below(head.path, item.path):
+            elif item.role in ("update", "delete") and below(head.path, item.path):
                 break  # what holds it was written as a whole
         return newest

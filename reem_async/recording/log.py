@@ -182,6 +182,11 @@ class Log:
         return self._container.damaged
 
     @property
+    def unreadable(self) -> int:
+        """How many updates were left out until now, since they are damaged, or of a type that was not recorded."""
+        return max(self._past.unreadable, self._container.damaged)
+
+    @property
     def metadata(self) -> dict[str, str]:
         """What the recorder says of itself: who, when, versions, patterns, and at the end its counts."""
         said: dict[str, str] = {}
@@ -360,7 +365,7 @@ class LogPath:
         until = _END if end is None else nanoseconds(end)
         last: Any = MISSING
         for ref, stream, value in self._log._past.following(self.path, after, until):
-            if value is MISSING or (stream.role == "state" and last is not MISSING and same(value, last)):
+            if value is MISSING or (stream.role in ("state", "keyframe") and last is not MISSING and same(value, last)):
                 last = value
                 continue
             last = value

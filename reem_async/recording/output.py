@@ -22,6 +22,12 @@ class Output:
 
     def __init__(self, path: FilePath, *, overwrite: bool) -> None:
         flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if overwrite else os.O_EXCL)
+        if path.is_dir():
+            raise BadValue(f"{path} is a directory; name a file in it")
+        if overwrite and path.is_file():  # whoever reads the old one goes on with it; cut short, it would kill him
+            path = path.resolve()
+            with contextlib.suppress(OSError):
+                path.unlink()
         try:
             self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
         except FileExistsError:

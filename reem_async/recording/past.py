@@ -20,7 +20,7 @@ from .errors import DamagedRecording
 from .layout import from_json
 from .messages import decode
 from .state import applied
-from .stored import LOST, Stored
+from .stored import LOST, Stored, opened
 from .timeline import Ref, Timeline
 
 __all__ = ["Past", "Stream"]
@@ -93,7 +93,7 @@ class Past:
         while True:
             found = self._rebuilt(anchor, streams, until)
             if found is not None:
-                return get(found[0], path[len(anchor) :])
+                return self._inside(found[0], path[len(anchor) :])
 
     def _rebuilt(self, path: Path, streams: list[Stream], until: int) -> list[Any] | None:
         """Return a list of what was at `path`; None if something turned out to be damaged: try again."""
@@ -106,14 +106,29 @@ class Past:
             if loaded is None:
                 return None
             base = ref.time
-            tree = get(loaded[0], path[len(stream.path) :])
+            tree = self._inside(loaded[0], path[len(stream.path) :])
         inner = [it for it in streams if it.role in _NEWS and len(it.path) > len(path) and below(it.path, path)]
         for ref, stream in self._later(inner, base, until):
             loaded = self._load(ref, stream)
             if loaded is None:
                 return None
-            tree = applied(tree, stream.path[len(path) :], stream.role, stream.kind, loaded[0])
+            tree = self._applied(tree, path, stream, loaded[0])
         return [tree]
+
+    def _applied(self, tree: Any, anchor: Path, stream: Stream, value: Any) -> Any:
+        """Return what is at `anchor` after an update of a stream below it."""
+        path = stream.path[len(anchor) :]
+        return applied(opened(tree, path, self._list), path, stream.role, stream.kind, value)
+
+    def _inside(self, tree: Any, path: Path) -> Any:
+        return get(opened(tree, path, self._list), path)
+
+    def _list(self, it: Stored) -> Any:
+        """Return a long list; what stands for it, if it is damaged."""
+        try:
+            return self.value(it)
+        except BadData:
+            return it
 
     def _newest(self, streams: Iterable[Stream], until: int, after: int) -> tuple[Ref, Stream] | None:
         best: tuple[Ref, Stream] | None = None
@@ -206,21 +221,27 @@ class Past:
                 yield ref, stream, loaded[0]
 
     def following(self, path: Path, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
-        """Yield what was at a full path after each piece of news on it between two instants."""
+        """Yield what was at a full path after each piece of news on it between two instants.
+
+        If a part of the file is damaged, what keyframes tell is news too.
+        """
         streams = self.names.get(str(path[0]), []) if path else []
         anchor = _anchor(path, streams)
-        related = [it for it in streams if it.role in _NEWS and (below(it.path, anchor) or below(anchor, it.path))]
+        roles = (*_NEWS, "keyframe")
+        related = [it for it in streams if it.role in roles and (below(it.path, anchor) or below(anchor, it.path))]
         tree = self.tree(anchor, after) if related and after >= 0 else MISSING
         for ref in self._timeline.between([each for it in related for each in it.channels], after, until):
             stream = self._of_channel[ref.channel]
+            if stream.role == "keyframe" and not (self._container.damaged or self.unreadable):
+                continue
             loaded = self._readable(ref, stream)
             if loaded is None:
                 continue
             if len(stream.path) <= len(anchor):
-                tree = get(loaded[0], anchor[len(stream.path) :])
+                tree = self._inside(loaded[0], anchor[len(stream.path) :])
             else:
-                tree = applied(tree, stream.path[len(anchor) :], stream.role, stream.kind, loaded[0])
-            yield ref, stream, get(tree, path[len(anchor) :])
+                tree = self._applied(tree, anchor, stream, loaded[0])
+            yield ref, stream, self._inside(tree, path[len(anchor) :])
 
     def gaps(self) -> Iterator[tuple[Ref, Stream, int | None]]:
         """Yield where updates were lost, and how many."""
@@ -241,7 +262,7 @@ class Past:
 
     def channels(self) -> Iterator[tuple[Channel, Stream | None, str]]:
         """Yield the channels, what they are for (None for none of REEM's), and the names of their schemas."""
-        for channel in self._container.channels.values():
+        for channel in list(self._container.channels.values()):  # reading an index may find more of them
             schema = self._container.schemas.get(channel.schema_id)
             yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
 
@@ -259,6 +280,7 @@ def _place(channel: Channel) -> tuple[Path, str, str] | None:
 
 
 def _anchor(path: Path, streams: Iterable[Stream]) -> Path:
-    """Return the part of `path` that never moves: up to the first list from which an item was deleted."""
+    """Return the part of `path` that never moves: up to an index from the end, or a list that lost an item."""
     lists = [it.path[:-1] for it in streams if it.role == "delete" and isinstance(it.path[-1], int)]
+    lists += [path[:place] for place, key in enumerate(path) if isinstance(key, int) and key < 0]
     return min([place for place in lists if len(place) < len(path) and below(path, place)], key=len, default=path)

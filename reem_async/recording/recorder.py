@@ -39,7 +39,7 @@ _TICK = 0.1
 _MAILBOX = 50_000
 _FETCHES = 8
 _MOST_SILENT_READS = 500
-"""Keys of which nothing is published that are read again at one keyframe."""
+"""Keys that are read again at one keyframe."""
 _PATIENCE = 3.0
 """Seconds in which what was announced before the end is still fetched."""
 
@@ -209,6 +209,7 @@ class Recorder:
             self._pump()
             await self._settled(_PATIENCE)
             await self._complete(time.monotonic() + _PATIENCE)
+            await self._look_once_more()
             self._keyframe_of_all()
         await self._end()
         self._check()
@@ -375,8 +376,16 @@ class Recorder:
         for feed in self._feeds.values():
             feed.lost(None)
 
+    async def _look_once_more(self) -> None:
+        """Read what is there at the end: somebody may have stored something since the last keyframe."""
+        for feed in self._feeds.values():
+            feed.news = False
+        if self._line is not None and self._line.wire is not None and self.scribe.failure is None:
+            with contextlib.suppress(RedisError, OSError):
+                await self._look()
+
     async def _look(self) -> None:
-        """Read keys of which nothing was published since the last keyframe: somebody may have stored something."""
+        """Read keys that were not published as a whole since the last keyframe: somebody may have stored something."""
         if self._monitor is None:
             return
         there = await self._names()

@@ -33,6 +33,7 @@ class ReplayStatus:
         lag: Seconds it is behind the pace asked for.
         most_lag: The most it was.
         rounds: How often it has come to the end.
+        unreadable: How many updates were left out, since they are damaged or of a type that was not recorded.
     """
 
     position: float
@@ -41,6 +42,7 @@ class ReplayStatus:
     lag: float
     most_lag: float
     rounds: int
+    unreadable: int = 0
 
 
 class Replayer:
@@ -97,6 +99,7 @@ class Replayer:
         self._session = interface.session
         self._updates: Iterator[LogUpdate] | None = None
         self._position = self.start
+        self._stepped = False  # there was an update in this round
         self._names: set[str] = set()
         self._published = self._refused = self._rounds = 0
         self._lag = self._most_lag = 0.0
@@ -124,7 +127,8 @@ class Replayer:
     @property
     def status(self) -> ReplayStatus:
         """How it is getting on. Any thread may ask."""
-        return ReplayStatus(self._position, self._published, self._refused, self._lag, self._most_lag, self._rounds)
+        counts = self._published, self._refused, self._lag, self._most_lag, self._rounds
+        return ReplayStatus(self._position, *counts, self._log.unreadable)
 
     async def play(self) -> ReplayStatus:
         """Publish until the end, or for ever with `loop`; returns how it went.
@@ -155,15 +159,19 @@ class Replayer:
 
         Returns None at the end (the call after it begins anew, with `loop` at once).
         """
-        if self._updates is None:
-            await self._begin()
-        update = next(self._remaining(), None)
-        if update is None:
+        while True:
+            if self._updates is None:
+                await self._begin()
+                self._stepped = False
+            update = next(self._remaining(), None)
+            if update is not None:
+                await self._publish(update)
+                self._stepped = True
+                return update
             self._updates = None
             self._rounds += 1
-            return await self.step() if self._loop and self._published else None
-        await self._publish(update)
-        return update
+            if not (self._loop and self._stepped):
+                return None
 
     def _remaining(self) -> Iterator[LogUpdate]:
         assert self._updates is not None
@@ -193,17 +201,20 @@ class Replayer:
     async def _publish(self, update: LogUpdate) -> None:
         path = self._renamed(update.path)
         if update.deleted:
-            await self._delete(path)
+            sampled = update.kind == "kvs" and isinstance(path[-1], int)
+            while await self._delete(path) and sampled:  # nor was there anything behind it
+                pass
         else:
             await self._write(path, update.value, parents=update.kind == "kvs")
         self._position = update.time
 
-    async def _delete(self, path: Path) -> None:
+    async def _delete(self, path: Path) -> bool:
         try:
             await self._at(path).delete()
         except MissingKey:
-            return
+            return False
         self._published += 1
+        return True
 
     async def _write(self, path: Path, value: Any, *, parents: bool = False) -> None:
         try:

@@ -45,7 +45,8 @@ def read_key_file(file: str | FilePath) -> list[Sample]:
     try:
         text = FilePath(file).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise BadValue(f"the key file {file} cannot be read: {error}") from None
+        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise BadValue(f"the key file {file} cannot be read: {why}") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
     samples = [_sample(file, number, line) for number, line in lines if not _is_title(line)]
     if not samples:

@@ -16,15 +16,15 @@ import numpy as np
 
 from ..courtesy import give_way
 from ..plan.paths import Path, show
-from ..plan.trees import MISSING, CannotApply, get, removed, replaced
+from ..plan.trees import MISSING, CannotApply, get, replaced
 from ..ships.numpy import NumpyShip
 from ..ships.registry import Ships
 from .contents import Content, Recent
 from .layout import WRAPPER, Document, to_json
 from .messages import encode
 from .sink import FullError, Sink
-from .state import planted
-from .stored import LOST, Stored, extract, same
+from .state import planted, without
+from .stored import LOST, Stored, extract, opened, same
 
 __all__ = ["Counts", "Operation", "Scribe"]
 
@@ -199,16 +199,15 @@ class Scribe:
             return
         try:
             getattr(self, f"_write_{it.role}")(it)
-        except FullError:
+        except FullError:  # reading it again would not help
             self.counts.lose(it.path)
-            self.behind.add(str(it.path[0]))
 
     def _write_update(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
         tree = self._extracted(it)
         if type(tree) is not Stored:
             self._count(self._sink.json(it.path, "update", it.kind, to_json(tree), it.stamp))
-        before = self._trees.get(name, MISSING)
+        before = opened(self._trees.get(name, MISSING), rest, _as_list)
         if it.kind == "kvs":
             self._trees[name] = planted(before, rest, tree)
             return
@@ -219,11 +218,11 @@ class Scribe:
 
     def _write_delete(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
-        before = self._trees.get(name, MISSING)
+        before = opened(self._trees.get(name, MISSING), rest, _as_list)
         if it.kind == "kvs" and get(before, rest) is MISSING:
             return
         self._event(it, {"op": "delete", "path": show(it.path)})
-        self._trees[name] = removed(before, rest)
+        self._trees[name] = without(before, rest, it.kind)
 
     def _write_gap(self, it: Operation) -> None:
         self.counts.gaps += 1
@@ -239,15 +238,21 @@ class Scribe:
             if before is not MISSING:
                 self._write_delete(it._replace(role="delete", kind="pub"))
             return
+        before = self._settled(it, before)
         tree = self._extracted(it, before)
         if before is MISSING or not same(tree, before):
             self._trees[name] = tree
             self._keyframe(it, tree)
 
     def _write_keyframe(self, it: Operation) -> None:
-        tree = self._trees.get(str(it.path[0]), MISSING)
+        tree = self._settled(it, self._trees.get(str(it.path[0]), MISSING))
         if tree is not MISSING:
+            self._trees[str(it.path[0])] = tree
             self._keyframe(it, tree)
+
+    def _settled(self, it: Operation, tree: Any) -> Any:
+        """Return a tree with the long lists in it, of which items were updated, as messages of their own again."""
+        return tree if tree is MISSING else self._extracted(it._replace(value=tree, kind="kvs"))
 
     def _keyframe(self, it: Operation, tree: Any) -> None:
         document = to_json(tree)
@@ -262,15 +267,19 @@ class Scribe:
 
         def store(label: str, path: Path, value: Any) -> Stored:
             data, label = self._packed(label, value)
+            old = get(before, path[len(it.path) :]) if it.role == "state" else None
             if data is None:
+                lost = Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
+                if type(old) is Stored and (old.label, old.summary) == (LOST, lost.summary):
+                    return old
                 self.counts.lose(path)
-                return Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
+                return lost
             content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", data)
             stored = _described(label, path, it.stamp[0], data, content)
-            old = get(before, path[len(it.path) :]) if it.role == "state" else None
             if type(old) is Stored and _is_same(stored, old):
                 return old
-            self._recent.add(content)
+            if stored.numbers is None:
+                self._recent.add(content)
             role = "update" if path == it.path and it.role == "update" else "part"
             encoded = encode(label, data, show(path), it.stamp[1] or it.stamp[0])
             try:
@@ -299,8 +308,13 @@ class Scribe:
 def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Stored:
     if isinstance(data, np.ndarray):
         size, summary = _NUMPY.describe(data)
-        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content)
+        numbers = data if label == "list" else None
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
     return Stored(label, path, at, len(data), label, content=content)
+
+
+def _as_list(it: Stored) -> Any:
+    return it if it.numbers is None else it.numbers.tolist()
 
 
 def _is_same(one: Stored, other: Stored) -> bool:

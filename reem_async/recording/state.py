@@ -7,9 +7,9 @@ from typing import Any
 
 from ..plan.paths import Path
 from ..plan.patterns import Pattern, parse_pattern
-from ..plan.trees import MISSING, CannotApply, removed, replaced
+from ..plan.trees import MISSING, CannotApply, get, removed, replaced
 
-__all__ = ["applied", "planted", "pruned"]
+__all__ = ["applied", "planted", "pruned", "without"]
 
 _LONGEST_PADDING = 10_000
 
@@ -37,7 +37,7 @@ def planted(tree: Any, path: Path, value: Any) -> Any:
 def applied(tree: Any, path: Path, role: str, kind: str, value: Any) -> Any:
     """Return `tree` after one recorded update of `path`; unchanged where the server had refused it."""
     if role == "delete":
-        return removed(tree, path)
+        return without(tree, path, kind)
     if kind == "kvs":
         return planted(tree, path, value)
     try:
@@ -46,17 +46,28 @@ def applied(tree: Any, path: Path, role: str, kind: str, value: Any) -> Any:
         return tree
 
 
+def without(tree: Any, path: Path, kind: str) -> Any:
+    """Return `tree` after a recorded deletion of `path`; behind an item that a sample did not find, there is none."""
+    if kind != "kvs" or not path or isinstance(path[-1], str):
+        return removed(tree, path)
+    items = get(tree, path[:-1])
+    return replaced(tree, path[:-1], items[: path[-1]]) if type(items) is list else tree
+
+
 def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
-    """Return what is at the full `path` without what none of the patterns name; MISSING if nothing is left."""
+    """Return what is at the full `path` without what none of the patterns name; MISSING if that is nothing at all.
+
+    A dict on the way to what they name stays, though it be empty: an update inside of it needs it.
+    """
     wanted = [pattern for pattern in patterns if pattern.concerns(path)]
     if any(len(pattern.rest) < len(path) for pattern in wanted):
         return tree
     if type(tree) is list and wanted:  # the items keep their places
         return tree
-    if type(tree) is not dict:
+    if type(tree) is not dict or not wanted:
         return MISSING
     left = {key: pruned(item, (*path, key), wanted) for key, item in tree.items()}
-    return {key: item for key, item in left.items() if item is not MISSING} or MISSING
+    return {key: item for key, item in left.items() if item is not MISSING}
 
 
 def parsed(patterns: Iterable[str]) -> list[Pattern]:

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from ..plan.paths import Path, show
+from ..plan.trees import get, replaced
 from .contents import Content
 
-__all__ = ["LONGEST_INLINE", "LOST", "Store", "Stored", "extract", "is_inline", "resolve", "same"]
+__all__ = ["LONGEST_INLINE", "LOST", "Store", "Stored", "extract", "is_inline", "opened", "resolve", "same"]
 
 LONGEST_INLINE = 64
 """Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""
@@ -37,6 +38,7 @@ class Stored:
         dtype: The dtype of an array, for people.
         shape: The shape of an array, None for anything else.
         content: Its bytes, or a digest of them, to tell whether it has changed; not in the file.
+        numbers: While it is recorded, the numbers of a list: one of them may be updated.
     """
 
     label: str
@@ -47,6 +49,7 @@ class Stored:
     dtype: str = ""
     shape: tuple[int, ...] | None = None
     content: Content | None = field(default=None, compare=False, repr=False)
+    numbers: np.ndarray[Any, Any] | None = field(default=None, compare=False, repr=False)
 
     @property
     def shown(self) -> str:
@@ -104,6 +107,15 @@ def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
     if kind is list:
         return [resolve(item, load) for item in tree]
     return load(tree) if kind is Stored else tree
+
+
+def opened(tree: Any, path: Path, load: Callable[[Stored], Any]) -> Any:
+    """Return `tree` with the long list on the way to `path`, if there is one, as the list that `load` makes of it."""
+    for depth in range(len(path)):
+        it = get(tree, path[:depth])
+        if type(it) is Stored:
+            return replaced(tree, path[:depth], load(it)) if it.label == "list" else tree
+    return tree
 
 
 def same(one: Any, other: Any) -> bool:

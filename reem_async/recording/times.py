@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import BadType, BadValue
 from ..plan.paths import shorten
 
-__all__ = ["AFTER", "STEP", "Arrivals", "Clock", "Instant", "nanoseconds", "seconds"]
+__all__ = ["AFTER", "STEP", "Arrivals", "Clock", "Instant", "nanoseconds", "published", "seconds"]
 
 Instant = float | np.datetime64
 """A point in time: seconds since 1970, or a numpy datetime64."""
@@ -19,6 +19,7 @@ Instant = float | np.datetime64
 STEP = 2000
 """Nanoseconds between two log times at least: whole microseconds, which seconds as float tell apart until 2100."""
 
+_LATEST = 2**63 - 1
 _MOST_PUBLISHERS = 10_000
 _FORGET = 1e-4
 """How much of a longer way each update makes the least one longer: clocks drift."""
@@ -41,6 +42,11 @@ def nanoseconds(instant: Any) -> int:
     if not math.isfinite(since) or abs(since) > 9e9:
         raise BadValue(f"the instant {instant!r} is out of range; give seconds since 1970")
     return round(since * 1e6) * 1000
+
+
+def published(time: float) -> int:
+    """Return a publisher's time stamp in ns, as near to it as a file can hold: his clock may be set to anything."""
+    return min(max(round(time * 1e6) * 1000, 0), _LATEST) if math.isfinite(time) else 0
 
 
 def seconds(ns: int) -> float:
