@@ -133,6 +133,22 @@ def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
     assert (run.returncode, "there already" in run.stderr) == (2, True)
 
 
+def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
+    file, _ = recorded
+    with open_log(file) as log:
+        info = log._container.chunks[len(log._container.chunks) // 2]
+    data = bytearray(file.read_bytes())
+    data[info.offset + info.length - 5] ^= 1
+    file.write_bytes(data)
+    play = reem("play", file, "--rate", "100")
+    assert (play.returncode, "left out (see reem log info --verify)" in play.stdout) == (1, True)
+    assert json.loads(reem("play", file, "--rate", "100", "--json").stdout.splitlines()[-1])["unreadable"] > 0
+    export = reem("log", "export", file, "--to", "csv", "--json")
+    assert (export.returncode, "damaged" in export.stderr) == (1, True)
+    assert json.loads(export.stdout)["unreadable"] > 0
+    assert (tmp_path / "run.csv").exists()
+
+
 def test_step(key, recorded, server_url, kvs, tmp_path):
     """One update for each line; the end of the input ends it."""
     file, _ = recorded

@@ -23,7 +23,7 @@ from test_recording import FRAME, IMAGE
 import reem
 import reem.recording
 import reem_async
-from reem_async.errors import BadData, MissingKey
+from reem_async.errors import BadData, BadValue, MissingKey
 from reem_async.recording import DamagedRecording, Recorder, RecordingFailed, open_log
 from reem_async.recording.output import Output
 from reem_async.recording.times import Arrivals
@@ -242,6 +242,55 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
         noticed += count > 0
     assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
     assert noticed > 40
+
+
+def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_values, tmp_path):
+    """Any bit of a log time: either what is told is right, or `verify` says that something is damaged."""
+    file, seen = file_and_values
+    whole, damaged = file.read_bytes(), tmp_path / "damaged.mcap"
+    with open_log(file) as log:
+        places = [info for info in log._container.chunks if info.index_length][-2:]
+    for info in places:
+        for offset in range(info.index, info.index + info.index_length):
+            data = bytearray(whole)
+            data[offset] ^= 1 << random.Random(offset).randrange(8)
+            damaged.write_bytes(data)
+            with open_log(damaged) as log:
+                assert log.verify() >= 1
+                assert log.channels()
+                time, value = seen[-1]
+                assert_same(log[names("a")].at(time), value)
+
+
+def test_history_goes_on_from_a_keyframe_behind_what_is_damaged(names, file_and_values, tmp_path):
+    file, _ = file_and_values
+    with open_log(file) as log:
+        chunks = log._container.chunks
+        info = chunks[len(chunks) // 2]
+        whole = log[names("a")]["t"].history()
+    damaged, data = tmp_path / "damaged.mcap", bytearray(file.read_bytes())
+    data[info.offset + info.length - 5] ^= 1
+    damaged.write_bytes(data)
+    with open_log(damaged) as log:
+        _, texts = log[names("a")]["t"].history()
+        assert log.unreadable > 0
+        assert 0 < len(set(texts)) < len(set(whole[1]))
+        assert texts[-1] == log[names("a")]["t"].at(log.end) == whole[1][-1]
+
+
+async def test_a_file_that_is_read_may_be_replaced(key, apspace, binterface, tmp_path):
+    """Its reader goes on with the old one; cut short under him, it would kill his process."""
+    file = tmp_path / "run.mcap"
+    async with Recorder(binterface, [key()], file):
+        await apspace[key()].write({"image": IMAGE, "text": "x" * 100_000})
+    with open_log(file) as log:
+        async with Recorder(binterface, ["nothing_there"], file, overwrite=True):
+            assert log[key()]["text"].at(log.end) == "x" * 100_000
+            assert_same(log[key()]["image"].at(log.end), IMAGE)
+    with open_log(file) as log:
+        assert log.names() == []
+    with pytest.raises(BadValue, match="name a file in it"):
+        Recorder(binterface, [key()], tmp_path, overwrite=True)
 
 
 async def test_what_is_no_recording(tmp_path, recorded):

@@ -259,3 +259,75 @@ def test_export_parquet(names, log, tmp_path):
     assert numbers == list(range(26))
     assert str(table.schema.field(f"{names('late')}[0]").type) == "double"
     assert str(table.schema.field("time").type) == "timestamp[us, tz=UTC]"
+
+
+async def test_a_key_called_time_does_not_take_the_place_of_the_instants(key, server_url, other, tmp_path):
+    file = tmp_path / "run.mcap"
+    async with reem_async.RedisInterface(server_url, namespace=key()) as interface:
+        space = reem_async.PublishSpace(interface)
+        async with Recorder(interface, ["*"], file):
+            await space["time"].write(1.5)
+            await space["_time"].write(2.5)
+    with open_log(file) as log:
+        for kind in ("csv", "parquet"):
+            assert export(log, kind, tmp_path / f"run.{kind}").time == "__time"
+        begun, ended = log.start, log.end
+    rows = (tmp_path / "run.csv").read_text().splitlines()
+    assert rows[0] == "__time,time,_time"
+    assert all(begun - 1e-5 <= float(row.split(",")[0]) <= ended + 1e-5 for row in rows[1:])
+    table = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "run.parquet")
+    assert table.column_names == ["__time", "time", "_time"]
+    assert [value for value in table["time"].to_pylist() if value is not None] == [1.5]
+    assert table["__time"][0].as_py().timestamp() == pytest.approx(begun, abs=1e-5)
+
+
+async def test_npz_has_no_text_that_is_shortened(key, apspace, server_url, tmp_path):
+    file = tmp_path / "run.mcap"
+    async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [key()], file):
+        await apspace[key()].write({"text": "abc\0", "other": "abc"})
+    with open_log(file) as log:
+        result = export(log, "npz", tmp_path / "run.npz")
+    assert (list(result.left_out), result.columns) == ([f"{key()}.text"], [f"{key()}.other"])
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_an_export_that_is_broken_off_leaves_nothing(log, tmp_path, kind, monkeypatch):
+    target = tmp_path / "run.out"
+
+    def broken_off(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("reem_async.recording.log.LogPath.values", broken_off)
+    monkeypatch.setattr("csv.writer", broken_off)
+    monkeypatch.setattr("reem_async.recording.export._cell", broken_off)
+    with pytest.raises(KeyboardInterrupt):
+        export(log, kind, target)
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_steps_of_a_recording_without_updates_end(key, akvs, other, server_url, tmp_path):
+    file = tmp_path / "run.mcap"
+    await akvs[key()].write(5)
+    async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [key()], file):
+        pass
+    with open_log(file) as log:
+        replayer = Replayer(other, log, start=log.end, loop=True)
+        assert await replayer.step() is None
+        assert (replayer.status.published, replayer.status.rounds) == (1, 1)
+
+
+async def test_what_cannot_be_read_is_counted(made, names, other, akvs, tmp_path):
+    with open_log(made[0]) as log:
+        info = log._container.chunks[len(log._container.chunks) // 2]
+    damaged, data = tmp_path / "damaged.mcap", bytearray(made[0].read_bytes())
+    data[info.offset + info.length - 5] ^= 1
+    damaged.write_bytes(data)
+    for kind in ("csv", "npz", "parquet"):
+        with open_log(damaged) as log:
+            assert export(log, kind, tmp_path / f"run.{kind}").unreadable > 0
+    with open_log(damaged) as log:
+        status = await Replayer(other, log, rate=100).play()
+    assert status.unreadable > 0
+    for name in ("arm", "late"):
+        with contextlib.suppress(KeyError):
+            await akvs[names(name)].delete()

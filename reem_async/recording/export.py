@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadValue
+from ..errors import BadData, BadValue
 from ..plan.paths import Path, suffix
 from .history import EXACT, numbers
 from .log import Log
@@ -184,11 +184,13 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
     """Write each path as it is read, array by array: a recording may be larger than memory."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for path in _array_paths(log, patterns, result):
-            times, form, count = _shape(log, path)
+            try:
+                times, form, count = _shape(log, path)
+            except BadData as error:
+                result.left_out[_name(path)] = str(error)
+                continue
             if form is None:
-                result.left_out[_name(path)] = (
-                    "its type or shape changes, no dtype holds it exactly, or it cannot be read"
-                )
+                result.left_out[_name(path)] = "its type or shape changes, or no dtype holds it exactly"
                 continue
             result.rows += count
             result.columns.append(_name(path))
