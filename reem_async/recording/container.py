@@ -136,6 +136,11 @@ class Container:
             self._data.close()
             self._file.close()
 
+    @property
+    def left_out(self) -> int:
+        """How many of the damaged records had to be left out; indexes are made anew."""
+        return self.damaged - len(self._remade)
+
     # Opening.
 
     def _summarized(self) -> list[ChunkInfo] | None:

@@ -77,7 +77,7 @@ def export(log: Log, kind: str, target: str | FilePath, patterns: Sequence[str] 
         part.replace(target)
     except OSError as error:
         part.unlink(missing_ok=True)
-        raise OSError(error.errno, error.strerror, str(target)) from error
+        raise OSError(error.errno, error.strerror or str(error), str(target)) from error
     except BaseException:
         part.unlink(missing_ok=True)
         raise

@@ -184,7 +184,7 @@ class Log:
     @property
     def unreadable(self) -> int:
         """How many updates were left out until now, since they are damaged, or of a type that was not recorded."""
-        return max(self._past.unreadable, self._container.damaged)
+        return max(self._past.unreadable, self._container.left_out)
 
     @property
     def metadata(self) -> dict[str, str]:
