@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -89,5 +91,24 @@ async def _ask(interface: RedisInterface, path: str) -> None:
     from reem_async.cli.outlines import describe
 
     what = describe(await outline(interface, path), 60)
-    if not typer.confirm(f"Delete {clean(path)} ({what}) at {interface.hostname}?", err=True):
+    if not _agreed(f"Delete {clean(path)} ({what}) at {interface.hostname}?"):
         raise Refused("nothing was deleted")
+
+
+def _agreed(question: str) -> bool:
+    """Ask; Ctrl-C ends the asking, which the event loop, standing still meanwhile, would not get to know of."""
+    pressed = []
+
+    def interrupted(*_: object) -> NoReturn:
+        pressed.append(True)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupted)
+    try:
+        return typer.confirm(question, err=True)
+    except typer.Abort:
+        if pressed:
+            raise asyncio.CancelledError from None
+        return False  # the end of the input is no answer
+    finally:
+        signal.signal(signal.SIGINT, before)

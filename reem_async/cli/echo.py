@@ -106,7 +106,7 @@ def _for_people(event: Event, value: Any, known: bool, skipped: int, *, cut_line
         lines.append(styled("# a gap: the connection broke, or an update was unreadable", "yellow"))
     if skipped:
         lines.append(styled(f"# {skipped} updates were skipped: they came faster than they could be shown", "yellow"))
-    moment, path = datetime.fromtimestamp(event.time).strftime("%H:%M:%S.%f"), typed(event.path)
+    moment, path = _moment(event.time), typed(event.path)
     if event.deleted:
         what = "deleted"
     elif known:
@@ -120,6 +120,13 @@ def _for_people(event: Event, value: Any, known: bool, skipped: int, *, cut_line
     colour = "red" if event.deleted else "" if known else "cyan"
     lines.append(f"{styled(moment, 'dim')}  {styled(path, 'bold')}  {styled(what, colour) if colour else what}")
     return lines
+
+
+def _moment(time: float) -> str:
+    try:
+        return datetime.fromtimestamp(time).strftime("%H:%M:%S.%f")
+    except (ValueError, OverflowError, OSError):  # a publisher's clock may be set to anything
+        return f"{time:g} s"
 
 
 def _one_line(value: Any) -> str:

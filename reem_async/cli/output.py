@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import re
 import shutil
@@ -66,7 +68,10 @@ def json_text(value: Any, *, pretty: bool = False) -> str:
     import orjson
 
     options = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if pretty else 0)
-    text = orjson.dumps(value, default=_plain, option=options).decode()
+    try:
+        text = orjson.dumps(value, default=_plain, option=options).decode()
+    except orjson.JSONEncodeError:  # nested very deep, or half a surrogate pair
+        text = json.dumps(_simple(value), indent=2 if pretty else None, separators=None if pretty else (",", ":"))
     return "\n".join(map(clean, text.split("\n")))
 
 
@@ -78,6 +83,16 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value)
+
+
+def _simple(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _simple(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_simple(item) for item in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return value if value is None or isinstance(value, str | int) else _simple(_plain(value))
 
 
 def emit_json(value: Any) -> None:
@@ -97,9 +112,14 @@ def size_text(size: float) -> str:
 
 def typed(path: Sequence[str | int]) -> str:
     """Return a full path as a user can type it, also where the top-level key has a dot: `["a.b"].c`."""
+    return clean("".join(map(_element, path)).removeprefix("."))
+
+
+def _element(key: str | int) -> str:
     from reem_async.plan.paths import suffix
 
-    return clean(suffix(tuple(path)).removeprefix("."))
+    text = suffix((key,))
+    return text if clean(text) == text or text.startswith("[") else f"[{json.dumps(key)}]"
 
 
 def columns(

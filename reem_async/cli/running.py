@@ -64,7 +64,7 @@ def run(
         namespace: What goes before every key.
         live: The command goes on until Ctrl-C.
     """
-    code = guarded(name, lambda: asyncio.run(_connected(work, url, namespace, live)), live=live)
+    code = guarded(name, lambda: asyncio.run(_connected(work, url, namespace)), live=live)
     if code:
         raise typer.Exit(code)
 
@@ -102,12 +102,10 @@ def prepared(name: str, make: Callable[[], Result]) -> Result:
     return result[0]
 
 
-async def _connected(
-    work: Callable[[RedisInterface], Awaitable[int | None]], url: str, namespace: str, live: bool
-) -> Any:
+async def _connected(work: Callable[[RedisInterface], Awaitable[int | None]], url: str, namespace: str) -> Any:
     from reem_async.connection import RedisInterface
 
-    _cancel_on([signal.SIGINT, signal.SIGTERM] if live else [signal.SIGINT])
+    _cancel_on([signal.SIGINT, signal.SIGTERM])
     interface = RedisInterface(address_of(url), namespace=namespace, timeout=CALL_SECONDS)
     try:
         await interface.initialize()

@@ -161,6 +161,8 @@ class _Saver:
             while True:
                 try:
                     await self.once(interface, bar=False)
+                except BrokenPipeError:  # nobody reads any more
+                    raise
                 except (ReemError, RedisError, OSError) as error:
                     if not self._made:
                         raise

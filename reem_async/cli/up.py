@@ -15,7 +15,9 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from reem_async.errors import BadData, BadValue, ServerFailed, ServerMissing
+from reem_async.cli.output import clean
+from reem_async.cli.running import INTERRUPTED
+from reem_async.errors import RedisError, ReemError
 from reem_async.server import EmbeddedServer
 
 PASSWORD_VARIABLE = "REEM_PASSWORD"  # noqa: S105 - the name of a variable
@@ -81,16 +83,20 @@ def up(
     variable = _password_variable(password_from_env)
     if port is None:
         port = 0 if snapshot else DEFAULT_PORT
-    stop = Stop()
+    if snapshot is not None and snapshot.exists() and not snapshot.is_file():
+        fail(f"{snapshot} is no file; give a snapshot")
     try:
         server = EmbeddedServer(port, directory, os.environ[variable] if variable else None, snapshot)
-        with server:
+        with server:  # until it is up, Ctrl-C ends the loading at once
+            stop = Stop()
             _describe(server, directory, variable, snapshot)
             while not stop.wait(LOOK_SECONDS):
                 if not server.running:
                     fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
-    except (BadData, BadValue, OSError, ServerFailed, ServerMissing) as error:
+    except (ReemError, RedisError, OSError) as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
     with suppress(OSError):  # the terminal may have closed
         Console().print(f"Stopped. The data is {'kept' if directory else 'gone'}.")
 
@@ -154,7 +160,7 @@ def print_rows(console: Console, rows: list[tuple[str, str]]) -> None:
     """Print what there is to know, one fact a line."""
     for label, value in rows:
         # soft_wrap: a line to be copied stays one line, however narrow the terminal
-        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value), soft_wrap=True)
+        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), clean(value)), soft_wrap=True)
 
 
 def _summary(path: Path) -> str:
@@ -175,5 +181,6 @@ def _log_end(server: EmbeddedServer) -> str:
 
 def fail(message: str) -> NoReturn:
     """Say why on standard error and exit with code 1."""
-    Console(stderr=True).print(Text.assemble(("reem up: ", "bold red"), message), soft_wrap=True)
+    lines = "\n".join(map(clean, message.split("\n")))
+    Console(stderr=True).print(Text.assemble(("reem up: ", "bold red"), lines), soft_wrap=True)
     raise typer.Exit(1)

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, NoReturn
@@ -25,12 +26,19 @@ def parse_value(text: str, *, is_text: bool) -> Any:
     if text.startswith("-") and text != "-" and not text[1:2].isdigit():
         raise Refused(f"there is no option {text.partition('=')[0]}; text that begins with - goes in '\"...\"'", USAGE)
     if is_text:
-        return sys.stdin.read().removesuffix("\n") if text == "-" else text
+        return _read(sys.stdin, "the standard input").removesuffix("\n") if text == "-" else text
     if text == "-":
-        return _json(sys.stdin.read(), "the standard input")
+        return _json(_read(sys.stdin, "the standard input"), "the standard input")
     if text.startswith("@"):
         return _from_file(Path(text[1:]))
     return _json(text, "VALUE")
+
+
+def _read(file: IO[str], where: str) -> str:
+    try:
+        return file.read()
+    except UnicodeDecodeError as error:
+        raise Refused(f"{where} is not UTF-8 text: {error}", USAGE) from None
 
 
 def _json(text: str, where: str) -> Any:
@@ -48,14 +56,17 @@ def _json(text: str, where: str) -> Any:
 
 def _from_file(path: Path) -> Any:
     if path.suffix == ".json":
-        return _json(path.read_text(encoding="utf-8"), str(path))
+        with path.open(encoding="utf-8") as file:
+            return _json(_read(file, str(path)), str(path))
     if path.suffix != ".npy":
         raise Refused(f"{path}: @ takes a .json or .npy file", USAGE)
     import numpy as np
 
     try:
         return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # numpy evaluates what stands at the beginning of the file: anything may come of that
         raise Refused(f"{path} is not an .npy file of plain data: {error}") from None
 
 
@@ -115,7 +126,10 @@ def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
     others = _collect(value, (), arrays)
     if not arrays:
         raise Refused(f"{where} holds no array; use a .json file")
-    np.savez(file, **{name: array for name, array in arrays.items() if name != "file"}, allow_pickle=False)
+    with zipfile.ZipFile(file, "w") as archive:  # numpy's own function takes some names for its arguments
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
     left = f"; {others} other values left out" if others else ""
     return f"{len(arrays)} array{'' if len(arrays) == 1 else 's'}{left}"
 

@@ -62,6 +62,11 @@ class _Hashed:
         """Leave closing to the owner."""
 
 
+_LARGEST_INDEX = 1 << 29
+_LATEST = 1 << 37
+"""A time in seconds since 1970 that no snapshot has been taken at."""
+
+
 class ArchiveWriter:
     """Makes one portable snapshot, which has its name when `finish` has returned, or never.
 
@@ -194,7 +199,7 @@ class Archive:
         return Snapshot(
             path=self._path,
             kind="portable",
-            time=float(header["time"]),
+            time=_within(float(header["time"]), _LATEST),
             size=self._path.stat().st_size,
             count=len(keys),
             keys=keys,
@@ -205,12 +210,17 @@ class Archive:
         )
 
     def _json(self, member: str) -> dict[str, Any]:
+        if self._zip.getinfo(member).file_size > _LARGEST_INDEX:
+            raise ValueError(f"{member} is larger than any index")
         content: dict[str, Any] = orjson.loads(self._zip.read(member))
         return content
 
     def _value(self, row: dict[str, Any]) -> Value:
         blob = self._zip.read(row["file"])
-        return Value(row["suffix"], row["type"], (blob,) if row["type"] == "string" else tuple(split(blob)))
+        pieces = (blob,) if row["type"] == "string" else tuple(split(blob))
+        if (row["type"] in ("hash", "zset") and len(pieces) % 2) or (row["type"] == "ReJSON-RL" and len(pieces) != 1):
+            raise ValueError(f"a {row['type']} of {len(pieces)} pieces")
+        return Value(row["suffix"], row["type"], pieces)
 
 
 def _saved_key(row: dict[str, Any]) -> SavedKey:
@@ -223,8 +233,14 @@ def _saved_key(row: dict[str, Any]) -> SavedKey:
     unknown = [value["type"] for value in row["values"] if value["type"] not in KINDS]
     if unknown:
         raise ValueError(f"a value of {name} has the unknown type {unknown[0]!r}")
-    values = tuple([(value["suffix"], value["type"], int(value["size"])) for value in row["values"]])
-    return SavedKey(name, int(row["size"]), values)
+    values = tuple([(it["suffix"], it["type"], int(_within(it["size"], 2**63))) for it in row["values"]])
+    return SavedKey(name, int(_within(row["size"], 2**63)), values)
+
+
+def _within(number: float, limit: float) -> float:
+    if not 0 <= number < limit:
+        raise ValueError(f"{number!r} cannot be")
+    return number
 
 
 @contextmanager
@@ -236,7 +252,7 @@ def _believed(path: Path) -> Iterator[None]:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise BadData(f"{path}: the snapshot is damaged or not complete: {error}") from None
-    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise BadData(f"{path}: the snapshot is damaged, its index does not fit its content: {error}") from None
 
 

@@ -7,11 +7,15 @@ import os
 import re
 import secrets
 import time
+import zipfile
+import zlib
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
+
+import orjson
 
 from ..errors import BadData
 
@@ -27,6 +31,7 @@ _NAME = re.compile(r"reem-(?P<auto>auto-)?(?P<time>\d{8}T\d{6}Z)(?:-\d+)?\.(?:zi
 _TIME = "%Y%m%dT%H%M%SZ"
 _ABANDONED_SECONDS = 3600.0
 _PART = ".part"
+_LONGEST_HEADER = 1 << 16
 
 
 class SavedKey(NamedTuple):
@@ -117,19 +122,20 @@ def dated(path: Path) -> float | None:
 def prune(made: Sequence[Path], keep: int) -> list[Path]:
     """Delete the oldest snapshots that were saved by period until `keep` are left; return what was deleted.
 
-    Only files beside the last one made that have such a name and such content, and are of its kind, are
-    deleted, and never that one itself. Those of earlier runs go first, whatever the clock said then and
-    says now: a robot without a clock of its own begins each day in 1970.
+    Only files beside the last one made that have such a name and such content, and are of its kind, server,
+    namespace and pattern, are deleted, and never that one itself. Those of earlier runs go first, whatever the
+    clock said then and says now: a robot without a clock of its own begins each day in 1970.
 
     Args:
         made: What this run has saved, in this order.
         keep: How many to leave, at least 1.
     """
     newest, order = made[-1], {path: number for number, path in enumerate(made)}
+    origin = _origin(newest)
     own = [
         path
         for path in newest.parent.iterdir()
-        if path.suffix == newest.suffix and path != newest and _is_automatic(path)
+        if path.suffix == newest.suffix and path != newest and _is_automatic(path) and _origin(path) == origin
     ]
     own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
     gone = own[: max(0, len(own) + 1 - keep)]
@@ -146,6 +152,18 @@ def _is_automatic(path: Path) -> bool:
         return SUFFIXES[sniff(path)] == path.suffix
     except (BadData, OSError):
         return False
+
+
+def _origin(path: Path) -> tuple[object, ...]:
+    """Return what of which server a snapshot holds, as far as it says that; an RDB file does not."""
+    if path.suffix != SUFFIXES["portable"]:
+        return ()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            said = orjson.loads(archive.open(FIRST_MEMBER.decode()).read(_LONGEST_HEADER))
+        return said["server"], said["namespace"], said["match"]
+    except (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, zlib.error, RuntimeError):
+        return (path,)
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
@@ -168,7 +186,7 @@ class NewFile:
     """
 
     def __init__(self, path: Path) -> None:
-        _remove_abandoned(path.parent)
+        _remove_abandoned(path)
         self._path = path
         self._part = path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}{_PART}")
         self.file: BinaryIO = self._part.open("x+b")
@@ -188,9 +206,12 @@ class NewFile:
         self._part.unlink(missing_ok=True)
 
 
-def _remove_abandoned(directory: Path) -> None:
-    """Remove what a run that was killed has left: it would have been written to within the hour."""
-    for part in directory.glob(f".reem-*{_PART}"):
+def _remove_abandoned(path: Path) -> None:
+    """Remove what a run that was killed has left of this name or one by time: it would have been written to lately."""
+    mine = re.compile(rf"\.{re.escape(path.name[:200])}\.[0-9a-f]{{8}}{re.escape(_PART)}")
+    for part in path.parent.glob(f".*{_PART}"):
+        if not (part.name.startswith(".reem-") or mine.fullmatch(part.name)):
+            continue
         with suppress(OSError):
             if time.time() - part.stat().st_mtime > _ABANDONED_SECONDS:
                 part.unlink()

@@ -13,7 +13,7 @@ import anyio.to_thread
 
 from .. import __version__
 from ..connection import RedisInterface
-from ..errors import BadData, Conflict, MissingKey, WrongKind
+from ..errors import BadData, Conflict, MissingKey, PartialWrite, RedisError, ReemError, WrongKind
 from ..plan import Command, Plan
 from ..plan.keys import Keys
 from ..plan.notices import announce, published
@@ -272,10 +272,18 @@ async def _put(session: Session, keys: Keys, entry: Entry, done: list[str], *, r
         except (Conflict, WrongKind) as error:
             if not done:
                 raise
-            raise Conflict(
-                f"{error}. Written before that: {len(done)} keys, from {done[0]!r} to {done[-1]!r}"
-            ) from None
+            raise Conflict(_after(error, done)) from None
+        except (ReemError, RedisError) as error:
+            if not done:
+                raise
+            raise PartialWrite(_after(error, done)) from error
     done.append(keys.name)
+
+
+def _after(error: Exception, done: Sequence[str]) -> str:
+    """Return what went wrong, and what had been written by then."""
+    why = str(error).removesuffix(", nothing was written")
+    return f"{why}. Written before that: {len(done)} keys, from {done[0]!r} to {done[-1]!r}"
 
 
 def _tell(progress: Told | None, doing: str, done: int, total: int) -> None:

@@ -148,7 +148,7 @@ def describe_rdb(path: Path) -> Snapshot:
         facts, count = _read_head(file)
     moment = facts.get("ctime", "")
     program = next((f"{name[:-4]} {facts[name]}" for name in ("redis-ver", "valkey-ver") if name in facts), "")
-    taken = float(moment) if moment.isdigit() else status.st_mtime
+    taken = float(moment) if moment.isascii() and moment.isdigit() and len(moment) < 12 else status.st_mtime
     return Snapshot(path, "rdb", taken, status.st_size, count, server=program)
 
 
