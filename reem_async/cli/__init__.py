@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 from typing import TYPE_CHECKING, NamedTuple
@@ -57,12 +58,7 @@ COMMANDS = (
 
 def main() -> None:
     """Run the command line; exit code 1 and the remedy if what it needs is not installed."""
-    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
-        stream = getattr(sys, name)
-        if stream is None:  # closed by the shell
-            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - until the program ends
-        elif mode == "w" and hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")  # not all terminals know all characters
+    _mend_streams()
     try:
         app = build()
     except KeyboardInterrupt:
@@ -76,6 +72,18 @@ def main() -> None:
         )
         raise SystemExit(1) from None
     app(prog_name="reem")
+
+
+def _mend_streams() -> None:
+    """Have all three streams, whatever the shell has closed; show characters that a terminal does not know as codes."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 - until the program ends
+            atexit.register(stream.close)
+            setattr(sys, name, stream)
+        elif mode == "w":
+            stream.reconfigure(errors="backslashreplace")
 
 
 def build() -> typer.Typer:

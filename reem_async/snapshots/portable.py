@@ -282,7 +282,7 @@ async def _put(session: Session, keys: Keys, entry: Entry, done: list[str], *, r
 
 def _after(error: Exception, done: Sequence[str]) -> str:
     """Return what went wrong, and what had been written by then."""
-    why = str(error).removesuffix(", nothing was written")
+    why = str(error).replace(", nothing was written", "")
     return f"{why}. Written before that: {len(done)} keys, from {done[0]!r} to {done[-1]!r}"
 
 

@@ -1,0 +1,262 @@
+"""The command line with odd names, files, clocks, encodings, and with Ctrl-C at a question."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pty
+import shlex
+import signal
+import subprocess
+import time
+
+import numpy as np
+import orjson
+import pytest
+import typer
+from conftest import assert_same
+from rich.console import Console
+from snapshotkit import servers  # noqa: F401 - a fixture
+from test_cli import REEM, CommandLine
+
+import reem as blocking
+import reem.snapshots
+from reem_async.cli.echo import _moment
+from reem_async.cli.output import json_text, typed
+from reem_async.cli.running import Refused
+from reem_async.cli.up import fail, print_rows
+from reem_async.cli.values import parse_value, save
+from reem_async.errors import BadData, ReemError
+from reem_async.plan.paths import parse
+from reem_async.snapshots import described
+from reem_async.snapshots.archive import Archive, ArchiveWriter, header
+from reem_async.snapshots.files import NewFile, prune
+from reem_async.snapshots.rdb import describe_rdb
+from reem_async.snapshots.values import Entry, Value
+
+
+@pytest.fixture
+def reem(server_url, key):
+    return CommandLine(server_url, key())
+
+
+@pytest.fixture
+def kvs(server_url, key):
+    with blocking.RedisInterface(server_url, namespace=key()) as interface:
+        yield blocking.KeyValueStore(interface)
+
+
+@pytest.mark.parametrize(
+    ("press", "code", "left"), [("^C", 130, ["a"]), ("n\n", 1, ["a"]), ("\x04", 1, ["a"]), ("y\n", 0, [])]
+)
+def test_before_a_whole_key_goes_it_is_asked(reem, kvs, press, code, left):
+    kvs["a"] = 1
+    mine, its = pty.openpty()
+    pipes = {"stdin": its, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(reem.words("del", "a"), env=reem.environment(), **pipes) as process:
+        said = b""
+        while b"[y/N]" not in said:
+            said += process.stderr.read(1)
+        time.sleep(0.1)
+        if press == "^C":
+            process.send_signal(signal.SIGINT)
+        else:
+            os.write(mine, press.encode())
+        assert process.wait(10) == code
+        assert b"Traceback" not in process.stderr.read()
+    os.close(mine)
+    os.close(its)
+    assert kvs.keys() == left
+
+
+def test_no_name_of_an_array_is_special_to_a_file(tmp_path):
+    value = {name: np.arange(3) + place for place, name in enumerate(("file", "allow_pickle", "args", "x"))}
+    assert save(value, tmp_path / "a.npz", "a").endswith("4 arrays")
+    with np.load(tmp_path / "a.npz") as found:
+        assert_same({name: found[name] for name in found.files}, value)
+
+
+def made(path, entries=(), index=None, **head):
+    """A snapshot with a valid digest, whatever it says."""
+    writer = ArchiveWriter(path, header("s", "", "*", "1") | head)
+    for entry in entries:
+        writer.add(entry)
+    if index is not None:
+        put = writer._put
+        writer._put = lambda name, _, *rest: put(name, index, *rest)
+    writer.finish([])
+    return path
+
+
+def test_only_snapshots_of_the_same_server_and_namespace_are_deleted(tmp_path):
+    names = [tmp_path / f"reem-auto-20260801T1200{second:02}Z.zip" for second in range(6)]
+    for place, name in enumerate(names):
+        made(name, namespace="one" if place % 2 else "two", match="*" if place else "arm*")
+    assert prune([names[5]], 1) == [names[1], names[3]]
+    assert prune([names[4]], 1) == [names[2]]
+    assert sorted(tmp_path.iterdir()) == [names[0], names[4], names[5]]
+
+
+def test_a_restore_that_fails_says_how_far_it_came(servers, tmp_path):  # noqa: F811
+    source, target = servers
+    with blocking.RedisInterface(source) as one, blocking.RedisInterface(target) as other:
+        store = blocking.KeyValueStore(one)
+        for number in range(100):
+            store[f"k{number:03}"] = {"x": np.random.default_rng(number).random(12_500)}
+        blocking.snapshots.save(one, tmp_path / "a.zip")
+        import redis
+
+        admin = redis.Redis(unix_socket_path=str(target.socket_path))
+        admin.config_set("maxmemory", admin.info("memory")["used_memory"] + 4_000_000)
+        try:
+            with pytest.raises(ReemError, match=r"Written before that: \d+ keys, from 'k000'") as caught:
+                blocking.snapshots.restore(other, tmp_path / "a.zip")
+        finally:
+            admin.config_set("maxmemory", 0)
+        assert "nothing was written" not in str(caught.value)
+        assert 0 < len(blocking.KeyValueStore(other).keys()) < 100
+        admin.flushall()
+        admin.close()
+
+
+def test_saving_by_period_ends_with_its_reader(reem, kvs, tmp_path):
+    kvs["a"] = 1
+    words = shlex.join(
+        [REEM, "snapshot", "save", "--namespace", reem.namespace, "--every", "1s", "-d", str(tmp_path), "--keep", "3"]
+    )
+    run = subprocess.run(
+        ["sh", "-c", f"{words} | head -1"],
+        env=reem.environment(),
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert (run.stdout.count("\n"), run.stderr.replace("Stopped; what is listed above is complete.\n", "")) == (1, "")
+
+
+NAMES = {"name": "a", "file": "x", "registry": [], "values": []}
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        {"time": 1e300},
+        {"time": -5},
+        {"index": orjson.dumps({"keys": [NAMES | {"size": 1e308}], "foreign": 0, "foreign_names": []})},
+        {"index": orjson.dumps({"keys": [NAMES | {"size": -1}], "foreign": 0, "foreign_names": []})},
+    ],
+)
+def test_a_snapshot_that_says_what_cannot_be_is_damaged(tmp_path, odd):
+    with pytest.raises(BadData, match="damaged"):
+        described(made(tmp_path / "a.zip", **odd))
+
+
+def test_an_index_that_unpacks_to_gigabytes_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("reem_async.snapshots.archive._LARGEST_INDEX", 1 << 20)
+    with pytest.raises(BadData, match="larger than any index"):
+        described(made(tmp_path / "a.zip", index=b" " * (1 << 21) + b'{"keys":[],"foreign":0,"foreign_names":[]}'))
+
+
+@pytest.mark.parametrize(("kind", "pieces"), [("zset", (b"a",)), ("hash", (b"a",)), ("ReJSON-RL", ())])
+def test_values_of_the_wrong_number_of_pieces_are_damaged(tmp_path, kind, pieces):
+    entry = Entry("foo", b'{"a":1}', (".z",), (Value(".z", kind, pieces),))
+    with Archive(made(tmp_path / "a.zip", [entry])) as archive, pytest.raises(BadData, match="pieces"):
+        archive.read("foo")
+
+
+@pytest.mark.parametrize("moment", ["9" * 20, "\u00b2"])
+def test_an_rdb_file_of_an_odd_time(tmp_path, moment):
+    file = tmp_path / "a.rdb"
+    text = moment.encode()
+    file.write_bytes(b"REDIS0011\xfa\x05ctime" + bytes([len(text)]) + text + b"\xff")
+    assert describe_rdb(file).time == pytest.approx(time.time(), abs=10)
+
+
+def test_what_a_killed_run_has_left_of_this_name_is_removed(tmp_path):
+    old, other = tmp_path / ".b.zip.0123abcd.part", tmp_path / ".c.zip.0123abcd.part"
+    for part in (old, other):
+        part.write_bytes(b"x")
+        os.utime(part, (1, 1))
+    NewFile(tmp_path / "b.zip").discard()
+    assert list(tmp_path.iterdir()) == [other]
+
+
+def test_what_files_say_does_not_command_the_terminal(capsys):
+    file = io.StringIO()
+    print_rows(Console(file=file), [("snapshot", "under \x1b]0;pwned\x07")])
+    assert "\x1b]0" not in file.getvalue()
+    with pytest.raises(typer.Exit):
+        fail("a value of \x1b[31mevil\nsecond line")
+    errors = capsys.readouterr().err
+    assert ("\\u001b[31mevil" in errors, errors.count("\n")) == (True, 2)
+
+
+def test_json_of_what_orjson_refuses():
+    deep = value = {}
+    for _ in range(200):
+        deep["a"] = deep = {}
+    assert json.loads(json_text(value)) == value
+    odd = {"half": "a\ud800b", "array": np.array(["\udfff"]), "nan": [np.nan, 1.5], "b": b"x", "pair": np.float64(2)}
+    wanted = {"half": "a\ud800b", "array": ["\udfff"], "nan": [None, 1.5], "b": "eA==", "pair": 2.0}
+    assert json.loads(json_text(odd)) == json.loads(json_text(odd, pretty=True)) == wanted
+
+
+def test_a_terminal_that_does_not_know_all_characters(reem, kvs):
+    kvs["a"] = {"text": "日本"}
+    run = reem.process("tree", PYTHONIOENCODING="ascii")
+    assert (run.returncode, "\\u65e5" in run.stdout) == (0, True)
+
+
+def test_without_an_output(reem, kvs):
+    kvs["a"] = 1
+    words = shlex.join(reem.words("ls"))
+    run = subprocess.run(
+        ["sh", "-c", f"{words} >&-"], env=reem.environment(), capture_output=True, text=True, timeout=20, check=False
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("clock", [1e13, 1e300, -1e12, float("nan")])
+def test_an_update_of_an_odd_time_is_shown(clock):
+    assert _moment(clock) == f"{clock:g} s"
+    assert _moment(1.5).endswith("00:01.500000")
+
+
+def test_values_from_files_that_are_none(tmp_path):
+    text, array = tmp_path / "a.json", tmp_path / "a.npy"
+    text.write_bytes(b'"\xff"')
+    with pytest.raises(Refused, match="not UTF-8"):
+        parse_value(f"@{text}", is_text=False)
+    for head in (
+        "(((((",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (10**30,)}",
+        f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({10**30},)}}",
+        f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({10**13},)}}",
+    ):
+        line = head.encode() + b"\n"
+        array.write_bytes(b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line)
+        with pytest.raises(Refused, match=r"not an \.npy file of"):
+            parse_value(f"@{array}", is_text=False)
+
+
+@pytest.mark.parametrize("path", [("foo\x9b",), ("a", "b\u202ec", 2), ("a.b", "c"), ("\x1b",)])
+def test_paths_are_shown_as_they_can_be_typed(path):
+    shown = typed(path)
+    assert shown.isprintable()
+    assert parse(shown) == path
+
+
+def test_a_pipe_is_no_snapshot(reem, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    environment = reem.environment()
+    run = subprocess.run(
+        [reem.words("up")[0], "up", "--from", str(tmp_path / "pipe")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert (run.returncode, "is no file" in run.stderr) == (1, True)
