@@ -207,7 +207,7 @@ class WrongKind(ReemError, redis.exceptions.ResponseError):
 
 
 class PartialWrite(ReemError, redis.exceptions.ResponseError):
-    """The server refused a part of a transaction; the message names what was applied."""
+    """A part of a transaction, or of a restored snapshot, was refused; the message names what was applied."""
 
 
 class Refused(ReemError):

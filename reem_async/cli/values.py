@@ -66,7 +66,7 @@ def _from_file(path: Path) -> Any:
         return np.load(path, allow_pickle=False)
     except OSError:
         raise
-    except Exception as error:  # numpy evaluates what stands at the beginning of the file: anything may come of that
+    except Exception as error:  # anything may come of what stands at the beginning of the file
         raise Refused(f"{path} is not an .npy file of plain data: {error}") from None
 
 

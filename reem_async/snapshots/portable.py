@@ -189,6 +189,7 @@ async def restore(
         Conflict: A key is there and `replace` is False. Nothing was written, unless the message says so.
         WrongKind: A Redis key that is not REEM's has the name of one. Nothing was written.
         BadKey: A name with `into` before it is none.
+        PartialWrite: The server, or the connection, failed behind some keys; the message says which were written.
         OSError: The file cannot be read.
     """
     session, source = interface.session, Path(path)
