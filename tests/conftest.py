@@ -202,6 +202,21 @@ async def ainterface(server_url, key):
 
 
 @pytest.fixture
+async def binterface(server_url):
+    """Another interface to the same server, such as a recorder has."""
+    import reem_async
+
+    async with reem_async.RedisInterface(server_url) as opened:
+        yield opened
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Where a recording goes."""
+    return tmp_path / "run.mcap"
+
+
+@pytest.fixture
 async def akvs(ainterface):
     import reem_async
 

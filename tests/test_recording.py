@@ -25,18 +25,6 @@ IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64,
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
 
 
-@pytest.fixture
-def file(tmp_path):
-    return tmp_path / "run.mcap"
-
-
-@pytest.fixture
-async def binterface(server_url):
-    """The recorder's own interface."""
-    async with reem_async.RedisInterface(server_url) as opened:
-        yield opened
-
-
 @contextlib.contextmanager
 def logged(file):
     with open_log(file) as log:

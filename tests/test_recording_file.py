@@ -22,18 +22,11 @@ from test_recording import FRAME, IMAGE
 
 import reem
 import reem.recording
-import reem_async
 from reem_async.errors import BadData, BadValue, MissingKey
 from reem_async.recording import DamagedRecording, Recorder, RecordingFailed, open_log
 from reem_async.recording.output import Output
 from reem_async.recording.times import Arrivals
 from reem_async.recording.writer import Writer
-
-
-@pytest.fixture
-async def binterface(server_url):
-    async with reem_async.RedisInterface(server_url) as opened:
-        yield opened
 
 
 @pytest.fixture(scope="module")

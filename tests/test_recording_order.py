@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from conftest import aeventually, assert_same
 
-import reem_async
 from reem_async.monitor import ANNOUNCED, Event
 from reem_async.plan.patterns import parse_pattern
 from reem_async.recording import Recorder, Replayer, feed, open_log
@@ -18,18 +17,6 @@ from reem_async.recording.state import pruned
 from reem_async.recording.times import published
 
 LARGE = np.zeros((300, 300))
-
-
-@pytest.fixture
-def file(tmp_path):
-    return tmp_path / "run.mcap"
-
-
-@pytest.fixture
-async def binterface(server_url):
-    """The recorder's own interface."""
-    async with reem_async.RedisInterface(server_url) as opened:
-        yield opened
 
 
 def news(file, path):

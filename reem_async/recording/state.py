@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from ..plan.paths import Path
-from ..plan.patterns import Pattern, parse_pattern
+from ..plan.patterns import Pattern
 from ..plan.trees import MISSING, CannotApply, get, removed, replaced
 
 __all__ = ["applied", "planted", "pruned", "without"]
@@ -68,8 +68,3 @@ def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
         return MISSING
     left = {key: pruned(item, (*path, key), wanted) for key, item in tree.items()}
     return {key: item for key, item in left.items() if item is not MISSING}
-
-
-def parsed(patterns: Iterable[str]) -> list[Pattern]:
-    """Return the patterns a user typed."""
-    return [parse_pattern(text) for text in patterns]

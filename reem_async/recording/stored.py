@@ -111,10 +111,11 @@ def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
 
 def opened(tree: Any, path: Path, load: Callable[[Stored], Any]) -> Any:
     """Return `tree` with the long list on the way to `path`, if there is one, as the list that `load` makes of it."""
-    for depth in range(len(path)):
-        it = get(tree, path[:depth])
+    it = tree
+    for depth, key in enumerate(path):
         if type(it) is Stored:
             return replaced(tree, path[:depth], load(it)) if it.label == "list" else tree
+        it = get(it, (key,))
     return tree
 
 
