@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test modes fuzz coverage check chaos mcap bench scale clean
+.PHONY: demo test modes fuzz coverage check chaos mcap bench bench-recorder scale clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -42,6 +42,9 @@ mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCA
 
 bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick for about one
 	.venv-bench/bin/python -m benchmarks $(BENCH)
+
+bench-recorder: .venv-bench/ready  ## what a recorder costs the writers beside it, 14 to 40 minutes
+	.venv-bench/bin/python -m benchmarks.recorder
 
 scale: .venv-bench/ready  ## cost per operation, and docs/scale.md from it, under four minutes; SCALE=--quick
 	.venv-bench/bin/python -m benchmarks.scale $(SCALE)

@@ -50,7 +50,7 @@ class RecorderCase(Case):
         windows: Windows = {name: [] for name in self.contenders}
         seconds, rounds = bench.scaled(self.seconds, 1.0), int(bench.scaled(self.rounds, 1))
         with tempfile.TemporaryDirectory() as folder:
-            with _writers(bench.workers.server.url, folder):
+            with writers(bench.workers.server.url, folder):
                 for number in range(rounds):
                     yield from self._round(bench, number, seconds, windows, folder)
             calls = {what: np.fromfile(f"{folder}/{what}").reshape(-1, 2) for what in WRITERS}
@@ -66,7 +66,7 @@ class RecorderCase(Case):
         shift = number % max(1, len(names))
         for name in names[shift:] + names[:shift]:
             try:
-                with _beside(name, bench.workers.server.url, folder):
+                with beside(name, bench.workers.server.url, folder):
                     time.sleep(SETTLED)
                     begin = time.perf_counter()
                     time.sleep(seconds)
@@ -82,7 +82,7 @@ def _surroundings() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def _writers(url: str, folder: str) -> Iterator[None]:
+def writers(url: str, folder: str) -> Iterator[None]:
     """Both writers at work; at the end their files are complete."""
     module = [sys.executable, "-m", "benchmarks.workers.steady", url]
     running = [
@@ -100,7 +100,7 @@ def _writers(url: str, folder: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _beside(name: str, url: str, folder: str) -> Iterator[None]:
+def beside(name: str, url: str, folder: str) -> Iterator[None]:
     """Somebody beside the writers; a recording that is not whole is an error."""
     command = BESIDE[name]
     if command is None:

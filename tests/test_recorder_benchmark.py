@@ -1,0 +1,61 @@
+"""The long measurement of what a recorder costs: its figures from known windows, its page, and a short real run."""
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks.measure_recorder import WRITERS
+from benchmarks.recorder import Window, judge, lines, rewrite, run
+
+
+def _window(tail: float, steal: float = 0.0) -> Window:
+    """A thousand calls of which three in a hundred take `tail`."""
+    took = np.full(1000, 1e-4)
+    took[:30] = tail
+    return Window(took, steal)
+
+
+def test_the_ratio_is_that_of_the_99th_percentiles_of_all_calls():
+    found = judge([(_window(1e-3), _window(1.1e-3))] * 5)
+
+    assert found["quiet"] == found["all"]
+    assert found["all"]["pairs"] == 5
+    assert found["all"]["alone"] == pytest.approx(1e-3)
+    assert found["all"]["ratio"] == pytest.approx(1.1)
+    assert found["all"]["interval"] == pytest.approx([1.1, 1.1])
+
+
+def test_pairs_of_which_the_host_took_much_are_told_apart_whichever_half_it_was():
+    quiet = (_window(1e-3), _window(1.1e-3))
+    found = judge([quiet, (_window(1e-3, 0.05), _window(9e-3)), quiet, (_window(1e-3), _window(9e-3, 0.05))])
+
+    assert found["quiet"]["pairs"] == 2
+    assert found["quiet"]["ratio"] == pytest.approx(1.1)
+    assert found["all"]["pairs"] == 4
+    assert found["all"]["ratio"] > 5
+    assert found["all"]["interval"][1] > found["all"]["interval"][0]
+
+
+def test_a_run_without_a_quiet_pair_says_so():
+    found = judge([(_window(1e-3, 0.05), _window(1e-3))])
+
+    assert found["quiet"] == {"pairs": 0}
+
+
+def test_a_short_run_measures_both_writers_and_is_written_into_the_page(tmp_path):
+    kept = run(pairs=1, minutes=0.01, seconds=1.0, console=Console(quiet=True))
+
+    head, *rows = lines(kept)
+    assert {row[0] for row in rows} == set(WRITERS)
+    for what in WRITERS:
+        found = kept["writers"][what]["all"]
+        assert 0 < found["alone"] < 1
+        assert 0 < found["recorded"] < 1
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- recorder -->\nold\n<!-- end of recorder -->\nafter\n")
+    rewrite(kept, page)
+    text = page.read_text()
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    assert all(" | ".join(row) in text for row in [head, *rows])
