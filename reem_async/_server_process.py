@@ -139,8 +139,9 @@ class ServerProcess:
     def _config(self, program: ServerProgram, keep: bool, password: str | None) -> str:
         """The configuration: private to this user, and quiet about everything else.
 
-        Every write is in the append-only file before it is answered, and on the platter within a second:
-        kill -9 of the server loses nothing, a power failure the last second.
+        With a directory, a write is in the append-only file before it is answered, unless the disk is so busy that
+        the fsync of the second before still runs: then it waits for that, two seconds at most. So a kill -9 of the
+        server can lose as much as a power failure does.
         """
         lines = [
             f"port {self.port}",

@@ -55,8 +55,9 @@ class EmbeddedServer(Startable):
 
         Args:
             port: TCP port on 127.0.0.1; 0 takes a free one.
-            directory: where the data is kept from one start to the next; made if missing. None keeps it in
-                memory, and it is gone with the server.
+            directory: where the data is kept from one start to the next; made if missing. A server or machine
+                that is killed loses the last two seconds at most; what the server's command WAITAOF was answered
+                for is kept. None keeps the data in memory, and it is gone with the server.
             password: what every client has to give, on the unix socket too.
             snapshot: a file of either kind (see `reem_async.snapshots`) that the server begins with, under the
                 namespace it was taken of. The directory, if there is one, must hold no data yet.
