@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import os
 import pathlib
+import socket
 import threading
 import time
 
@@ -17,6 +19,7 @@ from conftest import assert_same, eventually, python
 from PIL import Image
 
 import reem
+from reem_async.browser import listen
 from reem_async.browser.downloads import file_of
 from reem_async.server import EmbeddedServer
 
@@ -418,3 +421,20 @@ def fill(server):
         pipeline.execute()
     with reem.RedisInterface(server) as interface:
         reem.KeyValueStore(interface)["big"] = np.arange(1e6).reshape(1000, 1000)
+
+
+async def test_answers_are_sent_at_once():
+    """Nagle's algorithm held each answer back until the browser acknowledged its headers, 40 ms later."""
+    loop = asyncio.get_running_loop()
+    accepted = loop.create_future()
+
+    async def answer(reader, writer):
+        accepted.set_result(writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+        writer.close()
+
+    listening = listen("127.0.0.1", 0)
+    async with await asyncio.start_server(answer, sock=listening):
+        _, writer = await asyncio.open_connection(*listening.getsockname())
+        assert await accepted
+        writer.close()
+        await writer.wait_closed()
