@@ -143,6 +143,7 @@ def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
         ("step", {}, 400),
         ("picture", {"path": "{}.raw"}, 400),
         ("nothing", {}, 404),
+        *((what, {}, 400) for what in ("series", "array", "image", "table", "line", "histogram", "bytes", "picture")),
     ],
 )
 def test_what_cannot_be_shown_is_an_error_that_says_so(ask, robot, what, values, status):
@@ -155,6 +156,13 @@ def test_what_is_not_there_is_told_to_a_page_that_waits_for_it(ask, robot):
     """It is no error: the browser's console stays empty."""
     for what in ("node", "array"):
         assert "nothing is stored" in ask.json(what, path=f"{robot}.missing")["missing"]
+
+
+def test_what_the_server_refuses_does_not_look_as_if_it_were_away(ask, raw, key):
+    raw.set(key("foreign"), "of another program")
+    answer = ask.ask("image", path=key("foreign"))
+    assert answer.status_code == 409
+    assert "without REEM" in answer.json()["error"]
 
 
 def test_downloads(ask, robot):

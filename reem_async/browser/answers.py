@@ -11,7 +11,20 @@ import orjson
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ..errors import BadData, BadInput, BadValue, MissingKey, PathRefused, RedisError, ReemError
+from ..errors import (
+    BadData,
+    BadInput,
+    BadValue,
+    MissingKey,
+    NotAllowed,
+    PartialWrite,
+    PathRefused,
+    RedisError,
+    ReemError,
+    ServerFull,
+    ServerReadOnly,
+    WrongKind,
+)
 from ..plan.paths import Path
 from .addresses import path_of
 from .nodes import visible
@@ -28,6 +41,7 @@ __all__ = [
     "path_in",
     "reply",
     "told",
+    "value_path_in",
 ]
 
 LARGEST_BODY = 1 << 16
@@ -38,6 +52,8 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
     (BadInput, 400),
     (PathRefused, 409),
     (BadData, 422),
+    # The server answers, and refuses this: a page must not take it for lost.
+    *((refusal, 409) for refusal in (WrongKind, PartialWrite, NotAllowed, ServerFull, ServerReadOnly)),
     (RedisError, 503),
     (OSError, 503),
     (ReemError, 500),
@@ -79,6 +95,18 @@ def answered(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Req
 def path_in(request: Request) -> Path:
     """Return the path asked for."""
     return path_of(request.query_params.get("path", ""))
+
+
+def value_path_in(request: Request) -> Path:
+    """Return the path asked for, which must lead to a value: the root is none.
+
+    Raises:
+        BadValue: It is missing or empty.
+    """
+    path = path_in(request)
+    if not path:
+        raise BadValue("path= is missing; give a key, such as path=foo.bar")
+    return path
 
 
 def at_of(request: Request) -> float | None:

@@ -22,6 +22,7 @@ from .answers import (
     path_in,
     reply,
     told,
+    value_path_in,
 )
 from .guard import same_origin
 from .nodes import Node, visible
@@ -120,7 +121,7 @@ class Api:
         status = self._source.status()
         start, end = number_of(request, "start"), number_of(request, "end")
         start = status.start if start is None else start
-        found = await self._source.series(path_in(request), start, status.end if end is None else end)
+        found = await self._source.series(value_path_in(request), start, status.end if end is None else end)
         return reply({"start": start, "end": status.end if end is None else end, **_thinned(found)._asdict()})
 
     async def step(self, request: Request) -> Response:

@@ -15,7 +15,7 @@ from starlette.routing import Route
 
 from ..errors import BadType
 from ..plan.paths import Path, show
-from .answers import answered, at_of, integer_of, number_of, path_in, reply, told
+from .answers import answered, at_of, integer_of, number_of, reply, told, value_path_in
 from .figures import MOST_COLUMNS, MOST_ROWS, histogram, line, statistics, table
 from .pictures import LARGEST_SIDE, MAPS, colours_of, paint
 from .slices import Slice, look_at, parse_slice, part
@@ -64,7 +64,7 @@ class Arrays:
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
     async def _array(self, request: Request) -> tuple[np.ndarray[Any, Any], Sample]:
-        path, at = path_in(request), at_of(request)
+        path, at = value_path_in(request), at_of(request)
         sample = await self._source.value(path, at)
         value = sample.value
         if isinstance(value, Leaf):
@@ -146,7 +146,7 @@ class Arrays:
         return Response(value, media_type=kind)
 
     async def _bytes(self, request: Request) -> Any:
-        path = path_in(request)
+        path = value_path_in(request)
         value = (await self._source.value(path, at_of(request))).value
         if isinstance(value, Leaf):
             raise NotKept(f"the bytes at {show(path)} are not kept for this instant: there was no room for them")
