@@ -211,17 +211,28 @@ def test_a_token_is_asked_for_once_and_kept_in_a_cookie(server_url):
             assert ask.http.get(path).status_code == 403
             assert ask.http.get(path, params={"token": "wrong"}).status_code == 403
             assert ask.http.get(path, params={"token": ""}).status_code == 403
-            assert ask.http.get(path, headers={"cookie": "reem_browse=s3cret-tokem"}).status_code == 403
+            wrong = f"reem_browse_{ask.http.base_url.port}=s3cret-tokem"
+            assert ask.http.get(path, headers={"cookie": wrong}).status_code == 403
         answer = ask.http.get("/view/a.b", params={"token": "s3cret-token", "at": "5"})
         assert (answer.status_code, answer.headers["location"]) == (303, "/view/a.b?at=5")
         cookie = answer.headers["set-cookie"].lower()
         assert "httponly" in cookie
         assert "samesite=strict" in cookie
         assert ask.http.get("/").status_code == 200
-        assert ask.http.get("/", headers={"host": "10.0.0.7:80"}).status_code == 200
+        other = {"host": "10.0.0.7:80", "cookie": "reem_browse_80=s3cret-token"}
+        assert ask.http.get("/", headers=other).status_code == 200
         assert ask.http.get("/", headers={"host": "robot.example"}).status_code == 421
         answer = raw_get(ask, "//evil.example/?token=s3cret-token")
         assert "location: /evil.example/\r\n" in answer, "two slashes would lead to another server"
+
+
+def test_two_programs_on_one_machine_keep_their_cookies_apart(server_url):
+    """Browsers send the cookies of a host to all its ports, and keep one of each name."""
+    one, two = (served(live(server_url), token=token) for token in ("first-token", "second-token"))
+    with one as (first, _), two as (second, _), client_of(first) as ask:
+        assert ask.http.get(f"{first}/?token=first-token").status_code == 303
+        assert ask.http.get(f"{second}/?token=second-token").status_code == 303
+        assert [ask.http.get(f"{address}/").status_code for address in (first, second)] == [200, 200]
 
 
 def test_long_requests_are_refused(ask):

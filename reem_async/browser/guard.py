@@ -19,7 +19,8 @@ __all__ = ["LOOPBACK", "Guard", "is_loopback", "new_token", "own_address", "own_
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 """The names under which a browser on this machine reaches it."""
 
-COOKIE = "reem_browse"
+_COOKIE = "reem_browse_"
+"""Its name ends with the port: browsers send the cookies of a host to all its ports."""
 
 _LONGEST_URL = 48_000
 """Characters: a page asks for all its open branches in one."""
@@ -132,10 +133,10 @@ class Guard:
             path = scope.get("raw_path", b"/").partition(b"?")[0].decode("latin-1")
             # Two slashes at the beginning would lead to another server.
             answer = RedirectResponse("/" + path.lstrip("/") + (f"?{rest}" if rest else ""), 303)
-            answer.set_cookie(COOKIE, self._token or "", httponly=True, samesite="strict", path="/")
+            answer.set_cookie(_cookie_name(headers), self._token or "", httponly=True, samesite="strict", path="/")
             return answer
         try:
-            cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+            cookie = SimpleCookie(headers.get("cookie", "")).get(_cookie_name(headers))
         except CookieError:
             cookie = None
         if cookie is not None and self._fits(cookie.value):
@@ -144,6 +145,12 @@ class Guard:
 
     def _fits(self, offered: str) -> bool:
         return secrets.compare_digest(offered.encode(errors="replace"), (self._token or "").encode())
+
+
+def _cookie_name(headers: Headers) -> str:
+    """Return the name of the cookie for the port that the browser sees, which a tunnel may have changed."""
+    port = headers.get("host", "").rpartition(":")[2]
+    return _COOKIE + (port if port.isascii() and port.isdecimal() else "")
 
 
 def _is_address(host: str) -> bool:
