@@ -134,6 +134,7 @@ def test_a_table_shows_a_page_whatever_is_asked():
     assert len(table(array, 0, 0, 10**9, 10**9)["cells"]) <= 200
     assert table(np.zeros(0), 5, 0, 10, 10)["cells"] == []
     assert table(np.array(3.5), 0, 0, 10, 10)["cells"] == [["3.5"]]
+    assert table(np.array([5], "m8[s]"), 0, 0, 5, 5)["cells"] == [["5 seconds"]]
     records = np.array([(1, "a\u202eb")], [("n", int), ("t", "U5")])
     assert "\u202e" not in table(records, 0, 0, 5, 5)["cells"][0][0]
 
@@ -162,7 +163,8 @@ def test_histograms_count_everything():
     assert histogram(np.array([1, 1, 3], np.uint8)) == {"low": 0.5, "high": 3.5, "counts": [2, 0, 1]}
     assert histogram(np.array([np.nan, 2.0, 2.0])) == {"low": 2.0, "high": 2.0, "counts": [2]}
     assert histogram(np.array([np.nan]))["counts"] == []
-    assert sum(histogram(np.array([-1.7e308, 1.7e308]))["counts"]) == 2
+    for close in ([-1.7e308, 1.7e308], [2**62, 2**62 + 5], [1e16, 1e16 + 2], [0.0, 5e-324]):
+        assert histogram(np.array(close))["counts"] == [2], close
 
 
 def test_statistics():

@@ -44,7 +44,7 @@ def cell(item: Any) -> str:
         return f"{float(item):.7g}"
     if isinstance(item, np.complexfloating):
         return f"{complex(item):.5g}"
-    if isinstance(item, np.integer):
+    if isinstance(item, np.integer) and not isinstance(item, np.timedelta64):
         return str(int(item))
     if isinstance(item, np.bool_):
         return "true" if item else "false"
@@ -102,7 +102,9 @@ def histogram(array: np.ndarray[Any, Any], bins: int = 64) -> dict[str, Any]:
     low, high = float(flat.min()), float(flat.max())
     if array.dtype.kind in "biu" and high - low < 256:
         low, high, bins = low - 0.5, high + 0.5, int(high - low) + 1
-    elif low == high or not math.isfinite(high - low):
+    with np.errstate(all="ignore"):
+        edges = np.linspace(low, high, bins + 1)
+    if not (edges[:-1] < edges[1:]).all():  # floats have no room between them for so many parts, or no end of them
         return {"low": low, "high": high, "counts": [int(flat.size)]}
     counts, _ = np.histogram(flat, bins, (low, high))
     return {"low": low, "high": high, "counts": counts.tolist()}
