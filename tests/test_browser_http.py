@@ -109,6 +109,13 @@ def test_the_snippet_of_a_path_reads_it(ask, robot):
         assert done.stdout.strip() == "5", front
 
 
+def test_the_snippet_of_a_key_that_no_path_leads_to_reads_what_holds_it(ask, kvs, key):
+    kvs[key()] = {"d": {"a\\b": [5, 6]}}
+    for front, code in ask.json("node", path=f'{key()}.d["a\\\\b"][1]')["snippets"].items():
+        done = python(code + "print(value)")
+        assert (done.returncode, done.stdout.strip()) == (0, "6"), (front, done.stderr)
+
+
 def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
     about = ask.json("array", path=f"{robot}.image")
     assert (about["dtype"], about["shape"], about["view"]) == ("uint8", [40, 60, 3], "image")

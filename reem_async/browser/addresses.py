@@ -40,14 +40,17 @@ def is_addressable(key: str | int) -> bool:
 
 def snippets(path: Path, url: str, namespace: str) -> dict[str, str]:
     """Return Python that reads a path from a server, for both fronts."""
-    where = "kvs" + "".join([f"[{key!r}]" for key in path])
+    reach = next((index for index, key in enumerate(path) if index and not is_addressable(key)), len(path))
+    where, below = ("".join([f"[{key!r}]" for key in keys]) for keys in (path[:reach], path[reach:]))
+    read = f"kvs{where}.read()"
+    awaited = f"(await {read}){below}" if below else f"await {read}"
     interface = f"RedisInterface({url!r}" + (f", namespace={namespace!r})" if namespace else ")")
     return {
         "blocking (reem)": "from reem import KeyValueStore, RedisInterface\n\n"
-        f"kvs = KeyValueStore({interface})\nvalue = {where}.read()\n",
+        f"kvs = KeyValueStore({interface})\nvalue = {read}{below}\n",
         "asyncio (reem_async)": "import asyncio\nfrom reem_async import KeyValueStore, RedisInterface\n\n"
         "async def main():\n"
         f"    async with {interface} as interface:\n"
-        f"        kvs = KeyValueStore(interface)\n        return await {where}.read()\n\n"
+        f"        kvs = KeyValueStore(interface)\n        return {awaited}\n\n"
         "value = asyncio.run(main())\n",
     }
