@@ -203,6 +203,14 @@ def test_what_json_cannot_hold_is_refused_and_not_left_out(ask, kvs, key):
     assert f"{key()}.z" in answer.json()["error"]
 
 
+@pytest.mark.parametrize("kind", ["json", "csv"])
+def test_text_that_utf8_lacks_is_refused_as_a_file(ask, kvs, key, kind):
+    kvs[key()] = np.array(["\ud800", "plain"])
+    answer = ask.http.get(f"/view/{key()}", params={"format": kind})
+    assert answer.status_code == 400
+    assert "choose npy" in answer.json()["error"]
+
+
 def test_formulas_in_csv_are_quoted(ask, kvs, key):
     kvs[key()] = np.array(["=1+1", "plain", "@x"])
     assert ask.http.get(f"/view/{key()}", params={"format": "csv"}).text.split() == ["'=1+1", "plain", "'@x"]

@@ -54,7 +54,11 @@ def disposition(path: Path, kind: str, chosen: str | None = None) -> str:
 
 
 def _json(value: Any, path: Path, chosen: str | None) -> bytes:
-    return orjson.dumps(_plain(value, path), option=orjson.OPT_INDENT_2)
+    plain = _plain(value, path)
+    try:
+        return orjson.dumps(plain, option=orjson.OPT_INDENT_2)
+    except orjson.JSONEncodeError:
+        raise _no_text(path) from None
 
 
 def _plain(value: Any, path: Path) -> Any:
@@ -102,7 +106,15 @@ def _csv(value: Any, path: Path, chosen: str | None) -> bytes:
     else:
         rows = plane.reshape(-1, 1).tolist() if plane.ndim < 2 else plane.tolist()
     writer.writerows([[_cell(item) for item in row] for row in rows])
-    return file.getvalue().encode()
+    try:
+        return file.getvalue().encode()
+    except UnicodeEncodeError:
+        raise _no_text(path) from None
+
+
+def _no_text(path: Path) -> BadType:
+    """Return what is raised for text of an array that no file of text can hold."""
+    return BadType(f"{show(path)} has an array with half of a surrogate pair, which UTF-8 lacks; choose npy for it")
 
 
 def _cell(item: Any) -> Any:
