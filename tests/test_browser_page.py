@@ -465,6 +465,32 @@ def test_lost_connections_are_seen_and_mended(chromium, tmp_path):
     visitor.contexts[0].close()
 
 
+HIDE = """hidden => {
+  Object.defineProperty(document, "hidden", { configurable: true, get: () => hidden });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def test_pages_in_other_tabs_take_no_connection_and_come_back_up_to_date(visit, pspace, key):
+    """A browser has six for all pages of one host: a seventh page would wait for ever."""
+    pspace[key()] = 1
+    pages = [visit.open(f"/view/{key()}")]
+    for _ in range(7):
+        pages[-1].evaluate(HIDE, True)
+        page = pages[0].context.new_page()
+        page.goto(pages[0].url)
+        expect(page.locator(".big")).to_have_text("1")
+        pages.append(page)
+    pspace[key()] = 2
+    expect(pages[-1].locator(".big")).to_have_text("2")
+    expect(pages[0].locator(".big")).to_have_text("1")
+    pages[0].evaluate(HIDE, False)
+    expect(pages[0].locator(".big")).to_have_text("2")
+    pspace[key()] = 3
+    expect(pages[0].locator(".big")).to_have_text("3")
+    expect(pages[0].locator("#banner")).to_be_hidden()
+
+
 def test_ten_thousand_rows_do_not_make_the_page_slow(visit, kvs, key):
     kvs[key()] = {f"k{number:05}": number for number in range(10_000)}
     page = visit.open(f"/view/{key()}")

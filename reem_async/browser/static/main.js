@@ -156,20 +156,26 @@ class Finder {
   }
 }
 
+let events = null;
+
+// A hidden page lets go of its connection: a browser has six for all pages of one host.
 function listen() {
-  const events = new EventSource("/api/events");
+  events?.close();
+  clearTimeout(listen.again);
+  if (document.hidden) return;
+  events = new EventSource("/api/events");
   events.onopen = () => { app.heard = performance.now(); lost("page", ""); app.refresh(); };
   events.onmessage = (event) => {
     app.heard = performance.now();
     lost("page", "");
     const said = JSON.parse(event.data);
     app.spanFrom(said);
-    if (config.live && app.at === null && !document.hidden) app.news(said.paths, said.more);
+    if (config.live && app.at === null) app.news(said.paths, said.more);
     if (config.live && performance.now() - (app.counted ?? 0) > 1000) { app.counted = performance.now(); time.loadActivity(); }
   };
   events.onerror = () => {
     lost("page", "the program behind this page (reem browse) does not answer. Trying again…");
-    if (events.readyState === EventSource.CLOSED) refused().then(() => setTimeout(listen, 2000));
+    if (events.readyState === EventSource.CLOSED) refused().then(() => { listen.again = setTimeout(listen, 2000); });
   };
 }
 
@@ -231,7 +237,7 @@ document.addEventListener("click", (event) => {
   app.go(link.dataset.go);
 });
 document.addEventListener("keydown", onKey);
-document.addEventListener("visibilitychange", () => { app.heard = performance.now(); if (!document.hidden) app.refresh(); });
+document.addEventListener("visibilitychange", () => { app.heard = performance.now(); listen(); });
 window.addEventListener("popstate", route);
 route();
 listen();
