@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import os
 import pathlib
 import socket
@@ -301,6 +302,51 @@ def test_what_is_only_stored_is_noticed_too(ask, kvs, key):
     eventually(lambda: ask.json("series", path=f"{key()}.x")["lines"][0][-1] == 2.0)
     assert ask.rows(key(), at=at)["x"]["text"] == "1"
     assert ask.rows(key())["x"]["time"] > at
+
+
+def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(ask, pspace, kvs, key):
+    """It is told from what was published, which is not taken for it."""
+
+    def mode(at):
+        return ask.json("node", path=f"{key()}.mode", at=at).get("text")
+
+    def writes():
+        return sum(ask.json("activity", path=f"{key()}.mode")["counts"])
+
+    pspace[key()] = {"x": 0, "mode": "idle", "items": [0] * 5, "image": np.zeros((300, 300), np.uint8)}
+    eventually(lambda: mode(time.time()) == '"idle"')
+    ended = threading.Event()
+
+    def publish():
+        for number in itertools.count(1):
+            if ended.wait(0.01):
+                return
+            pspace[key()]["x"] = number
+            pspace[key()]["items"].append(number)
+            del pspace[key()]["items"][0]
+            if number % 5 == 0:
+                pspace[key()]["image"] = np.full((300, 300), number % 255, np.uint8)
+
+    publisher = threading.Thread(target=publish)
+    publisher.start()
+    try:
+        time.sleep(0.5)  # what comes now is of a key that has been published for a while
+        before = writes()
+        time.sleep(2.5)
+        assert writes() == before, "what was published looks like something stored by others"
+        kvs[key()]["mode"] = "run"
+        earlier = time.time()
+        eventually(lambda: writes() > before)
+        time.sleep(0.2)  # since the document has arrays it is read once more
+        later = time.time()
+        time.sleep(0.2)  # what was published since makes it the past
+        assert [mode(at) for at in (earlier - 0.1, later)] == ['"idle"', '"run"']
+    finally:
+        ended.set()
+        publisher.join()
+    assert writes() == before + 1
+    items = [node["text"] for node in ask.rows(f"{key()}.items", at=time.time()).values()]
+    assert items == [str(item) for item in kvs[key()]["items"].read()]
 
 
 @pytest.mark.parametrize(

@@ -8,23 +8,23 @@ import time
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..catalog import names, outline
+from ..catalog import names
 from ..connection import RedisInterface
 from ..document import DocumentReader
-from ..errors import BadData, MissingKey, RedisError, ReemError
+from ..errors import BadData, RedisError, ReemError
 from ..monitor import ANNOUNCED, Event, Monitor
-from ..plan.paths import Path
 from ..plan.placeholders import marked
 from ..plan.trees import MISSING
 from ..policy import Last
+from .fetcher import Allowance, Fetcher, array_bytes, note_of
 from .history import History
-from .peek import document_texts
+from .peek import document_texts, noted_texts
 from .timeline import PENDING
-from .trees import Leaf, leaf_of, strip, tree_of, tree_of_outline, walk, weight
+from .trees import strip, tree_of, walk, weight
 
 __all__ = ["Follower"]
 
@@ -47,29 +47,19 @@ _LARGEST_LOOK = 32 << 20
 
 _MOST_HEARD = 100_000
 _QUIET_SECONDS = 1.0
-"""A key that was just published need not be looked at: what is read may be older than what was heard."""
+"""A key that was just published is looked at with the note of its last notice: it may not have been heard yet."""
 
 
-class Allowance:
-    """So many bytes a second, saved up to a limit.
+class Heard(NamedTuple):
+    """The last notice of a key.
 
-    Args:
-        rate: Bytes a second.
-        most: Bytes that can be saved up.
+    Attributes:
+        when: When it came, on the monotonic clock.
+        note: Which it was, as the server notes it.
     """
 
-    def __init__(self, rate: float, most: float) -> None:
-        self._rate, self._most, self._saved, self._then = rate, most, most, time.monotonic()
-
-    def take(self, size: int) -> bool:
-        """Take so many bytes if they are there; else nothing, and return False."""
-        now = time.monotonic()
-        self._saved = min(self._saved + (now - self._then) * self._rate, self._most)
-        self._then = now
-        if size > self._saved:
-            return False
-        self._saved -= size
-        return True
+    when: float = 0.0
+    note: str = ""
 
 
 class Follower:
@@ -89,13 +79,12 @@ class Follower:
         self._interface = interface
         self._history = history
         self._allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
+        self._fetcher = Fetcher(interface.session, history, self._allowance, lambda name: self._last_heard(name).note)
         self._looks = Allowance(_LOOK_BYTES, _LARGEST_LOOK)
         self._monitor = Monitor(interface, policy=Last(_WAITING))
-        self._dirty: dict[Path, None] = {}
-        self._news = asyncio.Event()
         self._tasks: list[asyncio.Task[None]] = []
         self._shown: dict[str, None] = {}
-        self._heard: dict[str, float] = {}
+        self._heard: dict[str, Heard] = {}
         self._seldom: dict[str, float] = {}
         self._unsure: dict[str, int] = {}  # keys whose arrays are to be looked at, and how many bytes these are
         self._digests: dict[str, bytes] = {}
@@ -112,7 +101,7 @@ class Follower:
         await self._interface.initialize()
         await self._monitor.listen()
         self.names = sorted([name async for name in names(self._interface)])
-        for work in (self._follow(), self._fetch(), self._look()):
+        for work in (self._follow(), self._fetcher.run(), self._look()):
             self._tasks.append(asyncio.create_task(work))
 
     async def close(self) -> None:
@@ -143,19 +132,21 @@ class Follower:
         name = event.name
         if len(self._heard) > _MOST_HEARD:
             self._heard.clear()
-        self._heard[name] = time.monotonic()
+        self._heard[name] = Heard(time.monotonic(), note_of(event))
+        self._fetcher.heard(event)
         self._digests.pop(name, None)
         if len(event.path) == 1 and event.deleted:
             self._forget(name)
         elif len(event.path) == 1 or name not in self._history.names:
             self._note_name(name)
         if event.value is ANNOUNCED:
-            self._history.add(event.path, PENDING, 0, event.received)
-            self._dirty.setdefault(event.path)
-            self._news.set()
+            self._fetcher.want(event.path, event.received)
         else:
             value = MISSING if event.deleted else event.value
             self._history.add(event.path, value, event.size, event.received)
+
+    def _last_heard(self, name: str) -> Heard:
+        return self._heard.get(name, Heard())
 
     def _note_name(self, name: str) -> None:
         if not self._history.knows(name) and self._complete:
@@ -168,29 +159,6 @@ class Follower:
         index = _place(self.names, name)
         if index < len(self.names) and self.names[index] == name:
             self.names = [*self.names[:index], *self.names[index + 1 :]]
-
-    # --- what is only announced
-
-    async def _fetch(self) -> None:
-        while True:
-            await self._news.wait()
-            self._news.clear()
-            while self._dirty:
-                path = next(iter(self._dirty))
-                del self._dirty[path]
-                with suppress(ReemError, RedisError, OSError):
-                    await self._fetch_one(path)
-
-    async def _fetch_one(self, path: Path) -> None:
-        """Read the newest value at a path into the buffer: the document, and its arrays if there is room."""
-        reader = DocumentReader(self._interface.session, str(path[0]))
-        try:
-            tree = tree_of_outline(await outline(self._interface, path))
-            if self._allowance.take(_array_bytes(tree)):
-                tree = await reader.read(path[1:])
-        except MissingKey:
-            tree = MISSING
-        self._history.add(path, tree, weight(tree), time.time(), answer=True)
 
     # --- what is not published
 
@@ -216,7 +184,7 @@ class Follower:
         began = time.monotonic()
         listed = {name async for name in names(self._interface)}
         # The list may be older than what was heard meanwhile.
-        listed.update([name for name in self.names if self._heard.get(name, 0.0) > began - _QUIET_SECONDS])
+        listed.update([name for name in self.names if self._is_busy(name, began)])
         present = sorted(listed)
         gone = set(self.names).difference(present)
         appeared = set(present).difference(self.names)
@@ -241,14 +209,32 @@ class Follower:
         for start in range(0, len(chosen), _BATCH):
             batch = chosen[start : start + _BATCH]
             asked = time.monotonic()
-            texts = await document_texts(self._interface.session, batch)
-            total += sum([len(text or b"") for text in texts])
-            for name, text in zip(batch, texts, strict=True):
-                if self._heard.get(name, 0.0) < asked - _QUIET_SECONDS or not self._history.is_whole(name):
-                    self._compare_one(name, text)
+            busy = [name for name in batch if self._history.is_whole(name) and self._is_busy(name, asked)]
+            total += await self._compare_quiet([name for name in batch if name not in busy], asked)
+            total += await self._compare_busy(busy)
             await asyncio.sleep(0.002)  # a page that is asked for meanwhile goes first
         self._complete = True
         return total
+
+    async def _compare_quiet(self, quiet: Sequence[str], asked: float) -> int:
+        """Compare documents with what the changes led to; return how many bytes they have."""
+        texts = await document_texts(self._interface.session, quiet)
+        for name, text in zip(quiet, texts, strict=True):
+            if not self._is_busy(name, asked) or not self._history.is_whole(name):
+                self._compare_one(name, text)
+        return sum([len(text or b"") for text in texts])
+
+    async def _compare_busy(self, busy: Sequence[str]) -> int:
+        """The same for those that are published all the time, where all that is in the document was heard of."""
+        found = await noted_texts(self._interface.session, [(name,) for name in busy])
+        for name, (text, note) in zip(busy, found, strict=True):
+            if note and note == self._last_heard(name).note and name not in self._fetcher.behind:
+                self._compare_one(name, text)
+                self._unsure.pop(name, None)  # its arrays would be published anew before they are read
+        return sum([len(text or b"") for text, _ in found])
+
+    def _is_busy(self, name: str, now: float) -> bool:
+        return self._last_heard(name).when > now - _QUIET_SECONDS
 
     def _compare_one(self, name: str, text: bytes | None) -> None:
         if text is not None and len(text) > _LARGE:
@@ -259,7 +245,7 @@ class Follower:
             if self._history.differs(name, text, time.time()):
                 self._differs(name, text)
             elif text is not None and name not in self._unsure and marked(text):
-                self._unsure[name] = _array_bytes(tree_of(text, name))
+                self._unsure[name] = array_bytes(tree_of(text, name))
         self._history.remember(name, text)
 
     def _differs(self, name: str, text: bytes | None) -> None:
@@ -268,9 +254,7 @@ class Follower:
         if text is None:
             self._history.add((name,), MISSING, 0, when)
         elif marked(text):
-            self._history.add((name,), PENDING, 0, when)
-            self._dirty.setdefault((name,))
-            self._news.set()
+            self._fetcher.want((name,), when)
         elif len(text) <= _LARGE or self._allowance.take(len(text)):
             self._history.add((name,), tree_of(text, name), len(text), when)
         else:
@@ -298,13 +282,8 @@ class Follower:
             return  # published meanwhile: this may be older
         self._digests[name] = found
         if before is not None and before != found:
-            kept = tree if self._allowance.take(_array_bytes(tree)) else strip(tree)
+            kept = tree if self._allowance.take(array_bytes(tree)) else strip(tree)
             self._history.add((name,), kept, weight(kept), time.time())
-
-
-def _array_bytes(tree: Any) -> int:
-    """Return how many bytes the arrays in a tree have."""
-    return sum([leaf_of(it).size for _, it in walk(tree, ()) if isinstance(it, Leaf | np.ndarray | bytes)])
 
 
 def _digest(tree: Any) -> bytes:

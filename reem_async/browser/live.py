@@ -42,7 +42,8 @@ class LiveSource:
 
     Sees every update that is published. What a KeyValueStore writes is seen when the server is looked
     at, about twice a second for some hundreds of keys, long documents and arrays as often as 1 MB a second
-    allows. Arrays of the past are kept as far as the budget allows.
+    allows; its arrays only while their key is not published. Arrays of the past are kept as far as the
+    budget allows.
 
     Args:
         interface: The server; closed with the source.

@@ -9,16 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import BadData
+from ..errors import BadData, MissingKey, NotAllowed, WrongKind
 from ..plan import Command, Plan, Reply
+from ..plan.keys import Keys
 from ..plan.paths import Path, to_jsonpath
-from ..plan.replies import type_name
+from ..plan.reads import get_command
+from ..plan.replies import checked, type_name
 from ..session import Session
 from .addresses import is_addressable
 from .nodes import Node, node_of, shown_text
 from .trees import tree_of
 
-__all__ = ["document_texts", "keys_at", "peek"]
+__all__ = ["document_texts", "keys_at", "noted_texts", "peek"]
 
 _LONGEST = 2048
 """Bytes of a text that are fetched to show its beginning; placeholders are shorter."""
@@ -123,8 +125,37 @@ async def keys_at(session: Session, path: Path) -> list[str] | int | None:
 
 async def document_texts(session: Session, names: Sequence[str]) -> list[bytes | None]:
     """Return the text of each top-level key's document, None if it has none. One round trip."""
-    replies = await _ask(session, [("JSON.GET", session.keys(name).document) for name in names])
-    return [bytes(reply) if isinstance(reply, bytes | bytearray) else None for reply in replies]
+    documents = [session.keys(name) for name in names]
+    replies = await _ask(session, [("JSON.GET", keys.document) for keys in documents])
+    return [_text(reply, keys) for keys, reply in zip(documents, replies, strict=True)]
+
+
+async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[bytes | None, str]]:
+    """Return the text at each path with the note of the last notice that it includes. One round trip.
+
+    The text is None if nothing is there. The note is "" if there is none, and if something was published
+    while the text was read.
+    """
+    documents = [session.keys(path[0]) for path in paths]
+    commands: list[Command] = []
+    for keys, path in zip(documents, paths, strict=True):
+        commands += [("GET", keys.last), get_command(keys, path[1:]), ("GET", keys.last)]
+    replies = await _ask(session, commands)
+    found: list[tuple[bytes | None, str]] = []
+    for keys, before, reply, after in zip(documents, replies[::3], replies[1::3], replies[2::3], strict=True):
+        text = (_text(reply, keys) or b"")[1:-1]  # what a path of the server finds is in a list
+        noted = before if before == after and isinstance(before, bytes | bytearray) else b""
+        found.append((text or None, bytes(noted).decode(errors="replace")))
+    return found
+
+
+def _text(reply: Reply, keys: Keys) -> bytes | None:
+    """Return a document's text, None if there is no document that may be read."""
+    try:
+        found = checked(reply, keys, ())
+    except (MissingKey, NotAllowed, WrongKind):
+        return None
+    return bytes(found) if isinstance(found, bytes | bytearray) else None
 
 
 def _place(session: Session, path: Path) -> tuple[str, str]:
