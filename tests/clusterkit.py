@@ -10,6 +10,8 @@ import time
 import redis
 import redis.crc
 
+from reem_async.errors import ServerFailed
+
 
 def slot_of(key):
     return redis.crc.key_slot(key.encode())
@@ -33,10 +35,34 @@ def _ranges(client):
     return [((first, last), primary[1]) for first, last, primary, *_ in client.execute_command("CLUSTER", "SLOTS")]
 
 
+def agreed(cluster, timeout=20.0):
+    """Wait until all nodes say the same of who has which slots, and since when.
+
+    A node that is given a slot takes the highest epoch that it knows of. If another one has a newer epoch that it
+    has not heard of yet, and has not been told either that the slot is given away, it takes the slot back: for good.
+    """
+    deadline = time.monotonic() + timeout
+    while len(views := set(map(_view, cluster.nodes)) - {None}) > 1:
+        assert time.monotonic() < deadline, f"the nodes do not agree: {views}"
+        time.sleep(0.005)
+
+
+def _view(node):
+    """Who has which slots since which epoch, as a node knows it; None if it does not answer."""
+    with contextlib.suppress(ServerFailed):
+        rows = [row.split(" ") for row in node.say("CLUSTER", "NODES").splitlines()]
+        owned = {
+            row[0]: (row[6], *[slots for slots in row[8:] if slots[0] != "["]) for row in rows if "master" in row[2]
+        }
+        return frozenset(item for item in owned.items() if item[1][1:])
+    return None
+
+
 class Move:
     """A slot on its way from one node to another, key by key."""
 
     def __init__(self, cluster, key, target=None):
+        agreed(cluster)
         self.key = key
         self.slot = slot_of(key)
         self.source = owner(cluster, key)
