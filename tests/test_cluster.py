@@ -8,7 +8,7 @@ import pickle
 
 import numpy as np
 import pytest
-from clusterkit import Move, owner, raw_of, slot_of
+from clusterkit import Move, agreed, owner, raw_of, slot_of
 from conftest import FRONTS, Keys, aeventually, eventually, python
 
 import reem
@@ -271,6 +271,19 @@ def test_a_new_key_of_a_moving_slot_is_made_where_the_slot_goes(front, cluster, 
     assert front.read((name, "n")) == 1
     move.finish()
     assert front.read((name, "n")) == 1
+
+
+def test_nodes_that_do_not_agree_are_named_as_the_reason(front, cluster, key):
+    """Each sends to the other, until time is over."""
+    agreed(cluster)
+    first = owner(cluster, key())
+    second = next(node for node in cluster.nodes[:3] if node is not first)
+    first.say("CLUSTER", "SETSLOT", str(slot_of(key())), "NODE", second.id)
+    with pytest.raises(NotConnected, match=f"slot {slot_of(key())} is said to be at 127.0.0.1:.*nothing was applied"):
+        front.write((key(),), 1)
+    first.say("CLUSTER", "SETSLOT", str(slot_of(key())), "NODE", first.id)
+    front.write((key(),), 1)
+    assert front.read((key(),)) == 1
 
 
 def test_a_slot_that_has_moved_is_followed_by_every_kind_of_call(front, cluster, key):

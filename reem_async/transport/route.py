@@ -77,7 +77,7 @@ class Route:
     async def refused(self, problem: Exception) -> None:
         """Note why nothing was applied, and wait if need be; raise NotConnected if time is over."""
         # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.
-        self._check_time(str(problem), TlsRefused if isinstance(problem, TlsRefused) else NotConnected)
+        self._check_time(_reason(problem), TlsRefused if isinstance(problem, TlsRefused) else NotConnected)
         asked, self._node, self.asking = self._node, None, False
         pause = _PAUSES[min(self._tries, len(_PAUSES) - 1)]
         self._tries += 1
@@ -97,6 +97,12 @@ class Route:
                 f"the cluster did not take the call within {self._cluster.timeout:g} s ({reason}); "
                 "nothing was applied: call again, or give it longer with timeout="
             )
+
+
+def _reason(problem: Exception) -> str:
+    if isinstance(problem, Ask):
+        return f"slot {problem.slot_id} is said to be at {problem.host}:{problem.port}, and the nodes may not agree"
+    return str(problem)
 
 
 class HeldAcross:
