@@ -25,7 +25,7 @@ from .plan import Plan, Reply, wire_commands
 from .plan.copies import applied, concerns, is_whole
 from .plan.keys import Keys
 from .plan.memory import Memory
-from .plan.notices import Notice
+from .plan.notices import Notice, note_of
 from .plan.paths import Path, show
 from .plan.reads import Sealed, interpret, read
 from .plan.replies import decoded
@@ -258,7 +258,7 @@ class Follower:
     def _divide(self, also: tuple[Reply, ...]) -> None:
         """Tell the updates that a snapshot has from those it has not, by the note of the last one it has."""
         doubtful, self._doubtful = self._doubtful, []
-        notes = [f"{notice.publisher} {notice.sequence}".encode() for notice in doubtful]
+        notes = [note_of(notice.publisher, notice.sequence).encode() for notice in doubtful]
         known = notes.index(also[0]) + 1 if also and also[0] in notes else 0
         self._covered += doubtful[:known]
         self._later += [(notice, "next") for notice in doubtful[known:]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from .plan.notices import parsed_note
+
 __all__ = ["Sequences"]
 
 _MOST_PUBLISHERS = 10_000
@@ -52,12 +54,12 @@ class Sequences:
 
     def has(self, note: bytes | None) -> bool:
         """Return whether the update that a note names was heard of: then so were those before it."""
-        publisher, sequence = _parsed(note)
+        publisher, sequence = parsed_note(note)
         return 0 < sequence <= self._last.get(publisher, 0)
 
     def snapshot(self, note: bytes | None) -> None:
         """Take into account that a snapshot has all updates up to the one that its note names."""
-        publisher, sequence = _parsed(note)
+        publisher, sequence = parsed_note(note)
         if sequence > self._last.get(publisher, 0):
             self._put(publisher, sequence)
         self._known_note, self._compares = note, True
@@ -69,14 +71,8 @@ class Sequences:
             return False
         if note is None or note == self._known_note or self.has(note):
             return False
-        publisher, sequence = _parsed(note)
+        publisher, sequence = parsed_note(note)
         self.lose(sequence - self._last[publisher] if publisher in self._last else None)
         self._put(publisher, sequence)
         self._known_note = note
         return True
-
-
-def _parsed(note: bytes | None) -> tuple[str, int]:
-    """Return publisher and number, or a number of 0 if this is not a note."""
-    publisher, _, sequence = note.decode(errors="replace").partition(" ") if isinstance(note, bytes) else ("", "", "")
-    return publisher, int(sequence) if sequence.isascii() and sequence.isdigit() and len(sequence) < 19 else 0

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import RedisError, ReemError
 from ..monitor import ANNOUNCED, Event
+from ..plan.notices import note_of
 from ..plan.paths import Path, below
 from ..plan.placeholders import marked
 from ..plan.trees import MISSING, get
@@ -22,7 +23,7 @@ from .peek import noted_texts
 from .timeline import PENDING
 from .trees import Leaf, changed, leaf_of, tree_of, walk, weight
 
-__all__ = ["Allowance", "Fetcher", "array_bytes", "note_of"]
+__all__ = ["Allowance", "Fetcher", "array_bytes"]
 
 _HEARD_WITHIN = 0.1
 """Seconds that the notice of what was read may take to come."""
@@ -124,7 +125,7 @@ class Fetcher:
         if not marked(text) or not self._allowance.take(array_bytes(tree)):
             return tree, note
         value, _, publisher, number = await fetch(self._session, self._session.keys(path[0]), path[1:])
-        return value, f"{publisher} {number}" if publisher else ""
+        return value, note_of(publisher, number) if publisher else ""
 
     async def _later(self, before: str, note: str) -> Sequence[Event]:
         """Return which updates, of those heard of, came after the noted one; wait for that if it is still to come."""
@@ -132,17 +133,12 @@ class Fetcher:
             return ()
         deadline = time.monotonic() + _HEARD_WITHIN
         while True:
-            notes = [before, *map(note_of, self._since)]
+            notes = [before, *[note_of(event.publisher, event.sequence) for event in self._since]]
             if note in notes:
                 return self._since[notes.index(note) :]
             if time.monotonic() > deadline:
                 return ()
             await asyncio.sleep(0.001)
-
-
-def note_of(event: Event) -> str:
-    """Return how the server notes that this was the last notice of its key."""
-    return f"{event.publisher} {event.sequence}"
 
 
 def array_bytes(tree: Any) -> int:

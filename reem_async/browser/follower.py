@@ -17,10 +17,11 @@ from ..connection import RedisInterface
 from ..document import DocumentReader
 from ..errors import BadData, RedisError, ReemError
 from ..monitor import ANNOUNCED, Event, Monitor
+from ..plan.notices import note_of
 from ..plan.placeholders import marked
 from ..plan.trees import MISSING
 from ..policy import Last
-from .fetcher import Allowance, Fetcher, array_bytes, note_of
+from .fetcher import Allowance, Fetcher, array_bytes
 from .history import History
 from .peek import document_texts, noted_texts
 from .timeline import PENDING
@@ -132,7 +133,7 @@ class Follower:
         name = event.name
         if len(self._heard) > _MOST_HEARD:
             self._heard.clear()
-        self._heard[name] = Heard(time.monotonic(), note_of(event))
+        self._heard[name] = Heard(time.monotonic(), note_of(event.publisher, event.sequence))
         self._fetcher.heard(event)
         self._digests.pop(name, None)
         if len(event.path) == 1 and event.deleted:

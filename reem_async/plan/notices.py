@@ -20,7 +20,7 @@ from .paths import Path
 from .placeholders import find, marked
 from .writes import Loaded
 
-__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "published", "with_value"]
+__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "note_of", "parsed_note", "published", "with_value"]
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14
@@ -63,9 +63,21 @@ def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, ever
     expires, since it only matters while a snapshot is on its way. In a cluster a notice goes to those who
     know the key; `everywhere` it goes to all nodes besides, for those who look for keys.
     """
-    noted: Command = ("SET", keys.last, f"{publisher} {sequence}", "EX", "60")
+    noted: Command = ("SET", keys.last, note_of(publisher, sequence), "EX", "60")
     told: Command = (keys.publish, keys.channel, payload)
     return [noted, ("PUBLISH", keys.channel, payload), told] if everywhere else [noted, told]
+
+
+def note_of(publisher: str, sequence: int) -> str:
+    """Return what is noted of a key's last notice."""
+    return f"{publisher} {sequence}"
+
+
+def parsed_note(note: Any) -> tuple[str, int]:
+    """Return publisher and number of a note as the server has it, or a number of 0 if it is none."""
+    text = bytes(note).decode(errors="replace") if isinstance(note, bytes | bytearray) else ""
+    publisher, _, sequence = text.partition(" ")
+    return publisher, int(sequence) if sequence.isascii() and sequence.isdigit() and len(sequence) < 19 else 0
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:

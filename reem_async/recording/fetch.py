@@ -10,6 +10,7 @@ from ..errors import MissingKey
 from ..plan import Plan, Reply
 from ..plan.keys import Keys
 from ..plan.memory import Memory
+from ..plan.notices import parsed_note
 from ..plan.paths import Path
 from ..plan.placeholders import find, marked
 from ..plan.reads import Sealed, get_command, present, read
@@ -36,9 +37,7 @@ async def fetch(session: Session, keys: Keys, path: Path) -> Fetched:
         return MISSING, 0, "", 0
     size = sum([len(reply) for reply in sealed.raw if isinstance(reply, bytes | bytearray)])
     value = await opened(sealed) if sealed.crates else sealed.holder[0]
-    note = sealed.also[0] if sealed.also and isinstance(sealed.also[0], bytes | bytearray) else b""
-    publisher, _, number = bytes(note).decode(errors="replace").partition(" ")
-    return value, size, publisher, int(number) if number.isdecimal() else 0
+    return value, size, *parsed_note(sealed.also[0] if sealed.also else None)
 
 
 def _snapshot(keys: Keys, path: Path, ships: Ships, memory: Memory) -> Plan:
