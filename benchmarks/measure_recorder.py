@@ -18,6 +18,7 @@ from .environment import FOLDER
 from .measure import Bench, Case, Found
 from .process import ContenderError
 from .results import failure, summary
+from .server import socket_of
 
 WRITERS = ("setpoint", "camera")
 SETTLED = 1.8
@@ -27,12 +28,19 @@ Windows = dict[str, list[tuple[float, float]]]
 
 LISTENER = [sys.executable, "-m", "benchmarks.workers.listener"]
 RECORDER = [sys.executable, "-c", "from reem_async.cli import main; main()", "record", "--json", "--force"]
+FRAME_KEY = "{cam}.image"
 BESIDE = {
     "nobody": None,
-    "fetches": [*LISTENER, "PORT"],
+    "fetches": [*LISTENER, "PORT", "0.005", FRAME_KEY],
     "recorder": [*RECORDER, "--url", "URL", "-o", "FILE"],
     "background": [*RECORDER, "--background", "--url", "URL", "-o", "FILE"],
 }
+
+LEAST = {
+    "notices": [*LISTENER, "SOCKET", "0.01"],
+    "frames": [*LISTENER, "SOCKET", "0.01", FRAME_KEY],
+}
+"""The least that a recorder does: it comes as often and the same way, and drops what it gets."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,12 +110,12 @@ def writers(url: str, folder: str) -> Iterator[None]:
 @contextlib.contextmanager
 def beside(name: str, url: str, folder: str) -> Iterator[None]:
     """Somebody beside the writers; a recording that is not whole is an error."""
-    command = BESIDE[name]
+    command = (BESIDE | LEAST)[name]
     if command is None:
         yield
         return
     file = pathlib.Path(folder, "run.mcap")
-    places = {"URL": url, "PORT": url.rpartition(":")[2], "FILE": str(file)}
+    places = {"URL": url, "PORT": url.rpartition(":")[2], "SOCKET": socket_of(url), "FILE": str(file)}
     is_recording = "record" in command
     process = subprocess.Popen(
         [places.get(word, word) for word in command],

@@ -1,4 +1,4 @@
-"""What a recorder costs the writers beside it: `python -m benchmarks.recorder [--pairs N] [--minutes M]`.
+"""What a recorder costs the writers beside it: `python -m benchmarks.recorder [--beside WHOM]`.
 
 The row of `make bench` has ten seconds for it, in which one bad moment of the machine decides. Here windows with and
 without a recorder follow each other for as long as it takes to know: pairs, each next to its other half, every second
@@ -22,7 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from . import environment
-from .measure_recorder import SETTLED, WRITERS, beside, writers
+from .measure_recorder import LEAST, SETTLED, WRITERS, beside, writers
 from .results import SCRATCH
 from .server import Server, private_server
 
@@ -63,7 +63,9 @@ Pair = tuple[Window, Window]
 """Without and with a recorder."""
 
 
-def measure(server: Server, wanted: int, minutes: float, seconds: float, progress: Progress) -> dict[str, list[Pair]]:
+def measure(
+    server: Server, whom: str, wanted: int, minutes: float, seconds: float, progress: Progress
+) -> dict[str, list[Pair]]:
     """Return each writer's windows, of as many pairs as it took until `wanted` were quiet or the time was over."""
     spans: list[tuple[Span, Span]] = []
     quiet = 0
@@ -72,7 +74,7 @@ def measure(server: Server, wanted: int, minutes: float, seconds: float, progres
         with writers(server.url, folder):
             last = time.monotonic() + minutes * 60
             while quiet < wanted and time.monotonic() < last:
-                pair = _pair(server.url, folder, seconds, backwards=len(spans) % 2 == 1)
+                pair = _pair(server.url, whom, folder, seconds, backwards=len(spans) % 2 == 1)
                 spans.append(pair)
                 quiet += max(span.steal for span in pair) <= MUCH
                 progress.update(task, completed=quiet)
@@ -83,13 +85,13 @@ def measure(server: Server, wanted: int, minutes: float, seconds: float, progres
     }
 
 
-def _pair(url: str, folder: str, seconds: float, *, backwards: bool) -> tuple[Span, Span]:
+def _pair(url: str, whom: str, folder: str, seconds: float, *, backwards: bool) -> tuple[Span, Span]:
     found = {}
-    for name in ("recorder", "nobody") if backwards else ("nobody", "recorder"):
+    for name in (whom, "nobody") if backwards else ("nobody", whom):
         with beside(name, url, folder):
             time.sleep(SETTLED)
             found[name] = _span(seconds)
-    return found["nobody"], found["recorder"]
+    return found["nobody"], found[whom]
 
 
 def _window(calls: np.ndarray, span: Span) -> Window:
@@ -172,12 +174,12 @@ def rewrite(kept: dict[str, Any], page: pathlib.Path = PAGE) -> None:
     page.write_text(_TABLE.sub(lambda _: block, page.read_text()))
 
 
-def run(pairs: int, minutes: float, seconds: float, console: Console) -> dict[str, Any]:
+def run(whom: str, pairs: int, minutes: float, seconds: float, console: Console) -> dict[str, Any]:
     """Measure on a private server, by TCP as all of `make bench`."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     with private_server() as server, Progress(*columns, console=console) as progress:
-        found = measure(server, pairs, minutes, seconds, progress)
+        found = measure(server, whom, pairs, minutes, seconds, progress)
         version = server.version()
     return {
         "started": started,
@@ -195,12 +197,14 @@ def _is_whole(kept: dict[str, Any]) -> bool:
 def main() -> None:
     """Measure, keep, write the page, print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.recorder", description=__doc__)
+    whom = ("recorder", *LEAST)
+    parser.add_argument("--beside", choices=whom, default=whom[0], help="the recorder, or the least that one does")
     parser.add_argument("--pairs", type=int, default=WHOLE, help="quiet ones to wait for (default: %(default)s)")
     parser.add_argument("--minutes", type=float, default=40.0, help="at most (default: %(default)s)")
     parser.add_argument("--seconds", type=float, default=12.0, help="of one window (default: %(default)s)")
     options, console = parser.parse_args(), Console()
-    kept = run(options.pairs, options.minutes, options.seconds, console)
-    path = KEPT if _is_whole(kept) else SCRATCH / KEPT.name
+    kept = run(options.beside, options.pairs, options.minutes, options.seconds, console)
+    path = KEPT if options.beside == "recorder" and _is_whole(kept) else SCRATCH / KEPT.name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(kept, indent=1) + "\n")
     head, *rows = lines(kept)

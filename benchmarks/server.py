@@ -46,6 +46,12 @@ class Server:
         return f"{name} {number} (JSON module {json_version})"
 
 
+def socket_of(url: str) -> str:
+    """The path of a server's Unix socket."""
+    with redis.Redis.from_url(url, decode_responses=True) as client:
+        return str(client.config_get("unixsocket")["unixsocket"])
+
+
 def _text(name: bytes | str) -> str:
     return name.decode() if isinstance(name, bytes) else name
 
