@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from benchmarks.measure_recorder import WRITERS
+from benchmarks.measure_recorder import LEAST, WRITERS
 from benchmarks.recorder import Window, judge, lines, rewrite, run
 
 
@@ -42,8 +42,9 @@ def test_a_run_without_a_quiet_pair_says_so():
     assert found["quiet"] == {"pairs": 0}
 
 
-def test_a_short_run_measures_both_writers_and_is_written_into_the_page(tmp_path):
-    kept = run(pairs=1, minutes=0.01, seconds=1.0, console=Console(quiet=True))
+@pytest.mark.parametrize("whom", ["recorder", *LEAST])
+def test_a_short_run_measures_both_writers_and_is_written_into_the_page(tmp_path, whom):
+    kept = run(whom, pairs=1, minutes=0.01, seconds=1.0, console=Console(quiet=True))
 
     head, *rows = lines(kept)
     assert {row[0] for row in rows} == set(WRITERS)
