@@ -2,19 +2,30 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Two processes, each with a server of its own, take the test files in turns; then come, alone, the tests that measure time.
+TOGETHER := -n 2 --dist loadfile -m "not alone"
+# Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
+export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test modes fuzz coverage check chaos mcap bench bench-recorder scale clean
+.PHONY: demo test test-plain modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
 
 test: $(VENV)/ready  ## run every test on an embedded real server
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q $(TOGETHER)
+	$(BIN)/python -m pytest -q -m alone
 
-modes: $(VENV)/ready  ## tests once in Python's development mode, and once without assert statements
-	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_connection.py tests/test_facade_store.py
+test-plain: $(VENV)/ready  ## the tests on servers without the JSON module, but those of the module itself
+	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q $(TOGETHER)
+	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q -m alone
+
+modes: $(VENV)/ready  ## tests once in Python's development mode, once without assert statements, and once without JSON
+	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_connection.py tests/test_facade_store.py
 	$(BIN)/python -O -m pytest -q -W "ignore:assertions not in test modules" \
 		tests/test_bad_input.py tests/test_store.py tests/test_pure.py tests/test_regressions.py
+	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q \
+		tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_atomic.py tests/test_missing.py tests/test_indexes.py tests/test_connection.py
 
 fuzz: $(VENV)/ready  ## random bytes against everything that decodes, for a minute each
 	$(BIN)/python -m tests.fuzz
@@ -29,12 +40,25 @@ check: $(VENV)/ready  ## format, lint and type checks
 	$(BIN)/mypy
 
 $(VENV)/ready: pyproject.toml
+	@echo "Setting up $(VENV), about a minute, this once:"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
+	$(BIN)/python -m pip install --disable-pip-version-check --progress-bar off -e '.[dev]'
 	touch $@
 
 chaos: $(VENV)/ready  ## the reliability scoreboard, under 20 minutes; CHAOS="--rows 1,9 --seed 7"
 	$(BIN)/python -m tests.chaos $(CHAOS)
+
+recording: $(VENV)/ready  ## ten minutes at a robot's rates, compared with what was published; RECORDING="--seconds 60 --seed 7"
+	$(BIN)/python -m tests.rates $(RECORDING)
+
+hunt: $(VENV)/ready  ## random calls on REEM and on a dict, ten minutes; HUNT="--seed 7 --minutes 30"
+	$(BIN)/python -m tests.hunt $(HUNT)
+
+watching: $(VENV)/ready  ## 100,000 random changes by four processes beside watchers of all kinds; WATCHING="--seed 7 --kill --cluster"
+	$(BIN)/python -m tests.watchmodel $(WATCHING)
+
+slots: $(VENV)/ready  ## a million uses of slots of shared memory by processes that are killed; SLOTS="--seed 7 --uses 50000"
+	$(BIN)/python -m tests.slots $(SLOTS)
 
 mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCAP that Foxglove uses; needs npm
 	npm install --silent --no-fund --no-audit --no-package-lock --prefix tests/mcapcheck

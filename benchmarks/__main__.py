@@ -15,7 +15,7 @@ from .measure import Bench, Case
 from .process import Workers
 from .results import Results
 from .server import private_server
-from .suite import every_case
+from .suite import beside_before, every_case
 
 FIGURES = environment.FOLDER.parent / "docs" / "images" / "performance"
 
@@ -27,6 +27,7 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--only", metavar="PATTERN", help="cases that match, such as 'array.*.get' or 'publish'")
     parser.add_argument("--list", action="store_true", help="name the cases and end")
     parser.add_argument("--draw", action="store_true", help="draw the figures again from the last whole run and end")
+    parser.add_argument("--before", metavar="COMMIT", help="also measure REEM as it was then, where nothing may change")
     parser.add_argument("--all", action="store_true", help="print every figure, not only the ratios")
     return parser.parse_args()
 
@@ -76,6 +77,8 @@ def run(cases: list[Case], quick: bool, mode: str, console: Console) -> Results:
             bench.workers.end()
         found.versions = bench.workers.versions
     found.rows = [row.judged(found) for row in targets.rows()]
+    if "before" in environment.PRIVATE:
+        found.rows += [row.judged(found) for row in targets.unchanged()]
     found.seconds = time.monotonic() - begin
     return found
 
@@ -117,9 +120,12 @@ def main() -> None:
         report.show(found, console, options.all)
         return
     cases = chosen(options.only, options.quick)
+    if options.before:
+        environment.PRIVATE["before"] = environment.at_commit(options.before)
+        cases = beside_before(cases)
     if not cases:
         raise SystemExit(f"no case matches {options.only!r}; --list names them all")
-    mode = "partial" if options.only else "quick" if options.quick else "full"
+    mode = "partial" if options.only or options.before else "quick" if options.quick else "full"
     found = run(cases, options.quick, mode, console)
     path, folder = places(found.mode)
     found.save(path)

@@ -1,6 +1,7 @@
 """Who is measured."""
 
 import dataclasses
+from typing import Any
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,6 +15,7 @@ class Contender:
     host: str = "127.0.0.1"  # what it is told to connect to
     loop: str = "asyncio"
     instead: str | None = None  # who is asked where this one fails
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)  # what it is told besides
 
 
 CONTENDERS = {
@@ -22,6 +24,14 @@ CONTENDERS = {
     "reem-local": Contender("REEM, blocking, at localhost", "reem_blocking", "#6fa8dc", host="localhost"),
     "reem-static": Contender("REEM, blocking, static schema", "reem_static", "#2f3f8f"),
     "async-local": Contender("REEM, asyncio, at localhost", "reem_asyncio", "#8fd6d6", host="localhost"),
+    "reem-off": Contender(
+        "REEM, blocking, without shared memory", "reem_blocking", "#9db8d2", options={"local": "off"}
+    ),
+    "async-off": Contender("REEM, asyncio, without shared memory", "reem_asyncio", "#a9d6d6", options={"local": "off"}),
+    "reem-early": Contender("REEM, blocking, early", "reem_blocking", "#073b66", options={"local": "early"}),
+    "async-early": Contender("REEM, asyncio, early", "reem_asyncio", "#0b6b6b", options={"local": "early"}),
+    "before": Contender("REEM before, blocking", "reem_blocking", "#7f7fbf", environment="before"),
+    "async-before": Contender("REEM before, asyncio", "reem_asyncio", "#9f9fdf", environment="before"),
     "async-uvloop": Contender("REEM, asyncio on uvloop", "reem_asyncio", "#0e7a5f", loop="uvloop"),
     "original": Contender(
         "original REEM 0.1.2", "original", "#d1495b", environment="reem-0.1.2", instead="original-0.0.11"
@@ -34,8 +44,19 @@ CONTENDERS = {
     "floor": Contender("bare sockets, bytes made before", "floor", "#000000"),
     "pottery": Contender("pottery", "pottery_dict", "#8a5fbf"),
     "pyzmq": Contender("pyzmq", "pyzmq_pubsub", "#e0a030"),
-    "zenoh": Contender("zenoh over TCP", "zenoh_pubsub", "#b5651d"),
+    "zenoh": Contender("zenoh (shared memory, its default)", "zenoh_pubsub", "#b5651d"),
+    "zenoh-tcp": Contender("zenoh over TCP alone", "zenoh_pubsub", "#d9a066", options={"shares_memory": False}),
+    "iceoryx2": Contender("iceoryx2", "iceoryx2_pubsub", "#556b2f", environment="iceoryx2"),
 }
 
 LOCAL = {"reem": "reem-local", "async": "async-local"}
 """Who goes by TCP, as all do in every comparison, and the same at `localhost`: through the server's Unix socket."""
+
+OFF = {"reem": "reem-off", "async": "async-off"}
+"""Who shares memory with programs near by, as by default, and the same told not to."""
+
+EARLY = {"reem": "reem-early", "async": "async-early"}
+"""The same told to tell programs near by before the server has an update."""
+
+BEFORE = {"reem": "before", "async": "async-before"}
+"""The same of an earlier commit; measured only if one is named (`--before`)."""

@@ -13,9 +13,12 @@ CACHE = FOLDER / ".cache"
 
 # rejson 0.5.6 is the last one; it asks for redis-py below 4. numpy is the one we have ourselves.
 _ORIGINAL = ["rejson==0.5.6", "redis==3.5.3", "six", f"numpy=={importlib.metadata.version('numpy')}"]
+_NUMPY = f"numpy=={importlib.metadata.version('numpy')}"
 PRIVATE = {
     "reem-0.1.2": ["reem==0.1.2", *_ORIGINAL],
     "reem-0.0.11": ["reem==0.0.11", *_ORIGINAL],
+    # Where there is no wheel (Linux on ARM, an older glibc) it is left out, not built.
+    "iceoryx2": ["--only-binary=iceoryx2", "iceoryx2==0.10.0", "orjson", _NUMPY],
 }
 
 
@@ -29,12 +32,18 @@ def interpreter(name: str | None) -> str:
         return sys.executable
     folder, wanted = CACHE / name, PRIVATE[name]
     python, ready = folder / "bin" / "python", folder / "requirements.txt"
-    if ready.exists() and ready.read_text().split() == wanted:
+    if ready.exists() and ready.read_text().splitlines() == wanted:
         return str(python)
     _run([sys.executable, "-m", "venv", "--clear", str(folder)])
     _run([str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *wanted])
     ready.write_text("\n".join(wanted) + "\n")
     return str(python)
+
+
+def at_commit(commit: str) -> list[str]:
+    """What an environment needs to have REEM as it was at a commit, with the libraries that we have."""
+    others = [f"{name}=={importlib.metadata.version(name)}" for name in ("redis", "hiredis", "numpy", "orjson")]
+    return [f"git+file://{FOLDER.parent}@{commit}#egg=reem", *others]
 
 
 def _run(command: list[str]) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import pathlib
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +20,7 @@ from .contenders import CONTENDERS, LOCAL
 from .figures_bars import draw_camera, draw_import, draw_messages, draw_pottery, draw_ratios, draw_small
 from .results import Results
 
-MARKS = dict(zip(CONTENDERS, "os^D*vPXd<>hpH", strict=False))
+MARKS = dict(zip(CONTENDERS, itertools.cycle("os^D*vPXd<>hpH"), strict=False))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -54,7 +54,11 @@ def draw_pottery(results: Results) -> Figure | None:
 
 def draw_messages(results: Results) -> Figure | None:
     """Publish to callback, one subscriber."""
-    cases = {"publish.small": "small message", "publish.frame": "frame, 640x480x3 float64 (7.4 MB)"}
+    cases = {
+        "publish.small": "small message",
+        "publish.image": "image, 640x480x3 uint8 (0.92 MB)",
+        "publish.frame": "frame, 640x480x3 float64 (7.4 MB)",
+    }
     return _panels(results, "Publish to callback between two processes, medians", cases)
 
 

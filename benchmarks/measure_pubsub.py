@@ -92,6 +92,7 @@ class PublishCase(Case):
         count = max(10, int(bench.scaled(self.count, self.count / 5) / rounds))
         ages: dict[str, list[float]] = {}
         calls: dict[str, list[float]] = {}
+        servers: dict[str, list[float]] = {}
         with contextlib.ExitStack() as stack:
             channels: dict[str, Channel] = {}
             for name in self.contenders:
@@ -99,21 +100,25 @@ class PublishCase(Case):
                     publisher, subscriber = stack.enter_context(bench.workers.pair(name))
                     channels[name] = Channel(publisher, Audience(subscriber, herd=False), self.payload)
                     channels[name].open(1)
-                    ages[name], calls[name] = [], []
+                    ages[name], calls[name], servers[name] = [], [], []
                 except ContenderError as error:
                     channels.pop(name, None)
                     yield self.identifier, name, failure(error)
             for _ in range(rounds):
                 for name, channel in list(channels.items()):
                     try:
+                        before = bench.workers.server.seconds()
                         calls[name] += channel.publish(count, self.gap)
                         ages[name] += channel.collect(count)
+                        servers[name].append((bench.workers.server.seconds() - before) / count)
                     except ContenderError as error:
                         del channels[name]
                         yield self.identifier, name, failure(error)
         for name in channels:
             yield self.identifier, name, summary(ages[name], sent=count * rounds)
             yield f"{self.identifier}.call", name, summary(calls[name])
+            # What the server does for one message, with the heartbeats of all pairs in it.
+            yield f"{self.identifier}.server", name, summary(servers[name])
 
 
 @dataclasses.dataclass(frozen=True)

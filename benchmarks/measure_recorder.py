@@ -27,7 +27,7 @@ SETTLED = 1.8
 Windows = dict[str, list[tuple[float, float]]]
 
 LISTENER = [sys.executable, "-m", "benchmarks.workers.listener"]
-RECORDER = [sys.executable, "-c", "from reem_async.cli import main; main()", "record", "--json", "--force"]
+RECORDER = [sys.executable, "-c", "from reem_async.tools.cli import main; main()", "record", "--json", "--force"]
 FRAME_KEY = "{cam}.image"
 BESIDE = {
     "nobody": None,

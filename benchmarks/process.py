@@ -116,6 +116,7 @@ class Workers:
             "port": server.port,
             "loop": contender.loop,
             "peer_port": peer_port,
+            "options": contender.options,
         }
 
     def start(self, name: str, peer_port: int = 0) -> Worker:

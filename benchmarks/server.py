@@ -29,6 +29,12 @@ class Server:
         with redis.Redis(host=self.host, port=self.port) as client:
             return int(client.info("server")["process_id"])
 
+    def seconds(self) -> float:
+        """CPU time that it has used, its own and the kernel's for it."""
+        with redis.Redis(host=self.host, port=self.port) as client:
+            used = client.info("cpu")
+        return float(used["used_cpu_user"]) + float(used["used_cpu_sys"])
+
     def empty(self) -> None:
         """Forget all data: this server is the benchmark's own."""
         with redis.Redis(host=self.host, port=self.port) as client:

@@ -1,13 +1,15 @@
 """All cases of a whole run, chapter by chapter."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from .contenders import LOCAL
+from .contenders import BEFORE, EARLY, LOCAL, OFF
 from .measure import CallCase, Case, ClientsCase
 from .measure_other import IMPORTS, CameraCase, ImportCase
 from .measure_pubsub import PublishCase, SubscribersCase
 from .measure_recorder import BESIDE, RecorderCase
+from .targets import UNCHANGED
 from .values import Spec
 
 # What grows along the axes of the figures.
@@ -90,10 +92,12 @@ def array_rates(grown: Grown) -> list[Case]:
 def subscribers(grown: Grown) -> list[Case]:
     """Chapter 5.2: subscriber overhead, and peers with one subscriber."""
     fronts = (*FRONTS, "original", "redis-py")
-    everyone = (*fronts, *NEARBY, "pyzmq", "zenoh", "floor")
+    others = ("pyzmq", "zenoh", "zenoh-tcp", "iceoryx2", "floor")
+    ways = (*OFF.values(), *EARLY.values())
     cases: list[Case] = [
-        PublishCase("publish.small", everyone, payload="small", count=600, gap=0.004),
-        PublishCase("publish.frame", everyone, payload="frame", count=45, gap=0.05),
+        PublishCase("publish.small", (*fronts, *NEARBY, *OFF.values(), *others), payload="small", count=600, gap=0.004),
+        PublishCase("publish.frame", (*fronts, *NEARBY, *ways, *others), payload="frame", count=60, gap=0.05, rounds=5),
+        PublishCase("publish.image", (*fronts, *ways, *others), payload="image", count=100, gap=0.03, rounds=5),
     ]
     for total in grown(tuple(SUBSCRIBERS)):
         processes, each = SUBSCRIBERS[total]
@@ -150,6 +154,16 @@ def programs(grown: Grown) -> list[Case]:
         CameraCase("camera", (*FRONTS, *NEARBY, "original", "redis-py", "redis-asyncio")),
         RecorderCase("recorder", tuple(BESIDE)),
         ImportCase("import", tuple(IMPORTS)),
+    ]
+
+
+def beside_before(cases: list[Case]) -> list[Case]:
+    """The cases, those in which nothing may have changed with REEM of an earlier commit among the contenders."""
+    return [
+        dataclasses.replace(case, contenders=(*case.contenders, *BEFORE.values()))
+        if case.identifier in UNCHANGED
+        else case
+        for case in cases
     ]
 
 

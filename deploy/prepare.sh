@@ -23,6 +23,7 @@ shift $((OPTIND - 1))
 [ $# -gt 0 ] || { echo "usage: $0 [-n NAMESPACE] [-o DIRECTORY] HOST [HOST ...]" >&2; exit 2; }
 case $namespace in
     *[!A-Za-z0-9:_.-]*) echo "$0: a namespace for an ACL has letters, digits and : _ . - only" >&2; exit 2 ;;
+    *[A-Za-z0-9]) echo "$0: a namespace ends with a separator; write $namespace:" >&2; exit 2 ;;
 esac
 if [ -e "$out/ca.key" ]; then
     echo "$0: $out is there already; remove it to begin anew (all robots need the new files then)" >&2

@@ -11,122 +11,69 @@ from typing import TYPE_CHECKING, Any
 
 from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
+from reem_async.concurrency.aside import ensure_imported
 
+from .accessor import Accessor
 from .connection import RedisInterface
-from .errors import (
-    BadData,
-    BadInput,
-    BadKey,
-    BadType,
-    BadValue,
-    ClusterNode,
-    Conflict,
-    ConnectionLost,
-    InsecureConnection,
-    InterfaceClosed,
-    LoginRefused,
-    MissingKey,
-    Misuse,
-    NoJsonSupport,
-    NotAllowed,
-    NotConnected,
-    Overflow,
-    PartialWrite,
-    PathRefused,
-    QueueFull,
-    ReadOnly,
-    ReemError,
-    Refused,
-    ServerFailed,
-    ServerFull,
-    ServerMissing,
-    ServerNotReady,
-    ServerReadOnly,
-    TlsRefused,
-    TooDeep,
-    WriteOnly,
-    WrongKind,
-    WrongLoop,
-)
+from .errors import *
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 from .store import KeyValueStore, Reader, Writer
 
 if TYPE_CHECKING:
-    from reem_async.follow import Update
-    from reem_async.policy import Every, Last, Newest
+    from reem_async.concurrency.queues import Every, Last, Newest
+    from reem_async.pubsub.updates import Origin, Update
 
     from .publish import Publisher, PublishSpace
     from .subscribe import CallbackSubscriber, SilentSubscriber
 
 _LATER = {
     "CallbackSubscriber": "reem.subscribe",
-    "Every": "reem_async.policy",
-    "Last": "reem_async.policy",
-    "Newest": "reem_async.policy",
+    "Every": "reem_async.concurrency.queues",
+    "Last": "reem_async.concurrency.queues",
+    "Newest": "reem_async.concurrency.queues",
+    "Origin": "reem_async.pubsub.updates",
     "PublishSpace": "reem.publish",
     "Publisher": "reem.publish",
     "SilentSubscriber": "reem.subscribe",
-    "Update": "reem_async.follow",
+    "TolerantKeyValueStore": "reem.legacy",  # of REEM 0.1.3
+    "Update": "reem_async.pubsub.updates",
 }
 """Imported when first used: a program that only reads and writes starts sooner."""
+
+
+def load_ipython_extension(shell: Any) -> None:
+    """`%load_ext reem` in IPython and Jupyter: keys complete at any depth, and arrays are shown as pictures.
+
+    Pictures are of arrays that were read and can be one; they need pillow. Nothing is read to show it.
+    """
+    ensure_imported("reem_async.tools.notebook")
+    from reem_async.tools.notebook import complete_below, load_ipython_extension
+
+    complete_below(KeyValueStore, Accessor)
+    load_ipython_extension(shell)
+
+
+def unload_ipython_extension(shell: Any) -> None:
+    """`%unload_ext reem`: arrays are shown as numbers again."""
+    from reem_async.tools.notebook import unload_ipython_extension
+
+    unload_ipython_extension(shell)
 
 
 def __getattr__(name: str) -> Any:
     if name not in _LATER:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    ensure_imported(_LATER[name])
     return getattr(import_module(_LATER[name]), name)
 
 
 __all__ = [
-    "BadData",
-    "BadInput",
-    "BadKey",
-    "BadType",
-    "BadValue",
-    "BlobShip",
-    "BytesShip",
-    "CallbackSubscriber",
-    "ClusterNode",
-    "Conflict",
-    "ConnectionLost",
-    "Every",
-    "InsecureConnection",
-    "InterfaceClosed",
-    "KeyValueStore",
-    "Last",
-    "LoginRefused",
-    "MissingKey",
-    "Misuse",
-    "Newest",
-    "NoJsonSupport",
-    "NotAllowed",
-    "NotConnected",
-    "NumpyShip",
-    "Overflow",
-    "PartialWrite",
-    "PathRefused",
-    "PublishSpace",
-    "Publisher",
-    "QueueFull",
-    "ReadOnly",
-    "Reader",
-    "RedisInterface",
-    "ReemError",
-    "Refused",
-    "ServerFailed",
-    "ServerFull",
-    "ServerMissing",
-    "ServerNotReady",
-    "ServerReadOnly",
-    "SilentSubscriber",
-    "SpecialDatatypeShip",
-    "StateChange",
-    "TlsRefused",
-    "TooDeep",
-    "Update",
-    "WriteOnly",
-    "Writer",
-    "WrongKind",
-    "WrongLoop",
+    "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "BytesShip", "CallbackSubscriber",
+    "ClusterNode", "Conflict", "ConnectionLost", "Every", "InsecureConnection", "InterfaceClosed", "KeyValueStore",
+    "Last", "LoginRefused", "MissingKey", "Misuse", "Newest", "NoJsonSupport", "NotAllowed", "NotConnected",
+    "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite", "PathRefused", "PublishSpace", "Publisher",
+    "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "ServerFailed", "ServerFull",
+    "ServerMissing", "ServerNotReady", "ServerReadOnly", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
+    "StateChange", "TlsRefused", "TooDeep", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
-]
+]  # fmt: skip

@@ -2,15 +2,20 @@
 
 Plain reads and writes never come here: they run on the caller's thread. The loop serves what has to
 wait for others: subscriptions, and ships with `async def` methods.
+
+A caller may be interrupted between any two steps, by a handler of signals that raises or that calls REEM itself.
+So there is no lock between callers and the loop: a call is noted, then handed over, and its caller waits for a
+token that the loop gives back once. Whatever is still noted when the loop has ended is ended with it.
 """
 
 from __future__ import annotations
 
+import _thread
 import asyncio
-import concurrent.futures
+import contextlib
 import threading
-from collections.abc import Coroutine
-from typing import Any, TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, Generic, TypeVar
 
 from reem_async.errors import InterfaceClosed, WrongLoop
 
@@ -29,6 +34,7 @@ def finish(coroutine: Coroutine[Any, Any, Result]) -> Result:
         coroutine.send(None)
     except StopIteration as end:
         return end.value  # type: ignore[no-any-return]
+    # It waits for something: a ship with `async def` methods that was given to plain code, or a mistake of ours.
     coroutine.close()
     raise WrongLoop("this call has to wait for something that only an event loop can do")
 
@@ -41,26 +47,104 @@ def _new_loop() -> asyncio.AbstractEventLoop:
     return uvloop.new_event_loop()
 
 
+class _Call(Generic[Result]):
+    """A coroutine on its way through the loop, and the thread that waits for its end.
+
+    All but `wait` and `drop` is for the loop's thread. The token is a bare lock, given back once, at the end.
+    """
+
+    def __init__(self, coroutine: Coroutine[Any, Any, Result], noted: set[_Call[Any]]) -> None:
+        self._coroutine: Coroutine[Any, Any, Result] | None = coroutine  # until it begins
+        self._noted = noted
+        self._task: asyncio.Task[Result] | None = None
+        self._error: BaseException | None = None
+        self._result: Any = None
+        self._token = _thread.allocate_lock()
+        # Not an Event: its lock could be left taken by a handler of signals that raises.
+        self._token.acquire()
+        self.over = False
+
+    def begin(self) -> None:
+        """Start the coroutine."""
+        if self._coroutine is not None:
+            self._task = asyncio.get_running_loop().create_task(self._coroutine)
+            self._task.add_done_callback(self._take)
+            self._coroutine = None
+
+    def _take(self, task: asyncio.Task[Result]) -> None:
+        self._task = None  # asyncio's set of all tasks is to lose it on this thread
+        if task.cancelled():
+            self.end(_closed_meanwhile())
+        elif (error := task.exception()) is not None:
+            self.end(error)
+        else:
+            self._result = task.result()
+            self.end(None)
+
+    def give_up(self) -> None:
+        """Cancel the coroutine: nobody waits for it any more."""
+        if self._task is not None:
+            self._task.cancel()
+        elif not self.over:  # its caller was interrupted before it was handed over
+            self.end(_closed_meanwhile())
+
+    def end(self, error: BaseException | None) -> None:
+        """Let the caller go on. Idempotent."""
+        if self.over:
+            return
+        self.over, self._error = True, error
+        self.drop()
+        self._token.release()
+
+    def drop(self) -> None:
+        """Forget about it; also on its caller's thread, if there is no loop any more."""
+        self._noted.discard(self)
+        coroutine, self._coroutine = self._coroutine, None
+        if coroutine is not None:
+            coroutine.close()
+
+    def wait(self, timeout: float | None) -> Result:
+        """Return the coroutine's result, or raise what it raised; TimeoutError after `timeout` seconds."""
+        if not self._token.acquire(timeout=-1 if timeout is None else timeout):
+            raise TimeoutError
+        error, self._error = self._error, None
+        if error is None:
+            return self._result  # type: ignore[no-any-return]
+        try:
+            raise error
+        finally:
+            del error  # it holds this frame
+
+
+def _closed_meanwhile() -> InterfaceClosed:
+    return InterfaceClosed("this RedisInterface was closed during the call")
+
+
 class Portal:
-    """An event loop in a daemon thread, and the way into it."""
+    """An event loop in a daemon thread, and the way into it; made aside."""
 
     def __init__(self, name: str) -> None:
         self._loop = _new_loop()
-        self._gate = threading.Lock()
-        self._ended = False
+        self._calls: set[_Call[Any]] = set()
+        self._ident: int | None = None
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
+        self._ident = _thread.get_ident()
         asyncio.set_event_loop(self._loop)
-        self._loop.run_forever()
-        with self._gate:
-            self._ended = True
-        self._loop.run_until_complete(self._end_tasks())
-        self._loop.close()
+        try:
+            self._loop.run_forever()
+            # Calls that are under way are cancelled, and their callers told, before the loop is closed.
+            self._loop.run_until_complete(self._end_tasks())
+        finally:
+            self._loop.close()
+            for call in list(self._calls):  # a call that is not noted by now finds the loop closed
+                call.end(_closed_meanwhile())
 
     async def _end_tasks(self) -> None:
         """Cancel what still runs, including calls that were handed over just before the end."""
+        # One turn of the loop: calls that were handed over but not begun become tasks.
         await asyncio.sleep(0)
         left = asyncio.all_tasks() - {asyncio.current_task()}
         for task in left:
@@ -71,7 +155,7 @@ class Portal:
     @property
     def inside(self) -> bool:
         """Whether the caller is on the loop's own thread."""
-        return threading.current_thread() is self._thread
+        return _thread.get_ident() == self._ident
 
     def call(self, coroutine: Coroutine[Any, Any, Result], timeout: float | None = None) -> Result:
         """Run `coroutine` on the loop and wait for its result. Ctrl-C cancels it."""
@@ -80,23 +164,36 @@ class Portal:
             raise WrongLoop(
                 "a blocking call of REEM on REEM's own event loop thread would wait for itself; use reem_async there"
             )
-        with self._gate:
-            if self._ended:
-                coroutine.close()
-                raise InterfaceClosed("this RedisInterface is closed; make a new one")
-            future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        call = _Call(coroutine, self._calls)
         try:
-            return future.result(timeout)
-        except concurrent.futures.CancelledError:
-            raise InterfaceClosed("this RedisInterface was closed during the call") from None
+            self._calls.add(call)  # before it is handed over: see `_serve`
+            self._hand_over(call.begin)
+            return call.wait(timeout)
         except BaseException:
-            future.cancel()
+            if not call.over:
+                self._give_up(call)
             raise
+
+    def _give_up(self, call: _Call[Any]) -> None:
+        try:
+            self._hand_over(call.give_up)
+        except InterfaceClosed:
+            call.drop()
+
+    def _hand_over(self, step: Callable[[], object]) -> None:
+        """Have the loop take a step; raises InterfaceClosed."""
+        try:
+            self._loop.call_soon_threadsafe(step)
+        except RuntimeError:
+            # uvloop and asyncio raise the same RuntimeError for other mistakes too.
+            if not self._loop.is_closed():
+                raise
+            raise InterfaceClosed("this RedisInterface is closed; make a new one") from None
 
     def stop(self) -> None:
         """End the loop and wait for the thread, unless this is it. Idempotent."""
-        with self._gate:
-            if not self._ended:
-                self._loop.call_soon_threadsafe(self._loop.stop)
+        with contextlib.suppress(InterfaceClosed):
+            self._hand_over(self._loop.stop)
+        # A finalizer may run on the loop's own thread, which cannot wait for itself.
         if not self.inside:
             self._thread.join(2.0)

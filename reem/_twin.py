@@ -5,9 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-__all__ = ["documented_by"]
+__all__ = ["documented_by", "for_plain_code"]
 
 Class = TypeVar("Class", bound=type)
+
+
+def for_plain_code(text: str) -> str:
+    """Return a docstring of the core in the words of plain code: its loops and blocks wait by themselves."""
+    for of_asyncio, plain in (("an async iterator", "an iterator"), ("async for", "for"), ("async with", "with")):
+        text = text.replace(of_asyncio, plain)
+    return text
 
 
 def documented_by(core: type) -> Callable[[Class], Class]:
@@ -16,8 +23,9 @@ def documented_by(core: type) -> Callable[[Class], Class]:
     def decorate(facade: Class) -> Class:
         for name, member in vars(facade).items():
             twin = getattr(core, name, None)
+            # Properties keep their own text: theirs is one line, and has no word of asyncio.
             if callable(member) and not name.startswith("_") and twin is not None and twin.__doc__:
-                member.__doc__ = twin.__doc__
+                member.__doc__ = for_plain_code(twin.__doc__)
         return facade
 
     return decorate

@@ -4,31 +4,38 @@ from __future__ import annotations
 
 import builtins
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from reem_async import accessor as core
-from reem_async.errors import BadType
+from reem_async.concurrency.aside import ensure_imported
+from reem_async.errors import BadType, RedisError, ReemError
+from reem_async.plan.handles import Handle
+from reem_async.plan.paths import Path, show
+from reem_async.store import accessor as core
 
 from ._twin import documented_by
 from .connection import RedisInterface
+from .low_level import Publisher, Reader, Writer
 
 if TYPE_CHECKING:
-    from reem_async.policy import Policy
+    from reem_async.concurrency.queues import Policy
+    from reem_async.store.catalog import Outline
 
+    from .mirror import Mirror
     from .subscribe import Watch
 
 __all__ = ["Accessor", "Edit", "PublishAccessor"]
 
 
 @documented_by(core.Accessor)
-class Accessor:
+class Accessor(Handle):
     """One place in the dictionary: `kvs["foo"]["bar"]`, `kvs["foo"]["tiles"][0]`.
 
     It is only a path, immutable and cheap; nothing is sent before a method is called, or it is
     assigned to, deleted from, or changed with `+=`, `-=`, `*=`, `/=`. Every call is atomic and raises
-    `redis.exceptions.RedisError` if the server or the connection fails.
+    `redis.exceptions.RedisError` if the server or the connection fails. It is not its value: comparing it with one,
+    its truth, arithmetic and the like raise a TypeError that says how to read.
     """
 
     __slots__ = ("_core", "_edits", "_interface")
@@ -36,6 +43,7 @@ class Accessor:
     def __init__(self, interface: RedisInterface, inner: core.Accessor) -> None:
         self._interface = interface
         self._core = inner
+        # By thread: one accessor may be entered by several threads at once, and by one of them twice.
         self._edits: dict[int, list[Edit]] = {}
 
     def __getitem__(self, key: str | int) -> Self:
@@ -48,46 +56,79 @@ class Accessor:
         """Write, unless this is the end of `x[key] += n`: Python then assigns the accessor to itself."""
         if not isinstance(value, Accessor):
             self._interface._run(self._core.write(value))
+        # Identity is not enough: Python evaluates `x[key]` twice for `x[key] += n`, which makes two accessors.
         elif (value._interface, type(value), value.full_path) != (self._interface, type(self), self.full_path):
-            raise BadType(f"an accessor cannot be stored: assign {value!r}.read(), its value")
+            raise BadType(f"a handle cannot be stored ({show(value.full_path)}): assign its value, with .read()")
+
+    # Not by way of the methods: an error that says it all shows one frame less.
 
     def __delitem__(self, key: str | int) -> None:
-        self[key].delete()
+        self._interface._run(self._core[key].delete())
 
     def __len__(self) -> int:
-        return self.length()
+        return self._interface._run(self._core.length())
 
-    __iter__ = None
-    __contains__ = None
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._interface._run(self._core.keys()))
+
+    def __contains__(self, key: object) -> bool:
+        # Anything may stand before `in`; the core says what is wrong with what is no str.
+        return self._interface._run(self._core.contains(key))  # type: ignore[arg-type]  # which refuses it
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Return the keys that IPython offers after `["`; none where they cannot be had."""
+        try:
+            return self.keys()
+        except (ReemError, RedisError):
+            return []
 
     def __iadd__(self, value: Any) -> Self:
-        self.add(value)
+        self._interface._run(self._core.add(value))
         return self
 
     def __isub__(self, value: Any) -> Self:
-        self.decrement(value)
+        self._interface._run(self._core.decrement(value))
         return self
 
     def __imul__(self, value: Any) -> Self:
-        self.multiply(value)
+        self._interface._run(self._core.multiply(value))
         return self
 
     def __itruediv__(self, value: Any) -> Self:
-        self.divide(value)
+        self._interface._run(self._core.divide(value))
         return self
+
+    @property
+    def _place(self) -> tuple[object, Path]:
+        return self._interface, self.full_path
 
     @property
     def full_path(self) -> tuple[str | int, ...]:
         """The keys and indexes that lead here, top-level key first."""
         return self._core.full_path
 
+    @property
+    def path(self) -> list[str | int]:
+        """The keys and indexes that lead here from the top-level key."""
+        return self._core.path
+
+    @property
+    def reader(self) -> Reader:
+        """The reader of the top-level key."""
+        return Reader(str(self.full_path[0]), self._interface)
+
+    @property
+    def writer(self) -> Writer:
+        """The writer of the top-level key."""
+        return Writer(str(self.full_path[0]), self._interface)
+
     def read(self) -> Any:
         """Return the value here."""
         return self._interface._run(self._core.read())
 
-    def get(self, *default: Any) -> Any:
+    def get(self, *default: Any, default_value: Any = core._NOTHING) -> Any:
         """Return the value here, or a default."""
-        return self._interface._run(self._core.get(*default))
+        return self._interface._run(self._core.get(*default, default_value=default_value))
 
     def write(self, value: Any) -> None:
         """Store `value` here."""
@@ -100,6 +141,30 @@ class Accessor:
     def length(self) -> int:
         """Return the length of what is here."""
         return self._interface._run(self._core.length())
+
+    def contains(self, key: str) -> bool:
+        """Return whether the dict here has the key; also `key in accessor`."""
+        return self._interface._run(self._core.contains(key))
+
+    def keys(self) -> list[str]:
+        """Return the keys of the dict here; also `for key in accessor`."""
+        return self._interface._run(self._core.keys())
+
+    def outline(self) -> Outline:
+        """Return what is here without fetching arrays."""
+        return self._interface._run(self._core.outline())
+
+    def pop(self, key: str | int = -1, *default: Any) -> Any:
+        """Remove an element and return what it was."""
+        return self._interface._run(self._core.pop(key, *default))
+
+    def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
+        """Store several entries of the dict here."""
+        self._interface._run(self._core.update(values, **more))
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return an element of the dict here, stored first where there was none."""
+        return self._interface._run(self._core.setdefault(key, default))
 
     def type(self) -> builtins.type:
         """Return the Python type of what is here."""
@@ -137,11 +202,20 @@ class Accessor:
         """Return a context manager that reads, lets you change, and writes back; also `with accessor:`."""
         return Edit(self._interface, self._core.edit())
 
-    def watch(self, policy: Policy | None = None) -> Watch:
-        """Return an iterator over the value here and its updates."""
+    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+        """Return an iterator over the value here and its changes."""
+        ensure_imported("reem.subscribe")
         from .subscribe import Watch
 
-        return Watch(self._interface, self._interface._followers, self._core.full_path, policy)
+        # What follows lives on the background loop: the connections of the caller's thread only ask and answer.
+        return Watch(self._interface, self._interface._followers, self._core.full_path, policy, stored=stored)
+
+    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+        """Return a local copy of what is here that follows every change: `with kvs["arm"].mirror() as arm:`."""
+        ensure_imported("reem.mirror")
+        from .mirror import Mirror
+
+        return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest)
 
     def __enter__(self) -> Any:
         edit = self.edit()
@@ -152,24 +226,42 @@ class Accessor:
     def __exit__(
         self, kind: builtins.type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._edits[threading.get_ident()].pop().__exit__(kind, error, trace)
+        mine = self._edits[threading.get_ident()]
+        # The innermost block of this thread.
+        edit = mine.pop()
+        if not mine:
+            self._edits.pop(threading.get_ident(), None)
+        edit.__exit__(kind, error, trace)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        kinds = type(self), type(self._core), type(self._core._writer)
+        # The facade and the core's part of it, which says whether it publishes.
+        kinds = type(self), type(self._core), self._core._writer.maker()
         return _rebuilt, (kinds, self._interface, self._core.full_path)
-
-    def __repr__(self) -> str:
-        return repr(self._core)
 
 
 class PublishAccessor(Accessor):
     """One place of a PublishSpace: as `Accessor`, but what would read raises WriteOnly."""
 
     __slots__ = ()
+    _how_to_read = "a KeyValueStore"
 
-    def watch(self, policy: Policy | None = None) -> Watch:
+    @property
+    def reader(self) -> Any:
         """Raise WriteOnly."""
-        return self._core.watch(policy)  # type: ignore[return-value]
+        return self._core.reader
+
+    @property
+    def writer(self) -> Publisher:
+        """The publisher of the top-level key."""
+        return Publisher(str(self.full_path[0]), self._interface)
+
+    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+        """Raise WriteOnly."""
+        return self._core.mirror(max_age=max_age, largest=largest)  # type: ignore[return-value]
+
+    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+        """Raise WriteOnly."""
+        return self._core.watch(policy, stored=stored)  # type: ignore[return-value]
 
 
 def _rebuilt(kinds: Any, interface: RedisInterface, path: tuple[Any, ...]) -> Accessor:

@@ -4,24 +4,47 @@ from __future__ import annotations
 
 import contextlib
 import os
-import threading
+import sys
 import weakref
 from collections.abc import Callable, Coroutine, Sequence
+from functools import partial
+from importlib import import_module
+from threading import get_ident
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import reem_async
+from reem_async.concurrency.aside import aside
+from reem_async.concurrency.queues import Ended
 from reem_async.connection import rebuilt
-from reem_async.policy import Ended
+from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed
+from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
-from reem_async.state import State, StateChange, StateChanges
+from reem_async.transport.addresses import NewTransport
 from reem_async.transport.blocking import BlockingTransport
-from reem_async.transport.endpoints import NewTransport
+from reem_async.transport.state import State, StateChange, StateChanges, States
 
 from ._portal import Portal, finish
+from ._threads import Threads
 from ._twin import documented_by
 
-__all__ = ["RedisInterface"]
+__all__ = [  # noqa: F822 - all but RedisInterface stood here in REEM 0.1.x, and old programs import it from here
+    "ROOT_PATH", "ROOT_VALUE_SEQUENCE", "SEPARATOR_CHARACTER", "CallbackSubscriber", "KeyValueStore",
+    "NumpyMarshaller", "NumpyShip", "PublishSpace", "PublishWriter", "Publisher", "Reader", "RedisInterface",
+    "SilentSubscriber", "SpecialDatatypeMarshaller", "SpecialDatatypeShip", "Writer", "append_to_path",
+    "check_valid_key_name", "check_valid_key_name_ext", "copy_dictionary_without_paths", "extract_object",
+    "filter_paths_by_prefix", "insert_into_dictionary", "key_sequence_to_path", "key_sequence_to_path_ext",
+    "path_to_key_sequence",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    # Only when one is asked for, since `reem` imports this module.
+    reem = import_module("reem")
+    return getattr(reem if hasattr(reem, name) else import_module("reem.legacy"), name)
+
 
 Result = TypeVar("Result")
 
@@ -31,41 +54,92 @@ class _OnThread(reem_async.RedisInterface):
 
     _new_transport: NewTransport = BlockingTransport
 
+    def _new_client(self) -> Any:
+        from reem_async.transport.client import client
+
+        return client(self.session.options)
+
+    async def _close_client(self) -> None:
+        self._client.close()
+
+
+class _States(States):
+    """The states of an interface whose main thread may be interrupted anywhere: all that takes the lock is aside."""
+
+    def changes(self) -> StateChanges:
+        """Return an iterator over the state and its changes."""
+        return aside(super().changes)
+
+    def opened(self, address: str, server: str | None) -> None:
+        """Note a new connection."""
+        aside(partial(super().opened, address, server))
+
+    def lost(self, reason: Exception) -> bool:
+        """Note that a connection broke."""
+        return aside(partial(super().lost, reason))
+
+    def closed(self) -> None:
+        """Note the end, which ends all iterators."""
+        aside(super().closed)
+
 
 class _Background:
-    """The event loop of an interface and the core's interface on it, made when first needed."""
+    """The event loop of an interface and the core's interface on it, made when first needed.
+
+    Threads do not survive a fork, so each process has its own. There is no lock: who comes second finds what the
+    first has made, and what is made while the interface is being closed is stopped by whoever sees it last.
+    """
 
     def __init__(self, direct: reem_async.RedisInterface) -> None:
         self._direct = direct
-        self._lock = threading.RLock()
-        self._made: tuple[int, Portal, reem_async.RedisInterface] | None = None
+        self._made: dict[int, tuple[Portal, reem_async.RedisInterface]] = {}
 
     @property
     def inside(self) -> bool:
         """Whether the caller is on the loop's own thread."""
-        made = self._made
-        return made is not None and made[1].inside
+        made = self._made.get(os.getpid()) if self._made else None
+        return made is not None and made[0].inside
 
     def started(self) -> tuple[Portal, reem_async.RedisInterface]:
         """Return both, starting them if need be; raises InterfaceClosed."""
-        with self._lock:
+        # First, so that nothing is started for an interface that is closed.
+        self._direct.session.transport.check()
+        return self._made.get(os.getpid()) or aside(self._begun)
+
+    def _begun(self) -> tuple[Portal, reem_async.RedisInterface]:
+        host, ships, settings = self._direct._given
+        interface = reem_async.RedisInterface(host, ships, **settings)
+        # Both have one state: a user knows of one interface.
+        interface.session.transport.states = self._direct.session.transport.states
+        portal = Portal("reem-loop")
+        # One step of C, so of two threads that come here at once the second finds what the first has made.
+        made = self._made.setdefault(os.getpid(), (portal, interface))
+        if made[0] is not portal:
+            portal.stop()
+        try:
+            # It may have been closed while this was made: then nobody else would stop it.
             self._direct.session.transport.check()
-            if self._made is None or self._made[0] != os.getpid():  # threads do not survive a fork
-                host, ships, settings = self._direct._given
-                interface = reem_async.RedisInterface(host, ships, **settings)
-                interface.session.transport.states = self._direct.session.transport.states
-                self._made = os.getpid(), Portal("reem-loop"), interface
-            return self._made[1:]
+        except InterfaceClosed:
+            self._stop()
+            raise
+        return made
 
     def close(self) -> None:
-        """Close all connections and end the loop."""
+        """Close all connections and end the loop. Idempotent; goes on to its end if the caller is interrupted."""
+        aside(self._close)
+
+    def _close(self) -> None:
+        # The connections of calling threads go first, so that their calls end while the loop still answers.
         finish(self._direct.close())
-        with self._lock:
-            made, self._made = self._made, None
-        if made is not None and made[0] == os.getpid():
-            _, portal, interface = made
+        self._stop()
+
+    def _stop(self) -> None:
+        made = self._made.pop(os.getpid(), None)
+        if made is not None:
+            portal, interface = made
             if not portal.inside:
-                with contextlib.suppress(TimeoutError):
+                with contextlib.suppress(TimeoutError, InterfaceClosed):
+                    # A server that does not answer must not keep a program from ending.
                     portal.call(interface.close(), timeout=1.0)
             portal.stop()
 
@@ -81,7 +155,7 @@ class StateIterator:
 
     def __next__(self) -> StateChange:
         try:
-            return self._core.mailbox.take_waiting()  # type: ignore[no-any-return]
+            return self._core.queue.take_waiting()  # type: ignore[no-any-return]
         except Ended:
             raise StopIteration from None
 
@@ -96,13 +170,15 @@ class RedisInterface:
     started when first needed and ended by `close()` or at exit.
 
     Args:
-        host: A host name, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`. Several servers:
+        host: A host name, `host:port`, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`; if none is
+            given, the URL in the environment variable REEM_URL, else `localhost`. Several servers:
             `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an
             `EmbeddedCluster`; `redis+sentinel://host:26379,host:26380/mymaster` for the primary that
             sentinels name. With TLS they begin with `rediss+`. See docs/fleet.md.
         ships: What carries values that are not JSON, first fit first; replaces the default list of
-            `NumpyShip` and `BytesShip`.
-        namespace: Goes before every key and channel, so that several robots can share a server.
+            `NumpyShip` and `BytesShip`. A number in its place is the port.
+        namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
+            separator, any character but a letter or digit: "robot1:", "robots/r1:".
         timeout: Seconds without a byte moving after which a call is given up; `reem.timeout` sets another
             limit for some calls.
         read_from_replicas: Have replicas answer `read`, `get`, `length` and `type`, to spare primaries; for a
@@ -113,7 +189,17 @@ class RedisInterface:
             is of one instant, document and arrays together, and what a replica does not have is asked of the
             primary, so that MissingKey is as true as ever. Writes, `edit()`, arithmetic, subscribers, `watch()`
             and recordings stay with primaries, and `state` tells of them alone. See docs/fleet.md.
-        options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ...
+        local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
+            through shared memory, where that can be had; the server has every update all the same, and whatever goes
+            wrong on the way, the subscriber fetches it there. "off": always from the server. "early": what this
+            interface publishes is told to subscribers near by before the server has it (`update.early`); if the
+            server never gets it, they are told what is there, with `gap`. See docs/guarantees.md.
+        local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
+            of an update for each top-level key. Beyond that, values go through the server.
+        options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
+            is another name of `timeout`. Besides, `largest_value`: the bytes that a string in a reply may have
+            (an array, or the text of a document); 512 MB if not given, as a server's own `proto-max-bulk-len`. What is
+            larger, or over eight times that in one reply, closes the connection: ConnectionLost.
 
     Raises:
         BadType, BadValue: An option or URL that means nothing.
@@ -121,16 +207,22 @@ class RedisInterface:
 
     def __init__(
         self,
-        host: Any = "localhost",
-        ships: Sequence[SpecialDatatypeShip] | None = None,
+        host: Any = None,
+        ships: Sequence[SpecialDatatypeShip] | int | None = None,
         *,
         namespace: str = "",
         timeout: float = 1.0,
         read_from_replicas: bool = False,
+        local: Literal["auto", "off", "early"] = "auto",
+        local_memory: int = MEMORY,
         **options: Any,
     ) -> None:
         settings = {"namespace": namespace, "timeout": timeout, "read_from_replicas": read_from_replicas, **options}
+        settings |= {"local": local, "local_memory": local_memory}
         self._direct = _OnThread(host, ships, **settings)
+        self._direct.session.transport.states = _States()
+        self._direct.session.tasks = Threads()
+        self._uneven: set[int] = set()  # threads in whose calls a handler's call ended in an error
         self._background = _Background(self._direct)
         self._closing = weakref.finalize(self, self._background.close)  # when dropped, or at exit
 
@@ -143,6 +235,11 @@ class RedisInterface:
     def namespace(self) -> str:
         """What goes before every key and channel."""
         return self._direct.namespace
+
+    @property
+    def client(self) -> Any:
+        """A plain client of redis-py for the same server, made when first asked for and closed with this interface."""
+        return self._direct.client
 
     @property
     def state(self) -> State:
@@ -158,6 +255,11 @@ class RedisInterface:
         self._direct.on_state(callback)
 
     @property
+    def unreadable(self) -> int:
+        """How many messages on the channels that are followed could not be read, and were left out."""
+        return self._direct.unreadable
+
+    @property
     def _core(self) -> reem_async.RedisInterface:
         """The core's interface that stores are made from."""
         return self._followers if self._direct.session.ships.asynchronous else self._direct
@@ -169,13 +271,39 @@ class RedisInterface:
 
     def _run(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on a store to its end and return the result."""
-        if self._direct.session.ships.asynchronous or self._background.inside:
-            return self._wait(coroutine)
         try:
-            return finish(coroutine)
+            # Ships with `async def` methods need a loop. On the loop's own thread `_wait` refuses: the call would wait
+            # for itself.
+            if self._direct.session.ships.asynchronous or self._background.inside:
+                return self._wait(coroutine)
+            result = finish(coroutine)
+        except SELF_EXPLANATORY as error:  # forty lines of ours between the caller's and the message would not help
+            self._broken_off()
+            raise error.with_traceback(None) from None
         except BaseException:
-            self._direct.session.transport.broken_off()
+            self._broken_off()
             raise
+        # A call of a handler of signals, inside of one of this thread's calls, has ended in an error and could give
+        # nothing back.
+        if self._uneven:
+            self._broken_off()
+        return result
+
+    def _broken_off(self) -> None:
+        """Give back what this thread holds, at the end of the first of its calls that are under way.
+
+        There are several only where a handler of signals calls: what it came into still needs what it has.
+        """
+        me, frame = get_ident(), sys._getframe(1).f_back
+        # Looks for another `_run` of this interface below on the stack: then this call came out of a handler of
+        # signals.
+        while frame is not None:
+            if frame.f_code is RedisInterface._run.__code__ and frame.f_locals.get("self") is self:
+                self._uneven.add(me)
+                return
+            frame = frame.f_back
+        self._uneven.discard(me)
+        self._direct.session.transport.broken_off()
 
     def _wait(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on the background loop and return the result."""
@@ -192,7 +320,8 @@ class RedisInterface:
 
     def close(self) -> None:
         """End all subscriptions and close all connections."""
-        self._closing()
+        self._background.close()
+        self._closing.detach()
 
     def __enter__(self) -> Self:
         try:

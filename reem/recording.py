@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from reem_async import recording as core
 from reem_async.errors import InterfaceClosed
-from reem_async.recording import (
+from reem_async.tools import recording as core
+from reem_async.tools.recording import (
     ArrayHandle,
     ChannelSummary,
     DamagedRecording,
@@ -22,7 +21,7 @@ from reem_async.recording import (
     ReplayStatus,
     open_log,
 )
-from reem_async.recording.times import Instant
+from reem_async.tools.recording.times import Instant
 
 from ._twin import documented_by
 from .connection import RedisInterface
@@ -99,11 +98,16 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # The block's own error is what its reader has to know; that the recording failed too is a note on it.
         if error is None:
             self.stop()
             return
-        with contextlib.suppress(RecordingFailed, InterfaceClosed):
+        try:
             self.stop()
+        except InterfaceClosed:
+            pass
+        except RecordingFailed as failure:
+            error.add_note(str(failure))
 
 
 @documented_by(core.Replayer)
@@ -126,6 +130,7 @@ class Replayer:
         remap: Mapping[str, str] | None = None,
     ) -> None:
         self._interface = interface
+        # Checked by the core, which has the same names.
         settings: dict[str, Any] = {"start": start, "end": end, "loop": loop, "patterns": patterns, "remap": remap}
         self._core = core.Replayer(interface._followers, log, rate=rate, **settings)
 

@@ -1,5 +1,5 @@
-"""A private, real server inside a program; one object serves both fronts."""
+"""A private, real server or cluster inside a program; one object serves both fronts."""
 
-from reem_async.server import EmbeddedServer
+from reem_async.server import EmbeddedCluster, EmbeddedServer
 
-__all__ = ["EmbeddedServer"]
+__all__ = ["EmbeddedCluster", "EmbeddedServer"]

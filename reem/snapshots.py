@@ -11,8 +11,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from reem_async import snapshots as core
-from reem_async.snapshots import Progress, RdbUnavailable, Restored, SavedKey, Snapshot
+from reem_async.tools import snapshots as core
+from reem_async.tools.snapshots import Progress, RdbUnavailable, Restored, SavedKey, Snapshot
 
 from .connection import RedisInterface
 
@@ -66,5 +66,6 @@ def restore(
     return interface._wait(call)
 
 
+# The texts of the core, which say what is raised and how long it takes.
 for _twin in (save, save_rdb, restore):
     _twin.__doc__ = getattr(core, _twin.__name__).__doc__

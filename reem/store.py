@@ -1,57 +1,25 @@
-"""KeyValueStore, Reader and Writer for plain scripts."""
+"""KeyValueStore for plain scripts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
-from reem_async import store as core
+from reem_async.concurrency.aside import ensure_imported
+from reem_async.errors import RedisError, ReemError
+from reem_async.store import store as core
 
 from ._twin import documented_by
 from .accessor import Accessor
 from .connection import RedisInterface
+from .low_level import Reader, Writer
+
+if TYPE_CHECKING:
+    from reem_async.concurrency.queues import Policy
+
+    from .subscribe import PatternWatch
 
 __all__ = ["KeyValueStore", "Reader", "Writer"]
-
-
-@documented_by(core.Reader)
-class Reader:
-    """Reads one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
-
-    def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
-        self.interface = interface
-        self.top_key_name = top_key_name
-        self._core = core.Reader(top_key_name, interface._core)
-
-    def read_from_redis(self, read_path: str) -> Any:
-        """Return the value at a path like ".a.b"."""
-        return self.interface._run(self._core.read_from_redis(read_path))
-
-
-@documented_by(core.Writer)
-class Writer:
-    """Writes one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
-
-    _kind: type[core.Writer] = core.Writer
-
-    def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
-        self.interface = interface
-        self.top_key_name = top_key_name
-        self._core = self._kind(top_key_name, interface._core)
-
-    def send_to_redis(self, set_path: str, set_value: Any) -> None:
-        """Store a value at a path like ".a.b"."""
-        self.interface._run(self._core.send_to_redis(set_path, set_value))
 
 
 @documented_by(core.KeyValueStore)
@@ -63,17 +31,22 @@ class KeyValueStore:
 
     Args:
         interface: The server: a RedisInterface, another store, or what RedisInterface takes as host.
+        options: With a host, what else RedisInterface takes: `KeyValueStore("localhost", port=7400)`.
     """
 
     _kind: type[core.KeyValueStore] = core.KeyValueStore
     _accessor: type[Accessor] = Accessor
 
-    def __init__(self, interface: Any = "localhost") -> None:
+    def __init__(self, interface: Any = None, **options: Any) -> None:
         if isinstance(interface, KeyValueStore):
             interface = interface.interface
         self.interface: RedisInterface = (
-            interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
+            core.without_options(interface, options)
+            if isinstance(interface, RedisInterface)
+            else RedisInterface(interface, **options)
         )
+        # The core's interface that suits its ships: on this thread, or on the loop if one of them has `async def`
+        # methods.
         self._core = self._kind(self.interface._core)
 
     def __getitem__(self, key: str) -> Accessor:
@@ -85,8 +58,18 @@ class KeyValueStore:
     def __delitem__(self, key: str) -> None:
         self[key].delete()
 
-    __iter__ = None
-    __contains__ = None
+    def __contains__(self, key: str) -> bool:
+        return self.contains(key)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def _ipython_key_completions_(self) -> list[str]:
+        """Return the keys that IPython offers after `["`; none where they cannot be had."""
+        try:
+            return self.keys()
+        except (ReemError, RedisError):
+            return []
 
     def at(self, path: str) -> Accessor:
         """Return the accessor of a dotted path."""
@@ -96,17 +79,42 @@ class KeyValueStore:
         """Return the value at a dotted path."""
         return self.interface._run(self._core.get(path, default))
 
+    def contains(self, key: str) -> bool:
+        """Return whether a top-level key is there; also `key in store`."""
+        return self.interface._run(self._core.contains(key))
+
     def keys(self, pattern: str = "*") -> list[str]:
         """Return the top-level keys, sorted."""
         return self.interface._run(self._core.keys(pattern))
+
+    def pop(self, key: str, *default: Any) -> Any:
+        """Remove a top-level key and return what it held."""
+        return self.interface._run(self._core.pop(key, *default))
+
+    def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
+        """Store several top-level keys."""
+        self.interface._run(self._core.update(values, **more))
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return the value of a top-level key, stored first where there was none."""
+        return self.interface._run(self._core.setdefault(key, default))
 
     def set(self, path: str, value: Any) -> None:
         """Store `value` at a dotted path."""
         self.interface._run(self._core.set(path, value))
 
-    def track_schema_changes(self, set_value: bool, keys: Iterable[str] | None = None) -> None:
+    def watch(self, *patterns: str, policy: Policy | None = None, largest: int | None = None) -> PatternWatch:
+        """Return an iterator over every change of all keys that some patterns name."""
+        ensure_imported("reem.subscribe")
+        from .subscribe import PatternWatch
+
+        return PatternWatch(self.interface, patterns, policy, largest=largest)
+
+    def track_schema_changes(
+        self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
+    ) -> None:
         """Say whether the shape of what is written may change."""
-        self._core.track_schema_changes(set_value, keys)
+        self._core.track_schema_changes(set_value, keys, track=track)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface,)

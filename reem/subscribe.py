@@ -5,26 +5,49 @@ from __future__ import annotations
 import contextlib
 import inspect
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 import reem_async
-from reem_async import subscribe as core
-from reem_async.courtesy import take_short_turns
+from reem_async.concurrency.aside import aside
+from reem_async.concurrency.queues import Ended, Newest, Policy
+from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.errors import BadType, InterfaceClosed, QueueFull
 from reem_async.plan.paths import Path
-from reem_async.policy import Ended, Newest, Policy
+from reem_async.pubsub import subscribers as core
+from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
 from ._twin import documented_by
 from .connection import RedisInterface
 
-__all__ = ["CallbackSubscriber", "SilentSubscriber", "Watch"]
+__all__ = ["CallbackSubscriber", "PatternWatch", "SilentSubscriber", "Watch"]
+
+
+class Following:
+    """What begins to follow in `listen` and ends in `close`; `with` calls both."""
+
+    def listen(self) -> None:
+        """Begin to follow."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Stop following."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        self.listen()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 @documented_by(core.Watch)
-class Watch:
-    """Follows one path and yields its updates, one by one: an (async) iterator.
+class Watch(Following):
+    """Follows one path and yields its updates, one by one: an iterator.
 
     Follows from the first `for` or `with` on. The first update is the value that is already there,
     if any (`initial`). Leaving a loop with `break` keeps following until the watch is closed or
@@ -35,6 +58,7 @@ class Watch:
         followers: The interface's side on the background loop.
         path: The path, top-level key first.
         policy: What to keep for a loop that is slower than the updates.
+        stored: Yield what is only stored, too.
     """
 
     def __init__(
@@ -43,15 +67,17 @@ class Watch:
         followers: reem_async.RedisInterface,
         path: Path,
         policy: Policy | None,
+        *,
+        stored: bool = True,
     ) -> None:
         self._interface = interface
         session = followers.session
-        self._core = core.Watch(session, session.keys(path[0]), path[1:], policy or Newest())
+        self._core: Any = core.Watch(session, session.keys(path[0]), path[1:], policy or Newest(), stored=stored)
 
     @property
     def dropped(self) -> int:
         """How many updates were skipped since they were not taken in time."""
-        return self._core.dropped
+        return self._core.dropped  # type: ignore[no-any-return]
 
     def listen(self) -> None:
         """Begin to follow."""
@@ -66,25 +92,42 @@ class Watch:
         return self
 
     def __next__(self) -> core.Update:
+        # A loop need not be told to begin; `listen` has no update missed that is published after it.
         if not self._core._following:
             self.listen()
         try:
-            return self._core.mailbox.take_waiting()  # type: ignore[no-any-return]
+            # On the caller's thread: the loop puts updates into the queue and knows nothing of who takes them.
+            return self._core.queue.take_waiting()  # type: ignore[no-any-return]
         except Ended:
             raise StopIteration from None
 
-    def __enter__(self) -> Self:
-        self.listen()
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+@documented_by(PatternWatchCore)
+class PatternWatch(Watch):
+    """Follows all keys that some patterns name and yields their changes: an iterator.
+
+    What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
+    only stored, by whomever; keys that come to be, and those that go (`deleted`). A key that is only stored is found
+    within a second of its making.
+
+    Args:
+        interface: The server.
+        patterns: Globs of paths such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
+        policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
+        largest: Bytes of an array up to which it is fetched; None for no limit. See `Mirror`.
+    """
+
+    def __init__(
+        self, interface: RedisInterface, patterns: Sequence[str], policy: Policy | None, *, largest: int | None
     ) -> None:
-        self.close()
+        self._interface = interface
+        session = interface._followers.session
+        self._core: Any = PatternWatchCore(session, patterns, policy, largest=largest)
+        self.patterns = self._core.patterns
 
 
 @documented_by(core.SilentSubscriber)
-class SilentSubscriber:
+class SilentSubscriber(Following):
     """A local variable that follows what is published at a path.
 
     `value()` and `subscriber["number"].read()` answer from memory, without a trip to the server.
@@ -95,12 +138,16 @@ class SilentSubscriber:
         channel: The path to follow, such as "foo" or "foo.bar".
         interface: The server: a RedisInterface, or what it takes as host.
         policy: What an iteration keeps for a loop that is slower than the updates.
+        stored: Follow what is only stored, too, whoever stores it.
     """
 
-    def __init__(self, channel: str, interface: Any = "localhost", policy: Policy | None = None) -> None:
+    def __init__(
+        self, channel: str, interface: Any = None, policy: Policy | None = None, *, stored: bool = False
+    ) -> None:
         self.interface = interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
         self.channel = channel
-        self._core = core.SilentSubscriber(channel, self.interface._followers, policy)
+        self.stored = stored
+        self._core = core.SilentSubscriber(channel, self.interface._followers, policy, stored=stored)
 
     def listen(self) -> None:
         """Begin to follow."""
@@ -115,24 +162,21 @@ class SilentSubscriber:
         """Return a copy of the value as of now."""
         return self._core.value()
 
+    @property
+    def local_copy(self) -> Any:
+        """A copy of the value as of now, an empty dict if there is none."""
+        return self._core.local_copy
+
     def __getitem__(self, key: str | int) -> core.LocalAccessor:
         return self._core[key]
 
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an iterator over the updates."""
-        return Watch(self.interface, self._core.interface, self._core.full_path, policy or self._core.policy)
+        policy = policy or self._core.policy
+        return Watch(self.interface, self._core.interface, self._core.full_path, policy, stored=self.stored)
 
     def __iter__(self) -> Watch:
         return self.watch()
-
-    def __enter__(self) -> Self:
-        self.listen()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def __setitem__(self, key: str | int, value: Any) -> None:
         self._core[key] = value
@@ -141,7 +185,8 @@ class SilentSubscriber:
         del self._core[key]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.channel, self.interface, *self._core.__reduce__()[1][2:])
+        _, (_, arguments, stored) = self._core.__reduce__()
+        return core._rebuilt, (type(self), (self.channel, self.interface, *arguments[2:]), stored)
 
     def __repr__(self) -> str:
         return f"<reem.{type(self).__name__} {self.channel}>"
@@ -150,11 +195,13 @@ class SilentSubscriber:
 class CallbackSubscriber(SilentSubscriber):
     """Calls a function for each update of what is published at a path.
 
-    Called as `callback(data, updated_path, **kwargs)`: the whole structure below the channel, and
+    Called as `callback(data, updated_path, **kwargs)`, the first two by name where it has these
+    names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
     which path was updated, such as "callback_channel.number". Calls are made one after the other,
     in order, on a thread of the subscriber's own; they may use REEM. An exception in one is logged
     and does not end the subscription. If calls are slower than updates, the oldest of over 1000
-    waiting ones are dropped; a warning says so.
+    waiting ones are dropped; a warning says so. After a large update `data` may have later ones in it
+    already, which are called for too.
 
     Args:
         channel: The path to follow.
@@ -162,6 +209,7 @@ class CallbackSubscriber(SilentSubscriber):
         callback_function: The function.
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
+        stored: Call for what is only stored, too, whoever stores it.
     """
 
     def __init__(
@@ -171,32 +219,44 @@ class CallbackSubscriber(SilentSubscriber):
         callback_function: Callable[..., Any],
         kwargs: Mapping[str, Any] | None = None,
         policy: Policy | None = None,
+        *,
+        stored: bool = False,
     ) -> None:
-        super().__init__(channel, interface, policy)
-        self._calls = core.CallbackSubscriber(channel, self.interface._followers, callback_function, kwargs, policy)
+        super().__init__(channel, interface, policy, stored=stored)
+        self._calls = core.CallbackSubscriber(
+            channel, self.interface._followers, callback_function, kwargs, policy, stored=stored
+        )
+        # What answers `value()` is what calls are made of, so a callback never sees a copy older than its update.
         self._core = self._calls
         self._thread: threading.Thread | None = None
+        self._starting = threading.Lock()  # taken aside only
         if inspect.iscoroutinefunction(callback_function):
             raise BadType("callback_function is a coroutine function, which a thread cannot call; use reem_async")
 
     def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
         self.interface._wait(self._calls._updates.listen())
-        if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
-            self._thread.start()
+        aside(self._start)
+
+    def _start(self) -> None:
+        with self._starting:
+            # Again after a fork, which leaves the child without it.
+            if self._thread is None or not self._thread.is_alive():
+                self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
+                self._thread.start()
 
     def _call_all(self) -> None:
-        caller, mailbox = self._calls._caller(), self._calls._updates.mailbox
+        caller, queue = self._calls._caller(), self._calls._updates.queue
         take_short_turns()  # the event loop's thread has had its wake-up before: waiting once in line is enough
         try:
             while True:
-                caller.call(mailbox.take_waiting(), mailbox.dropped)
+                caller.call(queue.take_waiting(), queue.dropped)
         except (Ended, QueueFull) as reason:
             caller.ended(reason)
 
     def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
         super().close()
+        # A callback may close its own subscriber. One that takes longer goes on: its thread is a daemon.
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join(1.0)

@@ -1,9 +1,9 @@
 """The documented names: stores, subscribers, and what they are made of."""
 
-from .accessor import Accessor
-from .publish import Publisher, PublishSpace
+from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber, Update
 from .store import KeyValueStore, Reader, Writer
-from .subscribe import CallbackSubscriber, SilentSubscriber, Update
+from .store.accessor import Accessor
+from .store.publish import Publisher, PublishSpace
 
 __all__ = [
     "Accessor",

@@ -2,23 +2,29 @@
 
     ReemError
     +-- BadInput                 the value or path given; nothing was sent
-    |   +-- BadValue             also ValueError: NaN, an integer out of range, ...
+    |   +-- BadValue             also ValueError: an integer out of range, ...
+    |   |   +-- NotFinite        also redis ResponseError: NaN or infinity in a document
     |   +-- BadType              also TypeError: a set, an object array, ...
+    |   |   +-- WrongType        also redis ResponseError: what is stored there is of another type than the call needs
     |   +-- BadKey               also ValueError: a key that cannot be stored or addressed
-    |   +-- TooDeep              also ValueError: nested over 100 levels, or in a circle
+    |   +-- TooDeep              also ValueError, redis ResponseError: nested over 100 levels, or in a circle
     +-- Misuse                   also RuntimeError: used in a way that cannot work
     |   +-- InterfaceClosed
     |   +-- WrongLoop            an interface used in two event loops, or a blocking call on REEM's own
     |   +-- WriteOnly            also NotImplementedError: reading a PublishSpace
     |   +-- ReadOnly             also NotImplementedError: writing to a subscriber
-    +-- MissingKey               also KeyError: nothing is stored there
-    +-- PathRefused              also KeyError: the parent is missing or cannot hold the element
-    +-- Overflow                 also OverflowError: arithmetic left the range; put back
+    +-- MissingKey               also KeyError, redis ResponseError: nothing is stored there
+    +-- PathRefused              also KeyError, redis ResponseError: the parent is missing or cannot hold the element
+    +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
     +-- Conflict                 somebody else changed what was being edited; nothing written
+    +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     +-- QueueFull                a subscriber with the policy Every fell too far behind
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
     +-- ServerMissing            extra `server` not installed, or no usable server binary
     +-- ServerFailed             an embedded server did not start: port taken, ...
+
+Those that are also redis-py's ResponseError are what the server itself answered in REEM 0.0 and 0.1, whose programs
+catch them by that name.
 
 Errors that come from the server or from the connection stay `redis.exceptions.RedisError`:
 
@@ -34,9 +40,9 @@ Errors that come from the server or from the connection stay `redis.exceptions.R
         +-- ServerReadOnly       also redis ReadOnlyError: a replica, or a server that cannot save
         +-- ServerNotReady       also redis BusyLoadingError: still loading, busy, or without its primary
         +-- ClusterNode          also redis ResponseError: one node of a Redis Cluster
-        +-- NoJsonSupport        also redis ResponseError: the server lacks RedisJSON
+        +-- NoJsonSupport        also redis ResponseError: its JSON is not all of RedisJSON
 
-`NotConnected` has a subclass `TlsRefused`: the server is there, but TLS found it, or it found us, wanting.
+`NotConnected` has a subclass `TlsRefused`: the server is there, but one side did not accept the other's certificate.
 
 One warning: `InsecureConnection`, a connection to another machine that others can listen to.
 """
@@ -63,6 +69,7 @@ __all__ = [
     "NoJsonSupport",
     "NotAllowed",
     "NotConnected",
+    "NotFinite",
     "Overflow",
     "PartialWrite",
     "PathRefused",
@@ -75,11 +82,13 @@ __all__ = [
     "ServerMissing",
     "ServerNotReady",
     "ServerReadOnly",
+    "Stale",
     "TlsRefused",
     "TooDeep",
     "WriteOnly",
     "WrongKind",
     "WrongLoop",
+    "WrongType",
 ]
 
 
@@ -107,15 +116,23 @@ class BadValue(BadInput, ValueError):
     """A value of a right type that cannot be stored, such as NaN in a document."""
 
 
+class NotFinite(BadValue, redis.exceptions.ResponseError):
+    """NaN or infinity in a document: JSON has no such numbers; arrays keep them."""
+
+
 class BadType(BadInput, TypeError):
     """A value of a type that cannot be stored and that no ship takes."""
+
+
+class WrongType(BadType, redis.exceptions.ResponseError):
+    """What is stored at the path is of another type than the call works on, such as `append` to a dict."""
 
 
 class BadKey(BadInput, ValueError):
     """A key that cannot be stored, or that the server's paths cannot address."""
 
 
-class TooDeep(BadInput, ValueError):
+class TooDeep(BadInput, ValueError, redis.exceptions.ResponseError):
     """A value nested over 100 levels, or one that contains itself."""
 
 
@@ -139,21 +156,29 @@ class ReadOnly(Misuse, NotImplementedError, TypeError):
     """A subscriber's local copy was written; it only follows the server."""
 
 
-class MissingKey(ReemError, KeyError):
+class MissingKey(ReemError, KeyError, redis.exceptions.ResponseError):
     """Nothing is stored at the path."""
 
     def __str__(self) -> str:  # KeyError would show the message in quotes
         return str(self.args[0]) if self.args else ""
 
 
-class PathRefused(ReemError, KeyError):
+class MissingDocument(MissingKey):
+    """Not even the top-level key is there: `read` answers None; other calls raise this as MissingKey."""
+
+
+class PathRefused(ReemError, KeyError, redis.exceptions.ResponseError):
     """The parent of a written path is missing, or is a scalar, or the index is out of range."""
 
     def __str__(self) -> str:
         return str(self.args[0]) if self.args else ""
 
 
-class Overflow(ReemError, OverflowError):
+class MissingTop(PathRefused):
+    """There is no top-level key to write into: a single array makes it, all else is refused with this."""
+
+
+class Overflow(ReemError, OverflowError, redis.exceptions.ResponseError):
     """Arithmetic on the server left the range of its numbers; the old value is back."""
 
 
@@ -163,6 +188,10 @@ class Conflict(ReemError):
 
 class QueueFull(ReemError):
     """A subscriber that asked for every update fell further behind than its bound."""
+
+
+class Stale(ReemError):
+    """A mirror does not answer: its connection is down, or its copy is older than `max_age` allows."""
 
 
 class BadData(ReemError, ValueError):
@@ -197,11 +226,16 @@ class WrongKind(ReemError, redis.exceptions.ResponseError):
         where: The path that was meant.
     """
 
-    def __init__(self, key: str, where: str, kind: str = "another type") -> None:
-        super().__init__(
-            f"{where}: the Redis key {key!r} holds a value of type {kind} (a program without REEM wrote it), "
-            "not a document; choose another name, or remove that key"
+    def __init__(self, key: str, where: str, kind: str = "another type", *, text: bool = False) -> None:
+        foreign = (
+            f"the Redis key {key!r} holds a value of type {kind} (a program without REEM wrote it), not a document; "
+            "choose another name, or remove that key"
         )
+        moved = (
+            f"the document under the Redis key {key!r} is text, as servers without JSON keep it, and this one has "
+            "JSON; convert it: reem migrate --yes"
+        )
+        super().__init__(f"{where}: {moved if text else foreign}")
         self.key = key
         self.where = where
 
@@ -247,22 +281,54 @@ class ServerNotReady(Refused, redis.exceptions.BusyLoadingError):
 
 
 class ClusterNode(Refused, redis.exceptions.ResponseError):
-    """The server is one node of a Redis Cluster, and the key lives on another."""
+    """The server is one node of a Redis Cluster, and the key lives on another.
+
+    Attributes:
+        fact: What is the matter, without the advice for whoever is connected to this node alone.
+    """
+
+    def __init__(self, fact: str, advice: str = "") -> None:
+        super().__init__(f"{fact}; {advice}" if advice else fact)
+        self.fact = fact
+        self._advice = advice
+
+    def at(self, place: str) -> ClusterNode:
+        """Return this error with its message headed by where it happened."""
+        return ClusterNode(f"{place}: {self.fact}", self._advice)
 
 
 class NoJsonSupport(Refused, redis.exceptions.ResponseError):
-    """The server answers, but has no RedisJSON."""
+    """The server has JSON, but not this command of RedisJSON's. Where there is no JSON at all, REEM does without.
+
+    Of a JSON command of `interface.client`, that there is no JSON at all: redis-py does not do without.
+    """
 
 
 class InsecureConnection(UserWarning):
     """What goes over a connection can be read and changed on its way; said once for each address."""
 
 
+SELF_EXPLANATORY = (MissingKey, PathRefused, ConnectionLost, NotConnected)
+"""Errors whose message is all there is to know: REEM's own frames and causes are left out of their tracebacks."""
+
+
+ALL_NODES = "connect with RedisInterface('redis+cluster://host:port,host:port')"
+"""What to do when connected to one node of several."""
+
+
+def is_of_command(error: Exception) -> bool:
+    """Return whether a user may not run a command at all; else it is this key or channel that is out of bounds."""
+    return isinstance(error, NotAllowed) and "run the" in str(error)
+
+
 def turned_down(error: Exception) -> Refused:
     """Return what an error reply about the server means to somebody who talks to that one server only."""
     if isinstance(error, Refused):
         return error
-    return ClusterNode(
-        "the server is a node of a Redis Cluster and does not hold this key now; connect with "
-        f"RedisInterface('redis+cluster://host:port,host:port') (it says: {error!s:.120})"
-    )
+    fact = "the server is a node of a Redis Cluster and does not hold this key now"
+    # MOVED and ASK are followed by whoever knows the whole cluster; here nobody does.
+    if isinstance(error, redis.exceptions.TryAgainError):
+        fact = "the key's slot is moving between nodes of a Redis Cluster, and parts of the key are on either"
+    elif isinstance(error, redis.exceptions.ClusterDownError):
+        fact = "the server is a node of a Redis Cluster that does not serve this key at the moment"
+    return ClusterNode(f"{fact} (it says: {error!s:.120})", ALL_NODES)

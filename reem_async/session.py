@@ -2,32 +2,123 @@
 
 from __future__ import annotations
 
-import asyncio
+import collections
+import contextlib
 import os
 import secrets
+import threading
 import time
-from collections.abc import Coroutine, Sequence
+import weakref
+from collections.abc import AsyncIterator, Coroutine, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-from .errors import BadType, ClusterReply, NotAllowed, Refused, turned_down
+from .concurrency.tasks import Tasks
+from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
+from .local.path import LocalPath
 from .plan import Plan
 from .plan.keys import Keys, keys_of
-from .plan.memory import Memory
-from .plan.paths import check_top_key
+from .plan.paths import LONGEST_TOP_KEY, check_namespace, check_top_key
+from .plan.patterns import Pattern, escaped
+from .plan.scan import DOCUMENT
+from .plan.shapes import ShapeCache
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive
-from .transport.endpoints import NewTransport, way_to
+from .transport.addresses import NewTransport
+from .transport.endpoints import way_to
 from .transport.recorder import CommandRecorder
+from .transport.scan import scanned
 
-if TYPE_CHECKING:
-    from .hub import Hub
-
-__all__ = ["Session"]
+__all__ = ["Session", "Subscriptions"]
 
 _FRESH = 3.0
 """Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
+
+
+_IDLE, _LOOKS = 120.0, 10.0
+"""Seconds for which a top-level key must not have been published to be forgotten, and between looks for such keys.
+
+Longer than the server keeps the note of a key's last update."""
+_KEPT = 1000
+"""Top-level keys that are never forgotten, however idle."""
+
+
+class _Numbers:
+    """Who publishes, and the number of its last update of each top-level key; what is idle is forgotten.
+
+    A key that comes back after that is published under another id, from 1 on: numbers under one id never go back.
+    """
+
+    def __init__(self) -> None:
+        # A forked child shares the id until it publishes; then `next` gives it one of its own.
+        self._pid = os.getpid()
+        self._looked = 0.0
+        self._looking = threading.Lock()  # tried, never waited for
+        self.publisher = secrets.token_hex(6)
+        self._last: collections.OrderedDict[str, tuple[str, int, float]] = collections.OrderedDict()
+
+    def next(self, channel: str) -> tuple[str, int]:
+        """Return the id and the number of the next update."""
+        if self._pid != os.getpid():  # a forked child is another publisher
+            self.__init__()  # type: ignore[misc]
+        now = time.monotonic()
+        # No lock between threads: calls on one key come one after the other (`Transport.ordered`), and those on other
+        # keys touch other entries.
+        publisher, number, _ = self._last.get(channel) or (self.publisher, 0, now)
+        self._last[channel] = publisher, number + 1, now
+        with contextlib.suppress(KeyError):  # another thread has just forgotten it
+            self._last.move_to_end(channel)
+        if len(self._last) > _KEPT and now - self._looked > _LOOKS and self._looking.acquire(blocking=False):
+            try:
+                self._looked = now
+                self._forget(now - _IDLE)
+            finally:
+                self._looking.release()
+        return publisher, number + 1
+
+    def take_back(self, channel: str, publisher: str, number: int) -> None:
+        """Return a number once more, if it was the last."""
+        last = self._last.get(channel)
+        if last is not None and last[:2] == (publisher, number):
+            self._last[channel] = publisher, number - 1, last[2]
+
+    def _forget(self, before: float) -> None:
+        # The order of the dict is that of the last use, so the idlest key is the first.
+        if self._is_first_before(before):
+            self.publisher = secrets.token_hex(6)  # first: a key that comes back must not get the id it had
+        while len(self._last) > _KEPT and self._is_first_before(before):
+            self._last.popitem(last=False)
+
+    def _is_first_before(self, moment: float) -> bool:
+        try:
+            return self._last[next(iter(self._last))][2] < moment
+        except (KeyError, RuntimeError):  # another thread has published it now
+            return False
+
+
+class Subscriptions(Protocol):
+    """What follows updates for an interface in one event loop: `pubsub.manager.SubscriptionManager`."""
+
+    async def close(self) -> None:
+        """End all of them."""
+
+
+class Background(Protocol):
+    """Runs coroutines beside the calls of an interface."""
+
+    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> object:
+        """Run a coroutine, under a name."""
+
+    async def end(self) -> None:
+        """End all of them."""
+
+
+class Closing(Protocol):
+    """Who is told when an interface is closed."""
+
+    def close(self) -> None:
+        """Give up what could only be done while it was open."""
 
 
 class Session:
@@ -36,18 +127,23 @@ class Session:
     Args:
         host: A host name, a URL, an `EmbeddedServer` or an `EmbeddedCluster`.
         ships: What carries values that are not JSON; None for the default list.
-        namespace: Goes before every key and channel.
+        namespace: Goes before every key and channel; ends with a separator.
         timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options.
         new_transport: Makes the transport to one server.
         replicas: What a user reads comes from replicas.
+        local: The shared memory of publishers, and of those who listen to them; None for the usual.
 
     Attributes:
         ships: Chooses ships.
-        memory: What is known of the server.
+        cache: What is known of the server.
+        local: The shared memory of publishers, and of those who listen to them.
         transport: The way to the server.
         readers: The way for what a user reads for its own sake, not to act on it; the same if it is not for replicas.
         interface: The interface this belongs to: what is pickled in its place.
+        subscriptions: The subscription manager, made when something is first followed; see `pubsub.manager.manager_of`.
+        tasks: What runs in the background for publishers; ended by `close`.
+        closing: Who is told when this is closed.
     """
 
     def __init__(
@@ -60,36 +156,45 @@ class Session:
         new_transport: NewTransport,
         *,
         replicas: bool = False,
+        local: LocalPath | None = None,
     ) -> None:
-        if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
-            raise BadType(f"the namespace {namespace!r} is not a str without braces")
-        self.namespace = namespace
+        self.namespace = check_namespace(namespace)
+        # The namespace counts: what the server is sent has at most 512 bytes.
+        self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
-        self.memory = Memory()
+        self.cache = ShapeCache()
         self.options, self.transport, self.readers = way_to(host, timeout, options, new_transport, replicas=replicas)
+        self.local = local or LocalPath()
         self.interface: Any = None
-        self._publisher = secrets.token_hex(6), os.getpid()
-        self._sequences: dict[str, int] = {}
+        self._numbers = _Numbers()
         self._fresh: dict[str, float] = {}
-        self._hub: Hub | None = None
+        self.subscriptions: Subscriptions | None = None
+        self.tasks: Background = Tasks()
+        self.closing: weakref.WeakSet[Closing] = weakref.WeakSet()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return attrgetter("session"), (self.interface,)
 
-    @property
-    def hub(self) -> Hub:
-        """The one subscription connection of the running event loop and all that follow updates through it."""
-        self.transport.check()
-        place = os.getpid(), asyncio.get_running_loop()
-        if self._hub is None or self._hub.place != place:
-            from .hub import Hub
-
-            self._hub = Hub(self.transport, self.ships)
-        return self._hub
-
     def keys(self, name: object) -> Keys:
         """Return the server-side names of the top-level key `name`; raises BadKey."""
-        return keys_of(check_top_key(name), self.namespace, self.options.database, self.transport.sharded)
+        return keys_of(check_top_key(name, self._room), self.namespace, self.options.database, self.transport.sharded)
+
+    async def names(self, pattern: Pattern) -> AsyncIterator[str]:
+        """Yield the top-level keys that a pattern names, in no order, each once; a round trip for about 1000 keys."""
+        seen: set[str] = set()
+        async for page in scanned(self.transport, escaped(self.namespace) + pattern.glob, DOCUMENT):
+            for document in page:
+                name = self._name(document)
+                if name is not None and name not in seen:
+                    seen.add(name)
+                    yield name
+
+    def _name(self, document: bytes) -> str | None:
+        """Return the top-level key whose document has a name on the server, None if none can have it."""
+        try:
+            return self.keys(document.decode()[len(self.namespace) :]).name
+        except (UnicodeDecodeError, BadKey):
+            return None
 
     def run(self, plan: Plan, at: Transport | None = None) -> Coroutine[Any, Any, Any]:
         """Send a plan's commands, and those that follow from the replies; awaited, it is the result.
@@ -100,12 +205,24 @@ class Session:
 
     def stamp(self, keys: Keys) -> tuple[str, int]:
         """Return who publishes, and the number of this publisher's next update of a top-level key."""
-        if self._publisher[1] != os.getpid():  # a forked child is another publisher
-            self._publisher, self._sequences = (secrets.token_hex(6), os.getpid()), {}
-        number = self._sequences[keys.channel] = self._sequences.get(keys.channel, 0) + 1
+        publisher, number = self._numbers.next(keys.channel)
+        # Of a cluster, notices go to the key's own node. Who looks for keys by pattern does not follow a new one there
+        # yet.
         if number == 1 and self.transport.sharded:
-            self._fresh[keys.channel] = time.monotonic() + _FRESH
-        return self._publisher[0], number
+            now = time.monotonic()
+            if len(self._fresh) >= _KEPT:
+                for channel in [channel for channel, until in self._fresh.copy().items() if until < now]:
+                    self._fresh.pop(channel, None)
+            self._fresh[keys.channel] = now + _FRESH
+        return publisher, number
+
+    def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
+        """Have the number of a stamp of a top-level key returned again: it was not used.
+
+        Only for whoever has kept others from asking for one since; see `Transport.ordered`. A handler of signals that
+        has published meanwhile, on the same thread, leaves a number that is never used.
+        """
+        self._numbers.take_back(keys.channel, *stamp)
 
     def is_fresh(self, keys: Keys) -> bool:
         """Return whether this publisher has only begun with a top-level key of a cluster: others may not know it."""
@@ -118,23 +235,31 @@ class Session:
         return False
 
     async def initialize(self) -> None:
-        """Connect and check that the server has RedisJSON."""
+        """Connect and check that the server can be used."""
         await self.ships.ready()
+        # Any key will do: what matters is whether the server knows the command, and the user may send it.
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
         # Not allowed to use JSON is told at once; that this one key is out of bounds means nothing.
-        elsewhere = isinstance(reply, NotAllowed) and "run the" not in str(reply)
+        elsewhere = isinstance(reply, NotAllowed) and not is_of_command(reply)
         if isinstance(reply, Refused | ClusterReply) and not elsewhere:
             raise turned_down(reply).at(self.options.address)
 
     async def release(self) -> None:
         """End all subscriptions and close all connections of this event loop; another one may go on."""
-        hub, self._hub = self._hub, None
-        if hub is not None:
-            await hub.close()
+        subscriptions, self.subscriptions = self.subscriptions, None
+        if subscriptions is not None:
+            await subscriptions.close()
+        await self.tasks.end()
+        # `readers` may be the way to replicas, which closes the one to the primary with it.
         await self.readers.release()
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""
-        if self._hub is not None:
-            await self._hub.close()
+        if self.subscriptions is not None:
+            await self.subscriptions.close()
+        # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has kept.
         await self.readers.close()
+        for each in list(self.closing):
+            each.close()
+        await self.tasks.end()
+        self.local.close()

@@ -10,7 +10,7 @@ import httpx
 from conftest import PATIENCE, eventually
 
 from reem_async import RedisInterface
-from reem_async.browser import LiveSource, PageServer, create_app, listen
+from reem_async.tools.browser import LiveSource, PageServer, create_app, listen
 
 
 @contextlib.contextmanager

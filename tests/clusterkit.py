@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import time
@@ -11,6 +12,7 @@ import redis
 import redis.crc
 
 from reem_async.errors import ServerFailed
+from reem_async.plan.placeholders import find
 
 
 def slot_of(key):
@@ -92,16 +94,52 @@ class Move:
         """What of the key is still here; other keys may share the slot."""
         return [each for each in self.all_keys() if self.key in each]
 
-    def finish(self):
-        """Move what is left, and tell all nodes."""
+    def finish(self, *, source_first=False):
+        """Move what is left, and tell all nodes: the source before the target, if so wanted."""
         while keys := self.all_keys():
             self.take(*keys)
-        for node in (self.target, self.source, *self._others):
-            self._say(node, "NODE", self.target.id)
+        first = (self.source, self.target) if source_first else (self.target, self.source)
+        for node in (*first, *self._others):
+            self.tell(node)
+
+    def tell(self, node):
+        """Tell one node that the slot belongs to the target now."""
+        self._say(node, "NODE", self.target.id)
+
+    def on_both(self):
+        """The keys of the slot that are on both nodes: they could not be moved any more."""
+        return self._keys_of(self.source) & self._keys_of(self.target)
+
+    def _keys_of(self, node):
+        with raw_of(node) as client:
+            return set(client.execute_command("CLUSTER", "GETKEYSINSLOT", self.slot, 1000))
 
     def _say(self, node, *words):
         with raw_of(node) as client:
             client.execute_command("CLUSTER", "SETSLOT", self.slot, *words)
+
+
+@contextlib.contextmanager
+def clients_of(nodes):
+    """Plain clients of several nodes."""
+    with contextlib.ExitStack() as stack:
+        yield [stack.enter_context(raw_of(node)) for node in nodes]
+
+
+def assert_tidy(clients, *keys):
+    """Of each key, document, registry and arrays name the same arrays, on one node, and there are no others."""
+    found = {}
+    for client in clients:
+        for name in client.scan_iter(count=1000):
+            assert name not in found, f"{name} is on two nodes"
+            found[name] = client
+    for key in keys:
+        tag = "{" + key + "}"
+        arrays = {name for name in found if name.startswith(tag) and not name.startswith(tag + ":")}
+        registry = found[tag + ":ships"].smembers(tag + ":ships") if tag + ":ships" in found else ()
+        text = found[key].execute_command("JSON.GET", key) if key in found else "{}"
+        referred = {tag + slot.placeholder.suffix for slot in find([json.loads(text)], key)}
+        assert (arrays, {tag + suffix for suffix in registry}) == (referred, referred), key
 
 
 def kill_primary(cluster, key):

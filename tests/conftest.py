@@ -1,7 +1,8 @@
 """Fixtures and small tools shared by all tests.
 
 The server is `$REEM_TEST_URL` if set, else an `EmbeddedServer`, else a `redis:8` container; with
-`REEM_TEST_SERVER=cluster` it is an `EmbeddedCluster` of three primaries. It is not flushed: every test
+`REEM_TEST_SERVER=cluster` it is an `EmbeddedCluster` of three primaries, with `REEM_TEST_SERVER=plain` no server
+that a test starts has the JSON module. It is not flushed: every test
 names its keys through the `key` fixture, and what carries its prefix is unlinked.
 """
 
@@ -12,6 +13,7 @@ import contextlib
 import operator
 import os
 import re
+import select
 import signal
 import struct
 import subprocess
@@ -28,6 +30,11 @@ import redis
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Tests start hundreds of programs. Where the environment forbids to keep bytecode, each of them would compile all of
+# REEM anew, which takes longer than most tests.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 ROOT = Path(__file__).resolve().parents[1]
 
 EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", "2000"))
@@ -35,6 +42,14 @@ EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", "2000"))
 
 PATIENCE = 10.0
 """Seconds after which something that must happen is given up on."""
+
+
+PLAIN = os.environ.get("REEM_TEST_SERVER") == "plain"
+if PLAIN:
+    import plainkit
+
+    os.environ["REEM_SERVER_PLAIN"] = "1"  # for the servers of other processes too
+    plainkit.teach(redis.Redis)
 
 
 # --- the server -------------------------------------------------
@@ -52,7 +67,7 @@ def _container():
 @pytest.fixture(scope="session")
 def cluster():
     """A cluster of three primaries."""
-    from reem_async.cluster_server import EmbeddedCluster
+    from reem_async.server.cluster import EmbeddedCluster
 
     with EmbeddedCluster(replicas=0) as running:
         yield running
@@ -69,7 +84,7 @@ def server_url(request):
         yield request.getfixturevalue("cluster").url
         return
     from reem_async.errors import ServerMissing
-    from reem_async.server import EmbeddedServer
+    from reem_async.server.embedded import EmbeddedServer
 
     with contextlib.ExitStack() as stack:
         try:
@@ -86,8 +101,40 @@ ONE_SERVER = {
 """Tests of what only one server has, and why."""
 
 
+WITH_MODULE = {
+    "test_the_server_never_calculates_near_the_end_of_its_range": "counts commands of the module",
+    "test_ten_thousand_keys_and_eight_megabytes": "fills the server by a pipeline of the module's commands",
+    "test_a_server_takes_the_sample_configuration": "its file of users names commands of the module",
+    "test_compose_starts_the_server_with_these_files": "the same",
+    "test_another_namespace": "the same",
+    "test_nobody_gets_in_without_a_password": "the same",
+    "test_outline_tells_what_is_there_without_fetching_arrays": "counts GET",
+    "test_an_empty_server_gets_everything_bit_for_bit": "compares text that the module has made of numbers",
+    "test_the_servers_own_text_would_not_do": "shows how the module reads numbers",
+    "test_what_a_user_may_not_do_is_named": "takes away rights to the module's commands",
+    "test_a_client_that_may_not_read_the_document_removes_no_array_of_it": "may ask for the type of a document alone",
+    "test_without_the_right_to_use_json_one_hears_of_it_on_connecting": "the same",
+    "test_each_short_key_of_odd_characters_is_addressed_exactly_or_refused": "tries how the module reads paths",
+    "test_each_character_first_last_or_alone_is_addressed_exactly_or_refused": "the same",
+    "test_everything_security_md_says_to_type_works": "the same",
+    "test_migration.py": "what REEM 0.1 has stored are documents of the module, in a layout of their own",
+    "test_what_old_versions_have_stored_is_converted": "the same",
+    "test_reem_server_with_json": "hands the module to a server",
+    "test_path_is_tried_in_order_and_passed_over_without_json": "the same",
+    "test_a_plain_client_of_the_same_server": "calls the module; test_plain.py has what it says without",
+    "test_a_plain_client_for_asyncio": "the same",
+    "test_the_state_server_of_a_robot": "the same",
+}
+"""Tests, and files of tests, of what only a server with the JSON module does, and why."""
+
+
 def pytest_collection_modifyitems(items):
-    """On a cluster, leave out what only one server has."""
+    """On a cluster, leave out what only one server has; on a plain server, what only the module does."""
+    if PLAIN:
+        for item in items:
+            reason = WITH_MODULE.get(item.originalname) or WITH_MODULE.get(item.path.name)
+            if reason:
+                item.add_marker(pytest.mark.skip(reason=reason))
     if os.environ.get("REEM_TEST_SERVER") == "cluster":
         for item in items:
             if item.originalname in ONE_SERVER:
@@ -120,6 +167,8 @@ class RawCluster(redis.RedisCluster):
         return super().client_kill_filter(_id=number, target_nodes=self.get_node(node_name=node), **options)
 
     def execute_command(self, *words, **options):
+        if PLAIN and (words[0] == "TYPE" or words[0].startswith("JSON.")):
+            return self.get_node_from_key(words[1]).redis_connection.execute_command(*words, **options)
         if words[0] == "ACL":
             options.setdefault("target_nodes", redis.RedisCluster.PRIMARIES)
         return super().execute_command(*words, **options)
@@ -282,6 +331,9 @@ class BlockingFront:
     def get(self, dotted, *default):
         return self.kvs.get(dotted, *default)
 
+    def contains(self, name):
+        return name in self.kvs
+
     def close(self):
         self.interface.close()
 
@@ -344,6 +396,9 @@ class AsyncFront:
 
     def get(self, dotted, *default):
         return self.run(self.kvs.get(dotted, *default))
+
+    def contains(self, name):
+        return self.run(self.kvs.contains(name))
 
     def close(self):
         try:
@@ -480,6 +535,22 @@ def assert_no_orphans(raw, top_key):
         assert any(name in text for text in found), f"no placeholder for {name} among {found}"
 
 
+class Remembering(set):
+    """What is put in can be taken out by somebody else before a test looks.
+
+    Attributes:
+        ever: All that was put in since it was last taken from here.
+    """
+
+    def __init__(self):
+        super().__init__()
+        self.ever = set()
+
+    def add(self, item):
+        self.ever.add(item)
+        super().add(item)
+
+
 def subscribed(raw):
     """The ids of the connections that are subscribed to anything."""
     rows = raw.client_list()
@@ -517,6 +588,20 @@ async def aeventually(condition, timeout=PATIENCE):
     return value
 
 
+def line_of(descriptor, patience=60.0):
+    """The next line that a process says, "" at its end: what comes after stays in the pipe, for `communicate`.
+
+    A `readline` may take more than its line into a buffer that `communicate` does not look into.
+    """
+    line, deadline = b"", time.monotonic() + patience
+    while not line.endswith(b"\n"):
+        assert select.select([descriptor], [], [], max(deadline - time.monotonic(), 0))[0], f"silent, but for {line}"
+        if not (byte := os.read(descriptor, 1)):
+            break
+        line += byte
+    return line.decode()
+
+
 def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False):
     """Run code in another Python; returns the finished process, or with `start` the running one."""
     command = [sys.executable, *flags, "-c", code, *map(str, arguments)]
@@ -524,9 +609,9 @@ def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False):
     if start:
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
-    done.stderr = _SLOW_MACHINE.sub("", done.stderr)
+    done.stderr = SLOW_MACHINE.sub("", done.stderr)
     return done
 
 
-_SLOW_MACHINE = re.compile(r"^Executing <.* took \d+\.\d+ seconds\n", re.MULTILINE)
+SLOW_MACHINE = re.compile(r"^Executing <.* took \d+\.\d+ seconds\n", re.MULTILINE)
 """What asyncio's debug mode says of a machine that is busy with something else."""

@@ -17,9 +17,9 @@ from conftest import PATIENCE
 
 import reem
 import reem_async
-from reem_async._server_process import HOST, PortTaken, ServerProcess, ServerProgram
-from reem_async._server_programs import find_program
 from reem_async.errors import ServerMissing
+from reem_async.server.process import HOST, PortTaken, ServerProcess, ServerProgram
+from reem_async.server.programs import find_program
 
 
 class Configured(ServerProcess):
@@ -89,7 +89,10 @@ def own_server(*lines, json=True, directory=None, wait=True):
         process.stop()
 
 
-HELLO = b"%2\r\n$6\r\nserver\r\n$5\r\nredis\r\n$5\r\nproto\r\n:3\r\n"
+HELLO = (
+    b"%3\r\n$6\r\nserver\r\n$5\r\nredis\r\n$5\r\nproto\r\n:3\r\n"
+    b"$7\r\nmodules\r\n*1\r\n%1\r\n$4\r\nname\r\n$6\r\nReJSON\r\n"
+)
 
 
 @contextlib.contextmanager

@@ -9,8 +9,8 @@ import time
 
 import redis
 
-from reem_async._server_programs import find_program
 from reem_async.server import EmbeddedServer
+from reem_async.server.programs import find_program
 
 SERVICE = "mymaster"
 
@@ -23,8 +23,8 @@ class Watched:
         servers: The primary of the beginning and its replica.
     """
 
-    def __init__(self, directory, stack):
-        self.servers = [stack.enter_context(EmbeddedServer()) for _ in range(2)]
+    def __init__(self, directory, stack, *, json=True):
+        self.servers = [stack.enter_context(EmbeddedServer(json=json)) for _ in range(2)]
         self.raw = [
             stack.enter_context(redis.Redis(port=server.port, decode_responses=True)) for server in self.servers
         ]

@@ -254,6 +254,10 @@ def test_arrays_of_a_write_that_cannot_be_are_not_even_sent(interface, key, raw,
     for name, error in (("scalar", BadType), ("gone", MissingKey)):
         with pytest.raises(error):
             place[name].append(np.arange(900))
+    if not published:
+        for name in ("scalar", "gone", "l"):
+            with pytest.raises(PathRefused):
+                place[name].setdefault("x", {"y": np.arange(900)})
     after = commands_run(raw)
     assert {name: after.get(name) for name in ("set", "sadd")} == {name: before.get(name) for name in ("set", "sadd")}
 
@@ -434,6 +438,26 @@ LATER = {
     "whole": (lambda place: place.write("new"), lambda value: value == "new"),
     "add": (lambda place: place["count"].add(1), lambda value: value["count"] == 1),
 }
+
+
+async def test_what_a_cancelled_write_left_goes_with_the_next_one_to_the_key(akvs, kvs, key, raw):
+    """Cancelled before it has removed the arrays it replaced, which another program had put there."""
+    left = 0
+    for turns in range(40):
+        name = key(f"k{turns}")
+        await akvs[name].write({"a": 0, "b": 0})
+        kvs[name]["a"] = np.arange(3)
+        task = asyncio.ensure_future(akvs[name]["a"].write(1))
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        await akvs[name].read()
+        left += await akvs[name]["a"].type() is int and raw.exists(f"{{{name}}}:ships")
+        await akvs[name]["b"].write(1)
+        assert_no_orphans(raw, name)
+    assert left, "no write was cancelled between both"
 
 
 @pytest.mark.parametrize("later", LATER)

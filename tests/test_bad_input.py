@@ -272,11 +272,12 @@ def test_path_syntax_inside_an_element_is_just_a_name(front, key, stored, elemen
 
 
 def test_a_missing_key_or_path_is_a_key_error(front, key, stored):
-    """On read, delete, length, type and append; the text names the path."""
+    """On read, delete, length, type and append; the text names the path. A whole key that is missing reads as None."""
     calls = (front.read, front.delete, front.length, front.type, lambda path: front.append(path, 1))
-    for call in calls:
+    for call in calls[1:]:
         with pytest.raises(MissingKey, match=key("absent")):
             call([key("absent")])
+    for call in calls:
         with pytest.raises(KeyError, match="absent"):
             call([key(), "outer", "absent"])
 
@@ -286,7 +287,8 @@ def test_a_write_that_has_no_parent_is_refused_and_leaves_nothing(front, key, ra
     """A missing parent, a scalar or an array as parent, an index out of range; no arrays are left behind."""
     before = set(raw.scan_iter(match=f"*{key()}*"))
     for path, named in [
-        ([key("absent"), "a"], key("absent")),
+        ([key("absent"), "a", "b"], key("absent")),
+        ([key("absent"), 0], key("absent")),
         ([key(), "gone", "a"], "gone"),
         ([key(), "gone", "a", "b"], "gone"),
         ([key(), "n", "a"], "n"),

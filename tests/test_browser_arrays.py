@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reem_async.browser.figures import histogram, line, statistics, table
-from reem_async.browser.pictures import MAPS, colours_of, paint
-from reem_async.browser.slices import look_at, parse_slice, part
 from reem_async.errors import BadValue
+from reem_async.tools.browser.figures import histogram, line, statistics, table
+from reem_async.tools.browser.pictures import MAPS, colours_of, paint
+from reem_async.tools.browser.slices import look_at, parse_slice, part
 
 MAGENTA = (255, 0, 255)
 

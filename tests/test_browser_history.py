@@ -8,11 +8,11 @@ import random
 import numpy as np
 import pytest
 
-from reem_async.browser.history import History
-from reem_async.browser.source import numbers_in
-from reem_async.browser.timeline import PENDING, UNKNOWN
-from reem_async.browser.trees import same
 from reem_async.plan.trees import MISSING, get, removed, replaced
+from reem_async.tools.browser.history import History
+from reem_async.tools.browser.source import numbers_in
+from reem_async.tools.browser.timeline import PENDING, UNKNOWN
+from reem_async.tools.browser.trees import same
 
 
 @pytest.fixture
@@ -62,6 +62,18 @@ def test_an_array_that_was_not_kept_shows_the_one_before_and_how_late_it_is(hist
     assert kept.late == pytest.approx(3.0)
     assert history.kept(("cam", "image"), 5.5).late == 0.0
     assert history.last([("cam",)], 9.0) == {("cam",): 8.0}
+
+
+def test_an_update_inside_of_what_was_not_kept_does_not_make_it_known(history):
+    """The frame of 6.0 is not here: with one number of it, the one of 5.0 is still late."""
+    history.begin("cam", b"{}")
+    history.add(("cam",), {"image": np.zeros(4), "state": "raw"}, 40, 5.0)
+    history.add(("cam",), PENDING, 0, 6.0)
+    history.add(("cam", "state"), "done", 8, 6.5)
+    assert [history.kept(path, 7.0).late for path in (("cam",), ("cam", "image"))] == [1.0, 1.0]
+    assert history.kept(("cam", "state"), 7.0) == ("done", 0.0)
+    history.add(("cam",), {"image": np.ones(4), "state": "done"}, 40, 8.0, answer=True)
+    assert history.kept(("cam",), 9.0).late == 0.0
 
 
 def brute(base, changes, at):

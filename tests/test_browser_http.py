@@ -20,9 +20,9 @@ from conftest import assert_same, eventually, python
 from PIL import Image
 
 import reem
-from reem_async.browser import listen
-from reem_async.browser.downloads import file_of
 from reem_async.server import EmbeddedServer
+from reem_async.tools.browser import listen
+from reem_async.tools.browser.downloads import file_of
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +80,9 @@ def test_the_tree_has_types_sizes_and_values(ask, robot):
         "image": ("numpy", "uint8[40,60,3]", 7200, None),
         "depth": ("numpy", "float32[2,2]", 16, None),
         "raw": ("bytes", "bytes", 3, None),
-        "a.b": ("dict", "", None, 1),
+        '["a.b"]': ("dict", "", None, 1),
     }
-    assert ask.rows(rows["a.b"]["address"])["c d"]["text"] == "5"
+    assert ask.rows(rows['["a.b"]']["address"])["c d"]["text"] == "5"
     assert ask.rows(rows["nested"]["address"])["[1]"]["address"] == f"{robot}.nested[1]"
     eventually(lambda: robot in ask.rows())
 
@@ -125,7 +125,9 @@ def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
     with Image.open(io.BytesIO(answer.content)) as image:
         assert (np.asarray(image) == IMAGE).all()
     said = orjson.loads(ask.ask("image", path=f"{robot}.depth", map="viridis").headers["x-picture"])
-    assert said == {"low": 0.5, "high": 3.0, "bad": 1, "size": [2, 2], "late": 0.0}
+    statistics = {"low": "0.5", "high": "3", "mean": "1.8333333333333333", "bad": 1, "sampled": False}
+    about = {"late": 0.0, "age": None, "preview": False, "statistics": statistics}
+    assert said == {"low": 0.5, "high": 3.0, "bad": 1, "size": [2, 2], **about}
     page = ask.json("table", path=f"{robot}.image", slice=":,:,1", row=39, column=58)
     assert page["cells"] == [[str(value) for value in IMAGE[39, 58:, 1]]]
     assert ask.json("line", path=f"{robot}.image", slice="3,:,0")["lines"] == [IMAGE[3, :, 0].tolist()]
@@ -452,6 +454,7 @@ def memory_of(pid):
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) << 10
 
 
+@pytest.mark.alone
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the memory is read from /proc")
 def test_ten_thousand_keys_and_eight_megabytes():
     """The first page comes at once, and what is looked at is let go again."""

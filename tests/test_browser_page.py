@@ -1,85 +1,20 @@
 """The page, in headless Chromium: clicking, searching, dragging the slider, and what is seen then."""
 
+# ruff: noqa: F811 - fixtures are named as arguments
 from __future__ import annotations
 
 import re
-import shutil
 import time
 
 import numpy as np
 import pytest
 from browserkit import live, served
 from conftest import eventually
+from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
 
 from reem.server import EmbeddedServer
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-if CHROMIUM is None:
-    pytest.skip("Chromium is not installed: apt-get install chromium", allow_module_level=True)
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 expect = playwright.expect
-
-FLAGS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with playwright.sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def address(server_url):
-    with served(live(server_url), allow_write=True) as (address, _):
-        yield address
-
-
-class Visitor:
-    """Opens pages and remembers what their consoles said."""
-
-    def __init__(self, chromium, address):
-        self.chromium = chromium
-        self.address = address
-        self.contexts = []
-        self.said = []
-        self.asked = []
-
-    def open(self, path="/", address=None, **options):
-        context = self.chromium.new_context(viewport={"width": 1200, "height": 760}, **options)
-        context.set_default_timeout(10_000)
-        self.contexts.append(context)
-        page = context.new_page()
-        page.on("console", lambda message: self.said.append(f"{message.type}: {message.text}"))
-        page.on("pageerror", lambda error: self.said.append(f"error: {error}"))
-        page.on("request", lambda request: self.asked.append(request.url))
-        page.goto((address or self.address) + path)
-        return page
-
-
-@pytest.fixture
-def visit(chromium, address, key):  # the key, since pages must be closed before what they show is removed
-    """Opens pages; at the end nothing was said on the console, and nothing was asked of anybody else."""
-    visitor = Visitor(chromium, address)
-    yield visitor
-    for context in visitor.contexts:
-        context.close()
-    assert visitor.said == []
-    elsewhere = [url for url in visitor.asked if not url.startswith(("http://127.0.0.1:", "blob:http://127.0.0.1:"))]
-    assert elsewhere == []
-
-
-def row(page, address, where="#tree"):
-    return page.locator(f'{where} .row[data-address="{address}"]')
 
 
 def test_the_tree_opens_closes_and_remembers(visit, kvs, key):
@@ -148,7 +83,6 @@ def test_dragging_the_slider_shows_the_past(visit, pspace, key):
         page.wait_for_timeout(50)
     pspace[name]["mode"] = "run"
     expect(page.locator("pre.text")).to_have_text("run")
-    row(page, name).locator(".twist").click()
     at = when(page, name)
     box = page.locator("#slider").bounding_box()
     span = page.evaluate("Number(document.getElementById('slider').max)")
@@ -291,7 +225,7 @@ def test_writing_asks_first_and_tells_subscribers(visit, pspace, kvs, key):
     assert kvs[name]["kp"].read() == 3.5
     area.fill("three")
     page.get_by_text("Write…").click()
-    expect(page.locator("#toast")).to_contain_text("Not JSON")
+    expect(page.locator(".wrong")).to_contain_text("Not JSON")
     expect(page.locator("#confirm")).to_be_hidden()
 
 
@@ -453,7 +387,7 @@ def test_lost_connections_are_seen_and_mended(chromium, tmp_path):
             expect(page.locator("#tree")).to_contain_text("reem set demo 1")
             expect(page.locator("#banner")).to_be_hidden()
             server.stop()
-            expect(page.locator("#banner")).to_contain_text("no server answers")
+            expect(page.locator("#banner")).to_contain_text("has not answered since")
             with EmbeddedServer(port, tmp_path / "data"):
                 expect(page.locator("#banner")).to_be_hidden()
         expect(page.locator("#banner")).to_contain_text("reem browse")

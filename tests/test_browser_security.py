@@ -13,7 +13,7 @@ import pytest
 from browserkit import client_of, live, served
 from conftest import eventually
 
-from reem_async.browser.guard import LOOPBACK
+from reem_async.tools.browser.guard import LOOPBACK
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +95,25 @@ def test_requests_of_other_sites_are_refused(ask):
     headers = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}
     assert ask.http.get("/api/tree", headers=headers).status_code == 403
     assert ask.http.get("/", headers={**headers, "sec-fetch-mode": "navigate"}).status_code == 200
+
+
+def test_a_link_on_another_site_leads_to_the_first_page_only(ask, kvs, key):
+    kvs[key()] = {"a": 1}
+    headers = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
+    for path in ("/api/tree", "/api/node?path={}", "/view/{}?format=json", "/view/{}", "/api/array?path={}"):
+        assert ask.http.get(path.format(key()), headers=headers).status_code == 403
+
+
+@pytest.mark.parametrize("element", ['[" x"]', '["a\\\\b"]', "[9223372036854775808]"])
+def test_what_the_servers_paths_cannot_address_is_a_bad_request(ask, kvs, key, element):
+    kvs[key()] = {"x": 1, " x": 2}
+    for path in (f'["{key()}"]{element}', f"{key()}{element}"):
+        answers = [
+            ask.ask("array", path=path),
+            ask.http.get("/view/" + urllib.parse.quote(path, safe="") + "?format=json"),
+        ]
+        assert [answer.status_code for answer in answers] == [400, 400]
+        assert all("position" not in answer.text for answer in answers)
 
 
 def test_keys_and_values_with_scripts_do_not_become_html(ask, kvs, key):

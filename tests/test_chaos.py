@@ -15,6 +15,7 @@ from chaos.scoreboard import ROWS, run
 SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**9))
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("number", sorted(ROWS), ids=lambda number: f"row {number}")
 def test_a_row_of_the_scoreboard(number):
     """Every figure is within its bound, and the load was real."""

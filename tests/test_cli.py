@@ -22,7 +22,9 @@ from conftest import assert_same, nothing_sent
 from typer.testing import CliRunner
 
 import reem as blocking
-from reem_async.cli import COMMANDS, build, lazy
+from reem_async.server import EmbeddedServer
+from reem_async.tools.cli import build, lazy
+from reem_async.tools.cli.commands import COMMANDS
 
 REEM = str(pathlib.Path(sys.executable).parent / "reem")
 TERMINAL = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
@@ -142,7 +144,7 @@ def test_help_has_every_command_under_its_heading_with_examples():
     for entry in COMMANDS:
         assert entry.panel in run.stdout
         assert f" {entry.name} " in run.stdout
-        thing = getattr(importlib.import_module(f"reem_async.cli.{entry.module}"), entry.attribute)
+        thing = getattr(importlib.import_module(f"reem_async.tools.cli.{entry.module}"), entry.attribute)
         if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
             said = lazy.help_text(thing.__doc__)
             assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])
@@ -154,11 +156,13 @@ def test_help_has_every_command_under_its_heading_with_examples():
 
 def test_help_needs_none_of_the_commands():
     """A heavy import in one of them slows down only that one."""
-    code = "import sys; sys.argv = ['reem', '--help']\nfrom reem_async.cli import main\n"
-    code += "try: main()\nexcept SystemExit: print([name for name in sys.modules if name.startswith('reem_async.cli')])"
+    code = "import sys; sys.argv = ['reem', '--help']\nfrom reem_async.tools.cli import main\n"
+    code += "try: main()\nexcept SystemExit: "
+    code += "print([name for name in sys.modules if name.startswith('reem_async.tools.cli')])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
     loaded = run.stdout.splitlines()[-1]
-    assert loaded == "['reem_async.cli', 'reem_async.cli.lazy', 'reem_async.cli.version']"
+    light = ["", ".commands", ".lazy", ".version"]
+    assert loaded == str([f"reem_async.tools.cli{name}" for name in light])
 
 
 @pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
@@ -198,6 +202,20 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
     assert "hidden" not in said
 
 
+def test_the_password_may_be_in_a_variable_of_its_own():
+    """For every command; one in the URL goes before it."""
+    with EmbeddedServer(password="known-4711") as server:
+        cli = CommandLine(f"redis://127.0.0.1:{server.port}", "")
+        assert "needs a password" in cli.error(1, "ls")
+        for wrong in ("wrong-0815", "wrong 0815"):
+            assert "does not take this user name and password" in cli.error(1, "ls", REEM_PASSWORD=wrong)
+        cli.result("set", "speed", "0.5", REEM_PASSWORD="known-4711")
+        assert cli.result("get", "speed", REEM_PASSWORD="known-4711") == "0.5\n"
+        assert cli.process("doctor", REEM_PASSWORD="known-4711").returncode == 0
+        cli.url = f"redis://:known-4711@127.0.0.1:{server.port}"
+        assert cli.result("get", "speed", REEM_PASSWORD="wrong-0815") == "0.5\n"
+
+
 def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
     """No server answers under this name; only the words matter."""
     cli.url = "redis://robot.invalid:6379"
@@ -208,7 +226,7 @@ def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
     assert cli.process("ls", PYTHONWARNINGS=silent.partition("=")[2]).stderr.splitlines() == [error]
 
 
-def test_completion_of_top_level_keys(cli, kvs):
+def test_completion_of_paths(cli, kvs):
     def completed(*words, **changes):
         typed = ["reem", "get", "--namespace", cli.namespace, *words]
         changes = {"_REEM_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(typed), "COMP_CWORD": "4", **changes}
@@ -219,6 +237,10 @@ def test_completion_of_top_level_keys(cli, kvs):
         return run.stdout.split()
 
     assert completed("cam") == ["cam_left", "cam_right"]
+    assert completed("foo.na") == ["foo.names"]
+    assert completed("foo.de") == ["foo.deep", "foo.deep."]  # a dict: no blank behind it, its keys may follow
+    assert completed("fo") == ["foo", "foo."]
+    assert completed("foo.nix.") == []
     assert completed("cam", REEM_URL="redis://127.0.0.1:1") == []
 
 
@@ -301,7 +323,7 @@ def test_get_for_people(cli, kvs):
     assert (shown, code) == ("\\u001b[31mred\\u009b32m\r\nline\r\n", 0)
 
 
-def test_get_for_programs(cli, kvs):
+def test_get_for_programs(cli, kvs, tmp_path):
     assert json.loads(cli.result("get", "foo", "--json")) == {
         "number": 1,
         "image": np.arange(24).reshape(2, 4, 3).tolist(),
@@ -313,7 +335,10 @@ def test_get_for_programs(cli, kvs):
     said = cli.error(1, "get", "large", "--json")
     assert "300.0 kB of arrays" in said
     assert "-o FILE.npz" in said
-    assert "nothing is stored at nix" in cli.error(3, "get", "nix")
+    for options in ((), ("--json",), ("--raw",), ("-o", tmp_path / "nix.json")):
+        for path in ("nix", "nix.x", "foo.nix"):
+            assert f"nothing is stored at {path}" in cli.error(3, "get", path, *options)
+    assert not (tmp_path / "nix.json").exists()
 
 
 def test_get_into_files(cli, kvs, tmp_path):
@@ -337,7 +362,8 @@ def test_get_into_files(cli, kvs, tmp_path):
 
 def test_files_that_cannot_be_written_leave_nothing_behind(cli, kvs, tmp_path):
     (tmp_path / "old.npy").write_text("old")
-    assert "give its path, or use .npz" in cli.error(1, "get", "foo", "-o", tmp_path / "old.npy")
+    assert "give its path, or use .npz" in cli.error(1, "get", "foo", "-o", tmp_path / "old.npy", "--force")
+    assert "replace it with --force" in cli.error(2, "get", "foo", "-o", tmp_path / "old.npy")
     assert "png takes uint8" in cli.error(1, "get", "cam_left", "-o", tmp_path / "x.png")
     assert "No such file or directory" in cli.error(1, "get", "foo", "-o", tmp_path / "no" / "x.json")
     assert ".npy, .npz, .json" in cli.error(2, "get", "foo", "-o", tmp_path / "x.doc")
@@ -371,7 +397,7 @@ def test_what_cannot_be_set_is_refused_before_anything_is_sent(cli, kvs, raw, tm
         assert "NaN" in cli.error(2, "set", "foo.new", "[NaN]")
         assert "no option --pubslish" in cli.error(2, "set", "foo.new", "--pubslish")
         assert ".json or .npy" in cli.error(2, "set", "foo.new", "@picture.png")
-        assert "No such file" in cli.error(1, "set", "foo.new", f"@{tmp_path / 'none.npy'}")
+        assert "No such file" in cli.error(3, "set", "foo.new", f"@{tmp_path / 'none.npy'}")
         assert "not an .npy file" in cli.error(1, "set", "foo.new", f"@{tmp_path / 'x.npy'}")
     assert "there is no foo.nix to write into" in cli.error(1, "set", "foo.nix.x", "1")
     assert "18446744073709551616" in cli.error(2, "set", "foo.new", "18446744073709551616")
@@ -400,11 +426,13 @@ def test_subscribers_are_told_if_wanted(cli, kvs):
         updates = blocking.KeyValueStore(interface)["foo"]["number"].watch(blocking.Every(100))
         assert next(updates).initial
         cli.result("set", "foo.number", "2")
+        update = next(updates)
+        assert (update.data, update.origin) == (2, "stored")
         cli.result("set", "foo.number", "3", "--publish")
         assert next(updates).data == 3
         run = cli("pub", "foo.number", "4", "--count", "3", "--rate", "200")
         assert (run.exit_code, run.stdout) == (0, "")
-        assert run.stderr.startswith("published 3 times")
+        assert run.stderr.startswith("publishing foo.number at 200 Hz\npublished 3 times")
         assert [next(updates).data for _ in range(3)] == [4, 4, 4]
         assert cli("pub", "foo.number", "5").stderr == ""
         assert next(updates).data == 5
@@ -421,7 +449,7 @@ def test_publishing_until_ctrl_c(cli, kvs):
             process.send_signal(signal.SIGINT)
             said, errors = process.communicate(timeout=10)
     assert (process.returncode, said) == (0, "")
-    assert errors.startswith("published ")
+    assert errors.startswith("publishing foo.number at 100 Hz until Ctrl-C\npublished ")
 
 
 # --- the terminal and the pipe -------------------------------------------------

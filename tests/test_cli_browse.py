@@ -14,7 +14,7 @@ import httpx
 import pytest
 from conftest import PATIENCE, ROOT
 
-REEM = [sys.executable, "-W", "error", "-c", "from reem_async.cli import main; main()", "browse"]
+REEM = [sys.executable, "-W", "error", "-c", "from reem_async.tools.cli import main; main()", "browse"]
 
 
 def environment(**changes):
@@ -129,7 +129,7 @@ def test_a_file_that_is_no_recording_is_refused(tmp_path):
     path.write_bytes(b"no recording at all")
     for name in (path, tmp_path / "missing.mcap"):
         done = browse("--log", str(name), "--no-open", "--port", "0")
-        assert done.returncode in (1, 2), done.stderr
+        assert done.returncode == (1 if name == path else 3), done.stderr
         assert "Traceback" not in done.stderr
 
 

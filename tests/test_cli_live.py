@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import select
 import signal
 import threading
 import time
@@ -15,13 +16,13 @@ from conftest import RawCluster, eventually, subscribed, subscriptions
 from test_cli import CommandLine
 
 import reem as blocking
-from reem_async.cli import following
-from reem_async.cli.following import Ending, follow
-from reem_async.cli.windows import BANDWIDTH, DELAY, RATE, Window, spread
 from reem_async.connection import RedisInterface
-from reem_async.monitor import Event
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import announce, published
+from reem_async.pubsub.monitor import Event
+from reem_async.tools.cli import following
+from reem_async.tools.cli.following import Ending, follow
+from reem_async.tools.cli.windows import BANDWIDTH, DELAY, RATE, Window, spread
 
 
 @pytest.fixture
@@ -153,10 +154,62 @@ def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
     assert "0 lost, 1 gaps of unknown length" in errors
 
 
+def test_echo_shows_what_is_only_stored_and_marks_it(cli, space, listening):
+    """Arrays as what they are, without fetching them, and of a path that was asked for nothing else."""
+    store = blocking.KeyValueStore(space.interface)
+    store["imu"] = {"temp": 20, "acc": [1, 2]}
+    with listening("echo", "imu.temp", "cam") as process:
+
+        def line():
+            return process.stdout.readline().rstrip("\n").split("  ")[1:]
+
+        def heard(change):
+            """What is printed of a change: the command may follow the store a moment later than it subscribes."""
+            for number in range(100):
+                change(number)
+                if select.select([process.stdout], [], [], 0.2)[0]:
+                    return line()
+            raise AssertionError("nothing was printed")
+
+        path, _, mark = heard(lambda number: store["imu"].update({"temp": 100 + number}))
+        assert (path, mark) == ("imu.temp", "(stored)")
+        space["imu"] = {"temp": 7, "acc": [3, 4]}
+        assert line() == ["imu.temp", "7"]
+        store["cam"] = {"image": np.zeros((480, 640, 3), np.uint8), "n": 1}
+        assert line() == ["cam", '{"image":"<uint8[480,640,3], 921.6 kB>","n":1}', "(stored)"]
+        del store["cam"]
+        assert line() == ["cam", "deleted", "(stored)"]
+        ended(process)
+
+
+def test_stored_changes_are_counted_and_told_in_json(cli, space, listening):
+    """As what they are."""
+    store = blocking.KeyValueStore(space.interface)
+    store["foo"] = {"n": 0}
+    with cli.running("echo", "foo", "--json", "--count", "1") as process:
+        for number in range(200):
+            store["foo"]["n"] = number
+            if process.poll() is not None:
+                break
+            time.sleep(0.05)
+        said, _ = process.communicate(timeout=10)
+    entry = json.loads(said)
+    assert (entry["path"], entry["stored"], entry["publisher"]) == ("foo.n", True, "")
+    with cli.running("hz", "foo", "--json", "--count", "3") as process:
+        for number in range(200):
+            store["foo"]["n"] = -number
+            if process.poll() is not None:
+                break
+            time.sleep(0.05)
+        said, _ = process.communicate(timeout=10)
+    (entry,) = map(json.loads, said.splitlines())
+    assert (entry["path"], entry["updates"]) == ("foo.n (stored)", 3)
+
+
 def test_waiting_in_vain(cli):
     run = cli("echo", "foo", "--timeout", "0.2")
     assert (run.exit_code, run.stdout) == (4, "")
-    assert "only what a PublishSpace writes is heard" in run.stderr
+    assert "0 updates of 0 paths" in run.stderr
 
 
 async def test_how_waiting_ends(cli, space):

@@ -22,28 +22,28 @@ from test_cli import REEM, CommandLine
 
 import reem as blocking
 import reem.snapshots
-from reem_async.cli.echo import _moment
-from reem_async.cli.output import json_text, typed
-from reem_async.cli.running import Refused
-from reem_async.cli.up import fail, print_rows
-from reem_async.cli.values import parse_value, save
 from reem_async.errors import BadData, ReemError
 from reem_async.plan.paths import parse
-from reem_async.snapshots import described
-from reem_async.snapshots.archive import Archive, ArchiveWriter, header
-from reem_async.snapshots.files import NewFile, prune
-from reem_async.snapshots.rdb import describe_rdb
-from reem_async.snapshots.values import Entry, Value
+from reem_async.tools.cli.echo import _moment
+from reem_async.tools.cli.output import json_text, typed
+from reem_async.tools.cli.running import Refused
+from reem_async.tools.cli.up import fail, print_rows
+from reem_async.tools.cli.values import parse_value, save
+from reem_async.tools.snapshots import described
+from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
+from reem_async.tools.snapshots.files import NewFile, prune
+from reem_async.tools.snapshots.rdb import describe_rdb
+from reem_async.tools.snapshots.values import Entry, Value
 
 
 @pytest.fixture
 def reem(server_url, key):
-    return CommandLine(server_url, key())
+    return CommandLine(server_url, key("foo:"))
 
 
 @pytest.fixture
 def kvs(server_url, key):
-    with blocking.RedisInterface(server_url, namespace=key()) as interface:
+    with blocking.RedisInterface(server_url, namespace=key("foo:")) as interface:
         yield blocking.KeyValueStore(interface)
 
 
@@ -154,7 +154,7 @@ def test_a_snapshot_that_says_what_cannot_be_is_damaged(tmp_path, odd):
 
 
 def test_an_index_that_unpacks_to_gigabytes_is_not_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("reem_async.snapshots.archive._LARGEST_INDEX", 1 << 20)
+    monkeypatch.setattr("reem_async.tools.snapshots.archive._LARGEST_INDEX", 1 << 20)
     with pytest.raises(BadData, match="larger than any index"):
         described(made(tmp_path / "a.zip", index=b" " * (1 << 21) + b'{"keys":[],"foreign":0,"foreign_names":[]}'))
 
@@ -174,13 +174,19 @@ def test_an_rdb_file_of_an_odd_time(tmp_path, moment):
     assert describe_rdb(file).time == pytest.approx(time.time(), abs=10)
 
 
-def test_what_a_killed_run_has_left_of_this_name_is_removed(tmp_path):
-    old, other = tmp_path / ".b.zip.0123abcd.part", tmp_path / ".c.zip.0123abcd.part"
-    for part in (old, other):
+def test_what_killed_runs_have_left_is_removed(tmp_path):
+    """Of any name, since nobody may save under that one again; what a program still writes to stays, however old."""
+    left, foreign = tmp_path / ".b.zip.0123abcd.reem.part", tmp_path / ".c.zip.0123abcd.part"
+    for part in (left, foreign):
         part.write_bytes(b"x")
-        os.utime(part, (1, 1))
-    NewFile(tmp_path / "b.zip").discard()
-    assert list(tmp_path.iterdir()) == [other]
+    at_work = NewFile(tmp_path / "d.zip")
+    os.utime(at_work._part.path, (1, 1))
+    NewFile(tmp_path / "e.zip").discard()
+    assert sorted(tmp_path.iterdir()) == sorted([foreign, at_work._part.path])
+    at_work.file.write(b"whole")
+    at_work.commit()
+    assert (tmp_path / "d.zip").read_bytes() == b"whole"
+    assert sorted(tmp_path.iterdir()) == sorted([foreign, tmp_path / "d.zip"])
 
 
 def test_what_files_say_does_not_command_the_terminal(capsys):
@@ -200,7 +206,11 @@ def test_json_of_what_orjson_refuses():
     assert json.loads(json_text(value)) == value
     odd = {"half": "a\ud800b", "array": np.array(["\udfff"]), "nan": [np.nan, 1.5], "b": b"x", "pair": np.float64(2)}
     wanted = {"half": "a\ud800b", "array": ["\udfff"], "nan": [None, 1.5], "b": "eA==", "pair": 2.0}
-    assert json.loads(json_text(odd)) == json.loads(json_text(odd, pretty=True)) == wanted
+    for text in (json_text(odd), json_text(odd, pretty=True)):
+        found = json.loads(text)
+        assert np.isnan(found["nan"][0])
+        found["nan"][0] = None
+        assert found == wanted
 
 
 def test_a_terminal_that_does_not_know_all_characters(reem, kvs):

@@ -14,14 +14,14 @@ import time
 
 import numpy as np
 import pytest
-from conftest import ROOT, assert_same, eventually
+from conftest import ROOT, assert_same, eventually, line_of
 from test_recording import IMAGE
 
-from reem_async.recording import open_log
+from reem_async.tools.recording import open_log
 
 APP = """
 import typer
-from reem_async.cli import log, play, record
+from reem_async.tools.cli import log, play, record
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(record.record)
 app.command()(play.play)
@@ -59,8 +59,15 @@ def started(url, cwd, *arguments, **options):
             process.kill()
 
 
+def begins(process, *, as_json=False):
+    """Wait until `reem record` says that it has begun: before that, a signal leaves no recording."""
+    line = line_of((process.stdout if as_json else process.stderr).fileno())
+    assert line.startswith('{"seconds":' if as_json else "recording into "), line + process.communicate()[1]
+    return line
+
+
 def is_recording(file):
-    """Whether the first messages are in the file."""
+    """Whether the first messages are in the file; that does not mean that the command has begun."""
     with contextlib.suppress(OSError, ValueError), open_log(file) as log:
         return bool(log.names())
 
@@ -71,14 +78,15 @@ def recorded(key, server_url, pspace, tmp_path):
     pspace[key("a")] = {"n": 0, "image": IMAGE}
     file = tmp_path / "run.mcap"
     with started(server_url, tmp_path, "record", key("*"), "-o", file, "--json") as process:
-        eventually(lambda: is_recording(file))
+        said = [begins(process, as_json=True)]
+        eventually(lambda: is_recording(file))  # so that the updates are in a chunk of their own
         for number in range(1, 11):
             pspace[key("a")]["n"] = number
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
         out, errors = process.communicate(timeout=10)
     assert (process.returncode, errors) == (0, "")
-    return file, [json.loads(line) for line in out.splitlines()]
+    return file, [json.loads(line) for line in [*said, *out.splitlines()]]
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="only Linux has a scheduling class for what can wait")
@@ -89,7 +97,7 @@ def test_in_the_background_it_takes_only_what_nobody_else_wants(background, key,
     file = tmp_path / "run.mcap"
     option = ["--background"] if background else []
     with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
-        eventually(lambda: is_recording(file))
+        begins(process)
         threads = [int(name) for name in os.listdir(f"/proc/{process.pid}/task")]
         policies = [os.sched_getscheduler(thread) for thread in threads]
         process.send_signal(signal.SIGINT)
@@ -144,7 +152,7 @@ def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
     assert (play.returncode, "left out (see reem log info --verify)" in play.stdout) == (1, True)
     assert json.loads(reem("play", file, "--rate", "100", "--json").stdout.splitlines()[-1])["unreadable"] > 0
     export = reem("log", "export", file, "--to", "csv", "--json")
-    assert (export.returncode, "damaged" in export.stderr) == (1, True)
+    assert (export.returncode, "damaged" in export.stderr) == (1, True), export.stderr
     assert json.loads(export.stdout)["unreadable"] > 0
     assert (tmp_path / "run.csv").exists()
 
@@ -166,12 +174,27 @@ def test_step(key, recorded, server_url, kvs, tmp_path):
         assert "published" in rest
 
 
+@pytest.mark.parametrize("option", [[], ["--json"]], ids=["text", "json"])
+def test_once_it_says_that_it_has_begun_nothing_is_missed_and_ctrl_c_ends_it(option, key, server_url, pspace, tmp_path):
+    """At once, before anything is published: a script waits for that line."""
+    file = tmp_path / "run.mcap"
+    with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
+        line = begins(process, as_json=bool(option))
+        pspace[key("a")] = 1
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors) == (0, "")
+    assert json.loads(line)["messages"] == 0 if option else line == f"recording into {file} until Ctrl-C\n"
+    with open_log(file) as log:
+        assert log[key("a")].at(log.end) == 1
+
+
 def test_samples_for_some_time(key, kvs, reem, tmp_path):
     kvs[key("a")] = {"joint": 1.5}
     (tmp_path / "keys.csv").write_text(f"{key('a')}.joint, 0.02\n")
     (tmp_path / "run.mcap").write_bytes(b"old")
     run = reem("record", "--sample", "keys.csv", "--duration", "0.3", "--force")
-    assert (run.returncode, run.stderr) == (0, "")
+    assert (run.returncode, run.stderr) == (0, "recording into run.mcap for 0.3 s\n")
     assert run.stdout.startswith("run.mcap: ")
     with open_log(tmp_path / "run.mcap") as log:
         assert set(log[key("a.joint")].history()[1].tolist()) == {1.5}
@@ -181,11 +204,11 @@ def test_what_cannot_be(key, reem, tmp_path):
     (tmp_path / "there.mcap").write_bytes(b"precious")
     for arguments, code, text in (
         (("record", key("a"), "-o", "there.mcap"), 2, "--force"),
-        (("record", "--sample", "none.csv", "-o", "x.mcap"), 2, "none.csv"),
+        (("record", "--sample", "none.csv", "-o", "x.mcap"), 3, "none.csv"),
         (("play", "there.mcap"), 1, "not an MCAP file"),
     ):
         run = reem(*arguments)
-        assert (run.returncode, run.stdout if code == 2 else "") == (code, ""), run
+        assert (run.returncode, run.stdout if code > 1 else "") == (code, ""), run
         assert text in run.stderr
         assert "Traceback" not in run.stderr
     assert (tmp_path / "there.mcap").read_bytes() == b"precious"

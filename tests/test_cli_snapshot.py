@@ -16,17 +16,17 @@ import numpy as np
 import pytest
 import redis
 import typer
-from conftest import ROOT, assert_same, eventually
+from conftest import ROOT, assert_same, eventually, line_of
 from typer.testing import CliRunner
 
 import reem
-from reem_async.cli.snapshot import app, period
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
+from reem_async.tools.cli.snapshot import app, period
 
 MAIN = """
-from reem_async.cli import Entry
-from reem_async.cli.lazy import command_of
+from reem_async.tools.cli.commands import Entry
+from reem_async.tools.cli.lazy import command_of
 command_of(Entry("snapshot", "snapshot", "app", "", ""))(prog_name="reem snapshot")
 """
 REEM = [sys.executable, "-W", "error", "-c", MAIN]  # not -X dev: asyncio would tell of each slow step
@@ -76,7 +76,7 @@ def names(directory):
 def test_in_a_process_of_its_own(kvs, env, tmp_path):
     """As the shell sees it: both outputs apart, no colours, an exit code."""
     kvs["foo"] = 1
-    for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 1), (["list"], 0)):
+    for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 2), (["list"], 0)):
         run = subprocess.run(
             [*REEM, *words],
             cwd=tmp_path,
@@ -246,7 +246,7 @@ def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     (mine,) = names(tmp_path)
     (tmp_path / "reem-auto-20000101T000000Z.zip").write_text("not a snapshot")
     with periodic("-d", tmp_path, "--every", "1s", "--keep", "2", "--json", **env) as process:
-        lines = [json.loads(process.stdout.readline()) for _ in range(3)]
+        lines = [json.loads(line_of(process.stdout.fileno())) for _ in range(3)]
         process.send_signal(number)
         rest, errors = process.communicate(timeout=20)
     assert process.returncode == 0, errors

@@ -23,7 +23,7 @@ import reem.snapshots
 from reem_async.server import EmbeddedServer
 
 ROOT = pathlib.Path(__file__).parents[1]
-REEM = [sys.executable, "-X", "dev", "-W", "error", "-c", "from reem_async.cli import main; main()"]
+REEM = [sys.executable, "-X", "dev", "-W", "error", "-c", "from reem_async.tools.cli import main; main()"]
 
 
 def environment(**changes: str) -> dict[str, str]:
@@ -86,7 +86,7 @@ def test_up_until_told_to_stop(number):
 
 STORM = """
 import os, signal, threading
-from reem_async.cli.up import Stop
+from reem_async.tools.cli.up import Stop
 
 stop = Stop()
 ended = threading.Event()
@@ -275,7 +275,7 @@ def test_from_what_is_no_snapshot(snapshots):
         ("cut.zip", 1, "damaged"),
         ("cut.rdb", 1, "did not start"),
         ("text.zip", 1, "neither a snapshot"),
-        ("none.zip", 2, "none.zip"),
+        ("none.zip", 3, "none.zip"),
     ):
         run = reem_command("up", "--from", str(snapshots / name), COLUMNS="200")
         assert run.returncode == code
@@ -294,7 +294,7 @@ def test_version_and_help():
 
 @pytest.mark.parametrize("missing", ["typer", "rich"])
 def test_without_the_extra(missing):
-    code = f"import sys; sys.modules['{missing}'] = None; from reem_async.cli import main; main()"
+    code = f"import sys; sys.modules['{missing}'] = None; from reem_async.tools.cli import main; main()"
     run = subprocess.run(
         [sys.executable, "-c", code],
         env=environment(),

@@ -13,10 +13,10 @@ from conftest import FRONTS, Keys, aeventually, eventually, python
 
 import reem
 import reem_async
-from reem_async.catalog import names
-from reem_async.cluster_server import EmbeddedCluster
 from reem_async.errors import BadValue, NotConnected, ServerFailed, WrongKind
-from reem_async.monitor import Monitor
+from reem_async.pubsub.monitor import Monitor
+from reem_async.server.cluster import EmbeddedCluster
+from reem_async.store.catalog import names
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_a_cluster_ends_with_its_owner_however_it_ends():
     """Killed -9, all nodes go."""
     code = """
 import os, signal
-from reem_async.cluster_server import EmbeddedCluster
+from reem_async.server.cluster import EmbeddedCluster
 cluster = EmbeddedCluster(replicas=0)
 cluster.start()
 print(*[node.pid for node in cluster.nodes], flush=True)
@@ -350,6 +350,24 @@ async def test_who_begins_to_follow_a_moving_slot_is_told_or_served(cluster, key
         mirror = reem_async.SilentSubscriber(name, interface)
         await mirror.listen()
         assert mirror.value() == {"n": 1}
+
+
+@pytest.mark.parametrize("gone", ["{}", "{{{}}}:ships"], ids=["document", "registry"])
+async def test_who_follows_a_key_in_parts_is_not_advised_to_do_what_it_does(cluster, key, gone):
+    """It is connected with the URL of the cluster already."""
+    name = key()
+    async with reem_async.RedisInterface(cluster) as interface:
+        await reem_async.KeyValueStore(interface)[name].write({"n": 1, "a": np.arange(3)})
+        move = Move(cluster, name).begin()
+        move.take(gone.format(name))
+        with reem_async.timeout(0.2), pytest.raises(NotConnected, match="nothing is followed") as caught:
+            await reem_async.SilentSubscriber(name, interface).listen()
+        assert "redis+cluster://" not in str(caught.value)
+        assert "not hold this key now" in str(caught.value) or "parts of the key are on either" in str(caught.value)
+        move.finish()
+        mirror = reem_async.SilentSubscriber(name, interface)
+        await mirror.listen()
+        assert mirror.value()["n"] == 1
 
 
 async def test_leaving_and_coming_back_to_channels_of_one_node_keeps_the_connection_in_order(cluster, key):

@@ -7,12 +7,12 @@ import os
 import time
 
 import pytest
-from clusterkit import Move, kill_primary, whole_again
+from clusterkit import Move, kill_primary, owner, raw_of, whole_again
 from conftest import aeventually
 from loadkit import Load
 
 import reem_async
-from reem_async.cluster_server import EmbeddedCluster
+from reem_async.server.cluster import EmbeddedCluster
 
 SECONDS = float(os.environ.get("REEM_FAULT_SECONDS", "2"))
 """How long slots go back and forth; the full check is 60."""
@@ -62,3 +62,19 @@ async def test_a_killed_primary_is_replaced_and_all_go_on(cluster):
         await aeventually(lambda: interface.state == "connected")
     assert [change.state for change in changes][:3] == ["lost", "reconnecting", "connected"]
     assert load.gaps >= 1
+
+
+async def test_an_idle_connection_to_a_node_that_is_cut_is_made_anew(cluster):
+    """Nobody need call for what that node has: nothing is missed."""
+    async with reem_async.RedisInterface(cluster) as interface:
+        store, heard = reem_async.KeyValueStore(interface), []
+        for number in range(20):
+            await store[f"idle{number}"].write(number)
+        nodes = await interface.session.transport.nodes()
+        wires = [node._lanes[False] for node in nodes]
+        interface.on_state(heard.append)
+        with raw_of(owner(cluster, "idle0")) as raw:
+            raw.client_kill_filter(_type="normal", skipme=True)
+        await aeventually(lambda: any(node._lanes[False] not in wires for node in nodes))
+        await aeventually(lambda: interface.state == "connected")
+        assert {change.state for change in heard} <= {"lost", "connected"}

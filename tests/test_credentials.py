@@ -16,7 +16,7 @@ from redis.credentials import CredentialProvider
 
 import reem
 import reem_async
-from reem_async._server_process import HOST
+from reem_async.server.process import HOST
 from reem_async.transport import options as options_module
 
 both = pytest.mark.parametrize("name", list(FRONTS))

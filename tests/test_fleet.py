@@ -16,7 +16,7 @@ from conftest import ROOT, aeventually
 import reem
 import reem_async
 from reem_async.errors import BadType
-from reem_async.monitor import Monitor
+from reem_async.pubsub.monitor import Monitor
 
 
 @pytest.fixture(params=["server", "cluster"])

@@ -14,13 +14,14 @@ from conftest import Keys, aeventually
 from hypothesis import given, settings
 
 import reem_async
-from reem_async import handover
 from reem_async.errors import InterfaceClosed
-from reem_async.handover import Handover
-from reem_async.monitor import Monitor
 from reem_async.plan.notices import Notice
 from reem_async.plan.patterns import parse_pattern
-from reem_async.recording.line import Line
+from reem_async.pubsub import reorder as handover
+from reem_async.pubsub.manager import manager_of
+from reem_async.pubsub.monitor import Monitor
+from reem_async.pubsub.reorder import ReorderBuffer
+from reem_async.tools.recording.subscription import Subscription
 
 CHANNEL = b"{key}:notices"
 
@@ -51,7 +52,8 @@ class Ear:
         assert channel == CHANNEL
         self.told.append((it.publisher, it.sequence))
 
-    def doubt(self):
+    def doubt(self, channel):
+        assert channel == CHANNEL
         self.told.append("doubt")
 
     def numbers(self, publisher="p"):
@@ -59,7 +61,7 @@ class Ear:
 
 
 def handed(ear, *, late=True):
-    made = Handover(weakref.ref(ear), CHANNEL)
+    made = ReorderBuffer(weakref.ref(ear), CHANNEL)
     made.late = late
     return made
 
@@ -230,8 +232,8 @@ async def test_hundreds_of_keys_that_begin_at_once_are_all_followed_and_nothing_
         for number in range(1, 4):
             await asyncio.gather(*[space[name].write(number) for name in names])
         await aeventually(lambda: len(events) >= 3 * len(names))
-        discovery = other.session.hub._discovery
-        branches = [branch for each in discovery._branches.values() for branch in each.values()]
+        key_watcher = manager_of(other.session)._key_watcher
+        branches = [branch for each in key_watcher._branches.values() for branch in each.values()]
         await aeventually(lambda: len(branches) == len(names) and all(branch.begun for branch in branches))
     assert not [event for event in events if event.gap or event.missed]
     assert sorted((event.name, event.value) for event in events) == sorted(
@@ -249,8 +251,8 @@ async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pai
         for number in range(1, 101):
             for name in names:
                 await space[name].write(number)
-        await other.session.hub.fence()
-        waiting = [monitor.mailbox.take() for _ in range(len(monitor.mailbox._items))]
+        await manager_of(other.session).fence()
+        waiting = [monitor.queue.take() for _ in range(len(monitor.queue._items))]
     for name in names:
         assert [event.value for event in waiting if event.name == name][-100:] == list(range(1, 101))
 
@@ -272,29 +274,29 @@ async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_follow
     for name in names:
         await space[name].write(0)
     recorder = Recorder(other.session, key("*"))
-    line, hub = Line(recorder), other.session.hub
-    await hub.follow(line)
+    line, manager = Subscription(recorder), manager_of(other.session)
+    await manager.follow(line)
     for node in cluster.nodes:
-        before, count = {*hub._wires.values()}, recorder.count
+        before, count = {*manager._wires.values()}, recorder.count
         with raw_of(node) as raw:
             raw.client_kill_filter(_type="pubsub")
-        await aeventually(lambda before=before: len({*hub._wires.values()} - before) == 1)
-        await aeventually(lambda: not hub._missing() and line.wire is not None)
+        await aeventually(lambda before=before: len({*manager._wires.values()} - before) == 1)
+        await aeventually(lambda: not manager._missing() and line.wire is not None)
         assert recorder.count == count + 1
-    assert len(hub._subscribed) == len(names) + 1
-    await hub.unfollow(line)
+    assert len(manager._subscribed) == len(names) + 1
+    await manager.unfollow(line)
 
 
 async def test_a_connection_that_is_made_while_the_interface_closes_is_closed_too(server_url, key):
     """Nobody else would close it."""
     async with reem_async.RedisInterface(server_url) as interface:
-        hub = interface.session.hub
+        manager = manager_of(interface.session)
         following = asyncio.create_task(reem_async.SilentSubscriber(key(), interface).listen())
         node = await interface.session.transport.owner(key().encode())
-        opening = asyncio.create_task(hub._connected(node))
+        opening = asyncio.create_task(manager._connected(node))
         await asyncio.sleep(0)
-        await hub.close()
+        await manager.close()
         for each in (following, opening):
             with pytest.raises(InterfaceClosed):
                 await each
-        assert not [wire for wire in hub._wires.values() if wire.alive]
+        assert not [wire for wire in manager._wires.values() if wire.alive]

@@ -14,7 +14,7 @@ import time
 import numpy as np
 import orjson
 import pytest
-from conftest import EXAMPLES, FRONTS, ROOT, assert_same, commands_run
+from conftest import EXAMPLES, FRONTS, PLAIN, ROOT, assert_same, commands_run
 from fuzz.targets import KEYS, SHIPS, TARGETS, blob, header, mutants
 from own_servers import own_server
 
@@ -349,11 +349,17 @@ def test_bytes_of_arrays_never_become_commands(server, name):
             "srem",
             "smembers",
         }
+        if PLAIN:  # a document is one more SET, and looked at once, before it is known to be one
+            ran["set"] -= writes
+            expected |= {"watch", "type", "getrange"}
+        else:
+            assert ran["json.set"] == writes
         assert set(ran) - {"config|resetstat"} <= expected | {"publish"}
-        assert ran["set"] == writes * 11 + ran["publish"]
-        assert ran["json.set"] == writes
+        assert ran["set"] == writes * 11 + writes // 2  # the note of each update
+        assert ran["publish"] >= writes // 2  # and now and then the question who listens near by
         assert admin.exists("pwned") == 0
-        assert not any(row.startswith("errorstat_") for row in admin.info("errorstats"))
+        asked = {"errorstat_ERR"} if PLAIN else set()  # whether it knows JSON after all
+        assert {row for row in admin.info("errorstats") if row.startswith("errorstat_")} <= asked
         admin.flushall()
 
 

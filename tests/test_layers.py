@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import ast
+import functools
+import re
 import sys
 
-import pytest
 from conftest import ROOT
 
 MODULES = sorted(path for package in ("reem", "reem_async") for path in (ROOT / package).rglob("*.py"))
 PURE = [
     path
     for path in MODULES
-    if path.is_relative_to(ROOT / "reem_async/plan") or path.is_relative_to(ROOT / "reem_async/ships")
+    if path.relative_to(ROOT).parts[:2] in {("reem_async", name) for name in ("plain", "plan", "ships")}
 ]
 TALKS_TO_REDIS = ("reem_async/transport/", "reem_async/errors.py", "reem_async/connection.py")
 CALLS = {"eval", "exec", "compile", "__import__"}
@@ -23,10 +24,12 @@ def label(path):
     return str(path.relative_to(ROOT))
 
 
+@functools.cache
 def tree(path):
     return ast.parse(path.read_text(encoding="utf-8"), label(path))
 
 
+@functools.cache
 def imported(path):
     """The absolute names of all modules a file imports, wherever in it, relative imports resolved."""
     package = path.relative_to(ROOT).parent.parts
@@ -51,54 +54,183 @@ def test_there_is_something_to_check():
     assert len(MODULES) > len(PURE)
 
 
-@pytest.mark.parametrize("path", PURE, ids=label)
-def test_plans_and_ships_know_nothing_of_loops_sockets_or_redis(path):
+def wrong(paths, said):
+    """What `said` of each file, by file: of files in which nothing is wrong it says nothing."""
+    return {label(path): found for path in paths if (found := said(path))}
+
+
+def test_plans_and_ships_know_nothing_of_loops_sockets_or_redis():
     """They are values and functions."""
     forbidden = {"asyncio", "anyio", "redis", "hiredis", "socket", "uvloop"}
-    assert not roots(path) & forbidden
+    assert wrong(PURE, lambda path: roots(path) & forbidden) == {}
 
 
-@pytest.mark.parametrize("path", PURE, ids=label)
-def test_plans_and_ships_import_only_each_other_and_the_errors(path):
+def test_plans_and_ships_import_only_each_other_and_the_errors():
     """Nothing of REEM that does I/O, and no third party but numpy and orjson."""
-    ours = {name for name in imported(path) if name.split(".")[0] in ("reem", "reem_async")}
-    inside = ("reem_async.plan", "reem_async.ships", "reem_async.errors")
-    assert not [name for name in ours if name != "reem_async" and not name.startswith(inside)]
-    assert roots(path) <= set(sys.stdlib_module_names) | {"numpy", "orjson", "reem_async"}
+    inside = ("reem_async.plain", "reem_async.plan", "reem_async.ships", "reem_async.errors")
+    known = {*sys.stdlib_module_names, "numpy", "orjson", "reem_async"}
+
+    def strange(path):
+        ours = {name for name in imported(path) if name.split(".")[0] in ("reem", "reem_async")}
+        outside = [name for name in ours if name != "reem_async" and not name.startswith(inside)]
+        return outside + sorted(roots(path) - known)
+
+    assert wrong(PURE, strange) == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=label)
-def test_redis_is_imported_in_one_place(path):
+def test_redis_is_imported_in_one_place():
     """The transport; the errors, which are subclasses of its errors; and the options of the interface."""
-    if not label(path).startswith(TALKS_TO_REDIS):
-        assert not roots(path) & {"redis", "hiredis"}
+    others = [path for path in MODULES if not label(path).startswith(TALKS_TO_REDIS)]
+    assert wrong(others, lambda path: roots(path) & {"redis", "hiredis"}) == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=label)
-def test_nothing_that_was_read_is_evaluated(path):
-    """No eval, exec, pickle or marshal, no numpy.load with pickles."""
-    assert not roots(path) & LOADERS
-    assert not imported(path) & {"marshal.load", "marshal.loads"}
+def evaluates(path):
+    """What a file imports or calls that makes code, or objects of any class, of data."""
+    found = sorted(roots(path) & LOADERS) + sorted(imported(path) & {"marshal.load", "marshal.loads"})
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Call):
-            assert ast.unparse(node.func) not in {"marshal.load", "marshal.loads"}, f"{label(path)}:{node.lineno}"
-            name = node.func.id if isinstance(node.func, ast.Name) else ""
-            assert name not in CALLS, f"{label(path)}:{node.lineno} calls {name}"
+            name = ast.unparse(node.func)
             allowed = [each for each in node.keywords if each.arg == "allow_pickle"]
-            assert not [each for each in allowed if ast.unparse(each.value) != "False"], f"{label(path)}:{node.lineno}"
+            if name in CALLS | {"marshal.load", "marshal.loads"} or [
+                each for each in allowed if ast.unparse(each.value) != "False"
+            ]:
+                found.append(f"line {node.lineno} calls {name}")
+    return found
 
 
-@pytest.mark.parametrize("path", [path for path in MODULES if label(path).startswith("reem_async/")], ids=label)
-def test_the_core_does_not_know_its_facade(path):
+def test_nothing_that_was_read_is_evaluated():
+    """No eval, exec, pickle or marshal, no numpy.load with pickles."""
+    assert wrong(MODULES, evaluates) == {}
+
+
+def test_the_core_does_not_know_its_facade():
     """Only the facade imports the core."""
-    assert "reem" not in roots(path)
+    core = [path for path in MODULES if label(path).startswith("reem_async/")]
+    assert wrong(core, lambda path: roots(path) & {"reem"}) == {}
 
 
-@pytest.mark.parametrize("path", MODULES, ids=label)
-def test_no_forbidden_command_is_even_spelled(path):
-    """No scripting, KEYS, FLUSH or CONFIG SET in any string that is a command."""
-    forbidden = {"EVAL", "EVALSHA", "FCALL", "KEYS", "FLUSHALL", "FLUSHDB", "CONFIG SET", "SCRIPT"}
+FORBIDDEN = {"EVAL", "EVALSHA", "FCALL", "KEYS", "FLUSHALL", "FLUSHDB", "CONFIG SET", "SCRIPT"}
+
+
+def spelled(path):
+    """The forbidden commands that stand in a file, with their lines."""
+    found = []
     for node in ast.walk(tree(path)):
         if isinstance(node, ast.Constant) and isinstance(node.value, (str, bytes)):
             text = node.value.decode("latin-1") if isinstance(node.value, bytes) else node.value
-            assert text.strip().upper() not in forbidden or text != text.upper(), f"{label(path)}:{node.lineno}: {text}"
+            if text.strip().upper() in FORBIDDEN and text == text.upper():
+                found.append(f"line {node.lineno}: {text}")
+    return found
+
+
+def test_no_forbidden_command_is_even_spelled():
+    """No scripting, KEYS, FLUSH or CONFIG SET in any string that is a command."""
+    assert wrong(MODULES, spelled) == {}
+
+
+def test_what_is_forbidden_would_be_found(tmp_path, monkeypatch):
+    """The searches work."""
+    monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
+    bad = tmp_path / "bad.py"
+    bad.write_text("import pickle, redis\nnp.load(f, allow_pickle=True)\neval('1')\nrun('KEYS', 'Keys')\n")
+    assert evaluates(bad) == ["pickle", "line 2 calls np.load", "line 3 calls eval"]
+    assert spelled(bad) == ["line 4: KEYS"]
+    assert roots(bad) == {"pickle", "redis"}
+
+
+# --- the order of the folders, and no import circles -------------------------------------------------
+
+ORDER = [
+    {"errors", "_moved"},
+    {"plan", "ships"},
+    {"plain"},
+    {"concurrency"},
+    {"local"},
+    {"transport"},
+    {"session"},
+    {"connection"},
+    {"pubsub"},
+    {"store"},
+    {"tools.partfile", "tools.snapshots", "tools.recording", "tools.migration"},
+    {"server"},
+    {"tools.browser"},
+    {"tools.cli", "tools.notebook"},
+]
+"""What may import what: only what stands before it, and its own line. TYPE_CHECKING and functions count too."""
+DOORS = {"", "datatypes", "migration", "monitor", "recording", "snapshots", "tools"}
+"""Modules that only give documented names; nothing of the core imports them but `timeout` and the like from the top."""
+SCRIPTS = sorted((ROOT / "reem_async/tools/browser/static").glob("*.js"))
+
+
+def dotted(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports():
+    """The modules of REEM that each module of REEM imports; `from package import module` is of the module alone."""
+    ours = {dotted(path): path for path in MODULES}
+    found = {}
+    for name, path in ours.items():
+        package = path.relative_to(ROOT).parent.parts
+        wanted = set()
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Import):
+                wanted |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                base = ".".join(package[: len(package) - node.level + 1]) if node.level else ""
+                module = ".".join(part for part in (base, node.module) if part)
+                names = {f"{module}.{alias.name}" for alias in node.names}
+                wanted |= (names & ours.keys()) | ({module} if names - ours.keys() else set())
+        found[name] = (wanted & ours.keys()) - {name}
+    return found
+
+
+def circles(graph):
+    """The groups of nodes that can reach each other."""
+    reached = {}
+    for start in graph:
+        seen, ahead = set(), [start]
+        while ahead:
+            for each in graph[ahead.pop()] - seen:
+                seen.add(each)
+                ahead.append(each)
+        reached[start] = seen
+    return sorted({tuple(sorted(b for b in reached[a] if a in reached[b])) for a in graph if a in reached[a]})
+
+
+def test_a_circle_would_be_found():
+    """The search works."""
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [("b", "c")]
+
+
+def test_no_modules_import_each_other():
+    """Each file can be read after those it imports."""
+    assert circles(imports()) == []
+
+
+def test_no_scripts_of_the_page_import_each_other():
+    """Likewise in JavaScript."""
+    graph = {path.name: set(re.findall(r'from "\./([\w.]+)"', path.read_text(encoding="utf-8"))) for path in SCRIPTS}
+    assert any(graph.values())
+    assert circles(graph) == []
+
+
+def folder(module):
+    parts = module.split(".")[1:]
+    return ".".join(parts[:2] if parts[:1] == ["tools"] else parts[:1])
+
+
+def test_the_folders_are_in_order():
+    """A folder uses only those before it."""
+    place = {name: number for number, names in enumerate(ORDER) for name in names}
+    wrong = []
+    for module, wanted in imports().items():
+        if not module.startswith("reem_async") or folder(module) in DOORS:
+            continue
+        wrong += [
+            f"{module} imports {each}"
+            for each in wanted
+            if each != "reem_async" and (folder(each) in DOORS or place[folder(each)] > place[folder(module)])
+        ]
+    assert wrong == []

@@ -132,7 +132,7 @@ def test_calls_that_failed_are_not_under_way(server, by_tcp, naps):
     kvs, image = reem.KeyValueStore(by_tcp), np.arange(100_000.0)
     kvs["camera"] = {"image": image}
     with pytest.raises(reem.errors.MissingKey):
-        kvs["missing"].read()
+        kvs["camera"]["missing"].read()
     with pytest.raises(ZeroDivisionError), kvs["camera"].edit() as draft:
         draft["n"] = 1 / 0
     with contextlib.closing(redis.Redis(port=server.port)) as client:
@@ -168,6 +168,6 @@ async def test_beside_small_calls_loopback_tcp_takes_a_large_array_in_portions(s
         assert buffer(by_tcp) == 2 << 17
         assert (buffer(by_socket), buffer(by_tcp, large=False)) == before
         await asyncio.sleep(0.2)
-        await tcp["camera"]["image"].write(image)
+        await tcp["camera"].write({"image": image})
         highest = int(Path("/proc/sys/net/core/wmem_max").read_text())
         assert buffer(by_tcp) == 2 * min(BUFFER, highest)

@@ -294,6 +294,93 @@ def test_the_arm_actuator(opened, key, paradigm):
     assert seen[-1] == last
 
 
+# --- chapter 5 -------------------------------------------------------------------------------------
+
+
+def _place(store, path):
+    for element in path[:-1]:
+        store = store[element]
+    return store, path[-1]
+
+
+def _assign(store, path, value):
+    place, last = _place(store, path)
+    place[last] = value
+
+
+def _get(store, path):
+    place, last = _place(store, path)
+    return place[last].read()
+
+
+def test_dictionaries_of_many_entries(opened, key):
+    """Of text and of arrays, written again and again in growing numbers (5.1.1)."""
+    store = KeyValueStore(opened())
+    for entry in ("A" * 100, np.random.default_rng(5).random((3, 4))):
+        for copies in (1, 10, 40, 100):
+            data = {f"copy_{number}_single_key": entry for number in range(copies)}
+            for _ in range(3):
+                _assign(store, [key("growth")], data)
+            assert_same(_get(store, [key("growth")]), data)
+
+
+def test_frame_rates_of_arrays_on_an_empty_server(opened, key, raw):
+    """One array under a sub-key of what was not there before, in growing sizes; then read (5.1.2)."""
+    store = KeyValueStore(opened())
+    for edge in (10, 200, 400):
+        frame = np.random.default_rng(edge).random((edge, edge))
+        for name in ("set", "read"):
+            for _ in range(3):
+                _assign(store, [key(name), "subkey"], frame)
+        store[key("read")]["subkey"] = frame
+        for _ in range(3):
+            assert_same(_get(store, [key("read"), "subkey"]), frame)
+    assert_same(_get(store, [key("set")]), {"subkey": frame})
+    for name in ("set", "read"):
+        assert_no_orphans(raw, key(name))
+
+
+def test_a_dictionary_or_its_one_entry(opened, key):
+    """In turns, text and array."""
+    store, frame = KeyValueStore(opened()), np.random.default_rng(5).random((100, 400))
+    for value in (frame, "A" * 300_000):
+        _assign(store, [key("foo")], {"bar": value})
+        _assign(store, [key("foo"), "bar"], value)
+        assert_same(_get(store, [key("foo"), "bar"]), value)
+
+
+def test_the_overhead_of_subscribers(opened, key):
+    """Each of several is called for each of many time stamps (5.2)."""
+    subscribers = [[] for _ in range(3)]
+
+    def note_latency(data, updated_path, times):
+        times.append(time.time() - data["timestamp"])
+
+    for times in subscribers:
+        CallbackSubscriber(key("overhead"), opened(), note_latency, {"times": times}).listen()
+    publisher = PublishSpace(opened())
+    for _ in range(50):
+        publisher[key("overhead")] = {"timestamp": time.time()}
+        time.sleep(0.002)
+    eventually(lambda: all(len(times) == 50 for times in subscribers))
+    assert all(0 <= latency < PATIENCE for times in subscribers for latency in times)
+
+
+def test_a_deep_dictionary_and_one_entry_of_it(opened, key):
+    """As it is compared with another package (5.3)."""
+    inner = {f"copy_{number}_single_key": "A" * 100 for number in range(100)}
+    inner |= {f"copy_{number}_nested_data": {"subkey": "A" * 100} for number in range(100)}
+    data, path = inner, [key("deep")]
+    for level in reversed(range(5)):
+        data = {f"sub_{level}": data}
+    path += [f"sub_{level}" for level in range(5)]
+    store = KeyValueStore(opened())
+    for _ in range(3):
+        _assign(store, path[:1], data)
+    assert _get(store, [*path, "copy_0_single_key"]) == "A" * 100
+    assert _get(store, path) == inner
+
+
 # --- REEM 0.1.x ------------------------------------------------------------------------------------
 
 
@@ -330,8 +417,7 @@ def test_a_script_of_reem_0_1_2(server_url, key):
     del kvs[top]["cfg"]
     assert kvs[top].read() == {"joints": [0.75, 1.0, 1.25, 1.5, 1.75], "count": 3, "name": "ARM"}
     del kvs[top]
-    with pytest.raises(KeyError):
-        kvs[top].read()
+    assert kvs[top].read() is None
     kvs.interface.close()
 
 

@@ -11,11 +11,11 @@ import pytest
 from conftest import aeventually, nothing_fetched
 
 import reem_async
-from reem_async.catalog import names, outline
+from reem_async.concurrency.queues import Every, Last
 from reem_async.errors import BadKey, InterfaceClosed, MissingKey, QueueFull
-from reem_async.monitor import ANNOUNCED, Monitor
 from reem_async.plan.patterns import escaped, parse_pattern
-from reem_async.policy import Every, Last
+from reem_async.pubsub.monitor import ANNOUNCED, Monitor
+from reem_async.store.catalog import names, outline
 
 SIZE = 200_000
 

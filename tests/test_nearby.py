@@ -15,12 +15,12 @@ import pytest
 import redis
 from chaos.proxy import Proxy
 from conftest import FRONTS, eventually
-from test_cli_record import is_recording, started
+from test_cli_record import begins, started
 
 import reem
 from reem.errors import ConnectionLost, NotConnected
-from reem_async.recording import open_log
 from reem_async.server import EmbeddedServer
+from reem_async.tools.recording import open_log
 from reem_async.transport import nearby
 from reem_async.transport.nearby import Way, look_nearby
 from reem_async.transport.options import NodeOptions, Options
@@ -245,7 +245,7 @@ def test_a_recorder_takes_it_by_any_address_of_this_machine(server, tmp_path):
     with reem.RedisInterface(server) as interface:
         reem.PublishSpace(interface)["arm"] = 1
     with started(url, tmp_path, "record", "-o", file) as process:
-        eventually(lambda: is_recording(file))
+        begins(process)
         with contextlib.closing(redis.Redis(port=server.port)) as client:
             assert [each for each in client.client_list() if "redis.sock" in each["addr"] and each["psub"] != "0"]
         process.send_signal(signal.SIGINT)

@@ -13,13 +13,13 @@ import redis.exceptions
 from hypothesis import given
 from hypothesis import strategies as st
 
+from reem_async.concurrency.queues import BoundedQueue, Last
 from reem_async.errors import BadData, BadKey, BadValue, TooDeep
-from reem_async.follow import Update
 from reem_async.plan import placeholders, trees
 from reem_async.plan.documents import encode
 from reem_async.plan.floats import _as_parsed, exact_text, may_lose
 from reem_async.plan.paths import below, may_hold, parse, parse_suffix, show, suffix, to_jsonpath
-from reem_async.policy import Last, Mailbox
+from reem_async.pubsub.updates import Update
 from reem_async.ships import NumpyShip
 from reem_async.transport.packing import pack
 from reem_async.transport.parsing import MORE, LargeReader, SmallReader
@@ -314,16 +314,16 @@ def test_a_tree_is_replaced_as_the_server_would_and_never_changed():
 @pytest.mark.parametrize("bound", [1, 2])
 def test_a_gap_outlives_the_update_that_told_of_it(bound):
     """Whoever is slow is told of the loss with the next update that he gets."""
-    mailbox = Mailbox(Last(bound))
-    mailbox.put(Update("a", 1, 1, gap=True, missed=3))
+    queue = BoundedQueue(Last(bound))
+    queue.put(Update("a", 1, 1, gap=True, missed=3))
     for number in range(bound):
-        mailbox.put(Update("a", number, number, gap=number == 0, missed=2 if number == 0 else 0))
-    first = mailbox.take()
+        queue.put(Update("a", number, number, gap=number == 0, missed=2 if number == 0 else 0))
+    first = queue.take()
     assert (first.gap, first.missed, first.value) == (True, 5, 0)
     if bound == 2:
-        assert not mailbox.take().gap
-    assert mailbox.dropped == 1
-    mailbox.put(Update("a", 1, 1, gap=True, missed=None))
+        assert not queue.take().gap
+    assert queue.dropped == 1
+    queue.put(Update("a", 1, 1, gap=True, missed=None))
     for number in range(bound):
-        mailbox.put(Update("a", number, number))
-    assert (mailbox.take().missed, mailbox.dropped) == (None, 2)
+        queue.put(Update("a", number, number))
+    assert (queue.take().missed, queue.dropped) == (None, 2)

@@ -17,9 +17,11 @@ import reem
 import reem.recording
 import reem_async
 from reem_async.errors import BadInput, BadKey, BadType, BadValue, MissingKey
-from reem_async.recording import ArrayHandle, Recorder, Replayer, feed, open_log
-from reem_async.recording.line import HURRIED, PATIENCE
-from reem_async.recording.recorder import _TICK
+from reem_async.pubsub.manager import manager_of
+from reem_async.tools.recording import ArrayHandle, Recorder, Replayer, open_log
+from reem_async.tools.recording.key_reader import KeyReader
+from reem_async.tools.recording.recorder import _TICK
+from reem_async.tools.recording.subscription import HURRIED, PATIENCE
 
 IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64, 3)
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
@@ -69,7 +71,7 @@ async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, bi
     name = key("cam")
 
     def paces():
-        return {wire.pace for wire in binterface.session.hub._wires.values()}
+        return {wire.pace for wire in manager_of(binterface.session)._wires.values()}
 
     async with Recorder(binterface, [key("*")], file) as recorder:
         for number in range(3):
@@ -84,17 +86,15 @@ async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, bi
 
 
 async def test_what_was_there_and_what_only_was_stored(key, akvs, binterface, file):
-    """At the beginning everything is read, and at each keyframe what no publisher told of."""
+    """At the beginning everything is read, and then what no publisher told of, when the server says it was changed."""
     await akvs[key("a")].write({"map": FRAME, "n": 1})
     await akvs[key("gone")].write(5)
-    async with Recorder(binterface, [key("*")], file, keyframe=0.1) as recorder:
+    async with Recorder(binterface, [key("*")], file, keyframe=0.1):
         first = time.time()
         await akvs[key("a")]["n"].write(2)
         await akvs[key("a")]["map"].write(FRAME + np.uint8(1))
         await akvs[key("new")].write("x")
         await akvs[key("gone")].delete()
-        before = recorder.status.messages
-        await aeventually(lambda: recorder.status.messages > before + 12)
     with logged(file) as log:
         assert_same(log.value_at("", first), {key("a"): {"map": FRAME, "n": 1}, key("gone"): 5})
         assert_same(log.value_at("", log.end), {key("a"): {"map": FRAME + np.uint8(1), "n": 2}, key("new"): "x"})
@@ -184,7 +184,7 @@ async def _recorded_and_replayed(url, file, batch):
         other = reem_async.KeyValueStore(two)
         seen = []
         await space[name].write({"first": 1})
-        async with Recorder(two, [name], file):
+        async with Recorder(two, [name], file) as recorder:
             for value, how in batch:
                 if how == "whole":
                     await space[name].write({"x": value, "y": 1})
@@ -194,11 +194,13 @@ async def _recorded_and_replayed(url, file, batch):
                     with contextlib.suppress(MissingKey):
                         await space[name]["first"].delete()
                     await space[name].write({"first": [value]})
-                seen.append((time.time(), await kvs[name].read()))
+                there = await kvs[name].read()
                 await asyncio.sleep(0.003)
+                await recorder.fence()
+                seen.append((recorder.clock.stamp() / 1e9, there))  # behind all log times so far, ahead of all later
         with open_log(file) as log:
-            for (instant, value), following in zip(seen, [*seen[1:], (log.end + 1, None)], strict=True):
-                assert_same(log.value_at(name, min(instant + 0.001, following[0])), value)
+            for instant, value in seen:
+                assert_same(log.value_at(name, instant), value)
             replayed = f"{name}again"
             await Replayer(two, log, rate=1000, remap={name: replayed}).play()
             assert_same(await other[replayed].read(), seen[-1][1])
@@ -273,9 +275,9 @@ async def test_a_full_queue_drops_and_says_so(key, apspace, akvs, binterface, fi
     async with Recorder(binterface, [key("*")], file, queue_bytes=200_000) as recorder:
         for number in range(300):
             await apspace[key("big")].write({"n": number, "a": np.full(1900, number)})
-        await aeventually(lambda: recorder.scribe.waiting == 0)
+        await aeventually(lambda: recorder.writer_thread.waiting == 0)
         last = await akvs[key("big")].read()
-        await aeventually(lambda: not recorder.scribe.behind)
+        await aeventually(lambda: not recorder.writer_thread.behind)
     assert recorder.status.dropped + recorder.status.messages // 2 >= 300
     with logged(file) as log:
         assert_same(log[key("big")].at(log.end), last)
@@ -287,28 +289,28 @@ async def test_what_was_dropped_is_in_the_file_though_it_is_just_being_read_when
     key, apspace, akvs, binterface, file, monkeypatch
 ):
     """The recorder reads keys anew from time to time: what that has begun is waited for."""
-    fetch, name = feed.fetch, key("big")
+    whole, name = KeyReader.whole, key("big")
 
-    async def slowly(*given):
+    async def slowly(reader):
         await asyncio.sleep(0.3)
-        return await fetch(*given)
+        return await whole(reader)
 
     async with Recorder(binterface, [key("*")], file) as recorder:
         await apspace[name].write({"n": 1})
         await aeventually(lambda: recorder.status.messages)
-        monkeypatch.setattr(feed, "fetch", slowly)
-        put, refused = recorder.scribe.put, []
+        monkeypatch.setattr(KeyReader, "whole", slowly)
+        put, refused = recorder.writer_thread.put, []
 
         def full_once(operation, size):
             if operation.role == "update" or (operation.role == "state" and "state" not in refused):
                 refused.append(operation.role)
-                recorder.scribe.behind.add(name)
+                recorder.writer_thread.behind.add(name)
                 if operation.role == "state":
                     asyncio.get_running_loop().call_later(_TICK / 20, recorder._catch_up)  # it looks by itself, too
                 return False
             return put(operation, size)
 
-        monkeypatch.setattr(recorder.scribe, "put", full_once)
+        monkeypatch.setattr(recorder.writer_thread, "put", full_once)
         await apspace[name].write({"n": 2})
     assert refused
     with logged(file) as log:
@@ -428,7 +430,7 @@ def test_the_blocking_front(key, server_url, pspace, kvs, interface, file):
 def test_both_fronts_promise_the_same():
     import inspect
 
-    from reem_async import recording as core
+    from reem_async.tools import recording as core
 
     for name in ("Recorder", "Replayer"):
         ours, theirs = getattr(reem.recording, name), getattr(core, name)

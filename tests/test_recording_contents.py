@@ -5,8 +5,8 @@ import weakref
 import numpy as np
 import pytest
 
-from reem_async.recording import contents
-from reem_async.recording.contents import Content, Recent
+from reem_async.tools.recording import contents
+from reem_async.tools.recording.contents import Content, Recent
 
 
 def test_contents_are_told_apart_by_head_and_body() -> None:

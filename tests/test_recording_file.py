@@ -10,6 +10,7 @@ import random
 import signal
 import sys
 import time
+import tracemalloc
 
 import mcap.reader
 import mcap.writer
@@ -23,10 +24,11 @@ from test_recording import FRAME, IMAGE
 import reem
 import reem.recording
 from reem_async.errors import BadData, BadValue, MissingKey
-from reem_async.recording import DamagedRecording, Recorder, RecordingFailed, open_log
-from reem_async.recording.output import Output
-from reem_async.recording.times import Arrivals
-from reem_async.recording.writer import Writer
+from reem_async.tools.recording import DamagedRecording, Recorder, RecordingFailed, open_log
+from reem_async.tools.recording import mcap_writer as recording_writer
+from reem_async.tools.recording.mcap_writer import Writer
+from reem_async.tools.recording.output import Output
+from reem_async.tools.recording.times import Arrivals
 
 
 @pytest.fixture(scope="module")
@@ -79,6 +81,7 @@ def test_what_is_written_is_what_the_library_reads(compression, tmp_path):
             writer.flush()
     whole_before_the_end = file.stat().st_size
     writer.finish()
+    writer.close()
     output.close()
     with file.open("rb") as stream:
         reader = mcap.reader.make_reader(stream, validate_crcs=True)
@@ -94,6 +97,36 @@ def test_what_is_written_is_what_the_library_reads(compression, tmp_path):
         plain = mcap.reader.NonSeekingReader(stream, validate_crcs=True)
         assert [m.data for _, _, m in plain.iter_messages(log_time_order=False)] == [each[2] for each in sent]
     assert compression == "none" or file.stat().st_size < sum(sizes) * 0.7 < whole_before_the_end * 2
+
+
+def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path, monkeypatch):
+    """The index of chunks grows by ten bytes for each channel and chunk; it waits in a file, and is complete."""
+    monkeypatch.setattr(recording_writer, "_INDEX_BYTES", 1 << 14)
+    output = Output(tmp_path / "long.mcap", overwrite=False)
+    writer = Writer(output, "none", "test")
+    schema = writer.register_schema("a schema", "jsonschema", b"{}")
+    channels = [writer.register_channel(f"/topic{n}", "json", schema, {}) for n in range(100)]
+    used = []
+    tracemalloc.start()
+    try:
+        for number in range(300):
+            for channel in channels:
+                writer.add_message(channel, 1000 * number + channel, [b"{}"], 7, number)
+            writer.flush()
+            if number % 100 == 99:
+                used.append(tracemalloc.get_traced_memory()[0])
+        writer.finish()
+    finally:
+        tracemalloc.stop()
+        writer.close()
+        output.close()
+    assert used[2] - used[1] < 50_000
+    with (tmp_path / "long.mcap").open("rb") as stream:
+        summary = mcap.reader.make_reader(stream, validate_crcs=True).get_summary()
+    assert [len(index.message_index_offsets) for index in summary.chunk_indexes] == [100] * 300
+    times = summary.statistics.message_start_time, summary.statistics.message_end_time
+    assert times == (channels[0], 299_000 + channels[-1])
+    assert list(tmp_path.iterdir()) == [tmp_path / "long.mcap"]
 
 
 def test_arrivals_do_not_tell_that_updates_were_taken_together():
@@ -143,7 +176,7 @@ def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values)
             assert abs(message.publish_time - message.log_time) < 10**9
             assert image.timestamp.seconds == message.publish_time // 10**9
         names = {record.name for record in reader.iter_metadata()}
-        assert names == {"reem", "reem.channels"}
+        assert names == {"reem", "reem.channels", "reem.totals"}
     with file.open("rb") as stream:  # and record by record, every checksum verified
         assert list(mcap.reader.NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False))
 
@@ -235,6 +268,62 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
         noticed += count > 0
     assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
     assert noticed > 40
+
+
+def test_the_times_of_a_chunk_are_not_believed(names, file_and_values, tmp_path):
+    """Of a file without a summary; an end in the year 2500 was taken for that of the recording."""
+    file, seen = file_and_values
+    with open_log(file) as log:
+        chunks, end = log._container.chunks, log.end
+    whole, damaged = file.read_bytes()[:-20], tmp_path / "damaged.mcap"
+    for info in chunks[1:-1]:
+        for field in (9, 17):
+            data = bytearray(whole)
+            data[info.offset + field + 7] ^= 0x40
+            damaged.write_bytes(data)
+            found, count = check(damaged, names, seen)
+            assert count > 0
+            assert found >= len(seen) // 2
+            with open_log(damaged) as log:
+                assert log.end == end
+
+
+def mutated(data, rng):
+    """A file with a few things done to it."""
+    broken = bytearray(data)
+    for _ in range(rng.choice([1, 1, 5])):
+        start = rng.randrange(len(broken))
+        end = start + rng.choice([1, 8, 60, 500])
+        kind = rng.randrange(6)
+        if kind == 0:
+            broken[start] ^= 1 << rng.randrange(8)
+        elif kind == 1:
+            del broken[start:end]
+        elif kind == 2:
+            broken[start:start] = broken[start:end]
+        elif kind == 3:
+            broken[start:end] = rng.randbytes(min(end, len(broken)) - start)
+        elif kind == 4:
+            broken[start : start + 8] = rng.choice([b"\xff" * 8, bytes(8), (2**40).to_bytes(8, "little")])
+        else:
+            del broken[-rng.randrange(1, 300) :]
+    return bytes(broken)
+
+
+def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp_path):
+    """What is missing is counted: no update is lost but at the end, and none is another one."""
+    file, seen = file_and_values
+    data, rng, broken = file.read_bytes(), random.Random(11), tmp_path / "broken.mcap"
+    for number in range(150):
+        broken.write_bytes(mutated(data, rng))
+        try:
+            found, damaged = check(broken, names, seen)
+        except DamagedRecording:
+            continue  # its very beginning
+        with open_log(broken) as log:
+            list(log.updates())
+            assert found == len(seen) or damaged or log.unreadable or not log.indexed, number
+            log.verify()
 
 
 def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_values, tmp_path):
@@ -401,7 +490,7 @@ async def main(url, key, file):
                 for number in range(10_000):
                     await space[key].write({"n": number, "noise": rng.integers(0, 255, 20_000, numpy.uint8)})
                     await asyncio.sleep(0.002)
-                    if recorder.scribe.failure:
+                    if recorder.writer_thread.failure:
                         await recorder.wait()
         except RecordingFailed as error:
             print(number, error, flush=True)

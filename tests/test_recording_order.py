@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import math
+import random
 import time
 
 import numpy as np
 import pytest
-from conftest import aeventually, assert_same
+from conftest import PATIENCE, Remembering, aeventually, assert_same
 
-from reem_async.monitor import ANNOUNCED, Event
+import reem_async
 from reem_async.plan.patterns import parse_pattern
-from reem_async.recording import Recorder, Replayer, feed, open_log
-from reem_async.recording.state import pruned
-from reem_async.recording.times import published
+from reem_async.pubsub.monitor import Event
+from reem_async.tools.recording import Recorder, Replayer, key_recorder, open_log
+from reem_async.tools.recording.state import pruned
+from reem_async.tools.recording.times import published
 
 LARGE = np.zeros((300, 300))
 
@@ -26,34 +28,39 @@ def news(file, path):
 
 
 async def test_what_is_stored_beside_what_is_published_is_seen(key, apspace, akvs, binterface, file):
-    """At the next keyframe, though an update comes in each of them; and at the end, though there was none since."""
+    """Though updates go on coming; and at the end, though there was none since."""
     await apspace[key()].write({"x": 0, "y": 0, "z": 0})
-    async with Recorder(binterface, [key()], file, keyframe=0.2) as recorder:
+    async with Recorder(binterface, [key()], file, keyframe=60) as recorder:
+        stored = recorder.writer_thread.stored = Remembering()
         await akvs[key()]["y"].write(5)
-        stored, frames = time.time(), recorder._keyframes
-        while recorder._keyframes < frames + 3:
+        deadline = time.monotonic() + PATIENCE
+        while key() not in stored.ever:
+            assert time.monotonic() < deadline
             await apspace[key()]["x"].increment()
             await asyncio.sleep(0.01)
+        seen = time.time()
         await akvs[key()]["z"].write(7)
     with open_log(file) as log:
-        assert log[key()]["y"].at(stored + 0.6) == 5
+        assert log[key()]["y"].at(seen) == 5
+        assert {update.shown for update in log.updates() if update.kind == "stored"} == {f"{key()}.y", f"{key()}.z"}
         assert_same(log[key()].at(log.end), await akvs[key()].read())
         assert log[key()]["z"].at(log.end) == 7
 
 
 async def test_a_frame_that_a_keyframe_reads_first_is_not_skipped(key, apspace, binterface, file, monkeypatch):
     """What a state brings of updates that were only announced is theirs."""
-    monkeypatch.setattr(feed, "_LET_PASS", 0.05)
+    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
     await apspace[key()].write({"image": LARGE})
     async with Recorder(binterface, [key()], file) as recorder:
         for number in range(1, 4):
-            recorder._feed(key()).read()  # what a keyframe does
+            recorder._key_recorder(key()).read()  # what a keyframe does
             await apspace[key()]["image"].write(LARGE + number)
-            await aeventually(lambda: recorder._feed(key()).busy is None)
-        recorder._feed(key()).read()  # one comes while what was announced before waits to be fetched
+            await recorder.fence()
+            await aeventually(lambda: recorder._key_recorder(key()).busy is None)
+        recorder._key_recorder(key()).read()  # one comes while what was announced before waits to be fetched
         await apspace[key()]["image"].write(LARGE + 4)
         await asyncio.sleep(0.02)
-        recorder._feed(key()).read()
+        recorder._key_recorder(key()).read()
         await apspace[key()]["image"].write(LARGE + 5)
     with open_log(file) as log:
         found = [update for update in log.updates() if update.path == (key(), "image")]
@@ -66,7 +73,7 @@ async def test_what_was_deleted_before_it_could_be_fetched_is_skipped_and_counte
     key, apspace, akvs, binterface, file, monkeypatch
 ):
     """It is neither a deletion of its own, nor is its deletion recorded twice."""
-    monkeypatch.setattr(feed, "_LET_PASS", 0.05)
+    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
     await apspace[key()].write({})
     async with Recorder(binterface, [key()], file) as recorder:
         for _ in range(5):
@@ -78,7 +85,7 @@ async def test_what_was_deleted_before_it_could_be_fetched_is_skipped_and_counte
 
 
 async def test_what_was_replaced_with_what_holds_it_is_skipped_and_counted(key, apspace, binterface, file, monkeypatch):
-    monkeypatch.setattr(feed, "_LET_PASS", 0.05)
+    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
     async with Recorder(binterface, [key()], file) as recorder:
         for number in range(4):
             await apspace[key()].write({"image": LARGE})
@@ -89,29 +96,83 @@ async def test_what_was_replaced_with_what_holds_it_is_skipped_and_counted(key, 
     assert news(file, key()) == [{"n": number} for number in range(4)]
 
 
-async def test_a_keyframe_comes_behind_all_that_it_holds(key, apspace, binterface, file):
-    """Small updates between two large ones wait for the first; a keyframe among them must wait too."""
+async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(key, apspace, akvs, binterface, file):
+    """It is not recorded with a value that it did not have, nor behind what came later; what is left of it is found."""
+    async with Recorder(binterface, [key()], file) as recorder:
+        for number in range(10):
+            await apspace[key()].write({"image": LARGE + number, "n": number, "state": "raw", "box": [1, 2, 3]})
+            await apspace[key()]["state"].write("done")
+            await apspace[key()]["box"][0].delete()
+            await apspace[key()]["score"].write(number / 2)
+            await recorder.fence()
+            await recorder._settled(PATIENCE)
+        whole = await akvs[key()].read()
+    with open_log(file) as log:
+        updates = [update for update in log.updates() if update.kind == "pub"]
+        assert [update.sequence for update in updates] == sorted({update.sequence for update in updates})
+        recorded = {update.sequence for update in updates}
+        skipped = {number: path for _, path, number in log.skipped()}
+        assert recorded.isdisjoint(skipped)
+        assert recorded | skipped.keys() == set(range(1, 41))
+        assert set(skipped.values()) == {key()}
+        assert len(skipped) == recorder.status.skipped > 0
+        for update in updates:
+            frame = (update.sequence - 1) // 4
+            state = log.value_at((key(),), update.time)
+            assert (state["n"], int(state["image"][0, 0])) == (frame, frame)
+            if update.path == (key(),):
+                assert update.value["state"] == "raw"
+            elif update.path == (key(), "score"):
+                score = {"n": frame, "state": "done", "box": [2, 3], "score": frame / 2}
+                assert {name: item for name, item in state.items() if name != "image"} == score
+            elif update.path == (key(), "state"):
+                assert state["state"] == "done"
+        assert_same(log[key()].at(log.end), whole)
+        await apspace[key()].delete()
+        await Replayer(binterface, log, rate=100).play()
+    assert_same(await akvs[key()].read(), whole)
+
+
+async def test_a_loss_between_an_announcement_and_its_fetch_is_no_part_of_it(key, apspace, akvs, binterface, file):
+    """What is read names an update that nobody has heard of: others may have changed what was announced."""
     async with Recorder(binterface, [key()], file) as recorder:
         await apspace[key()].write({"x": 0, "image": LARGE})
-        await aeventually(lambda: recorder.status.messages >= 2)
-        one, stamps = recorder._feed(key()), iter(range(2000, 20000, 2000))
-        base = recorder.clock.stamp()
-
-        def item(role, path, value, number):
-            return feed.Item(role, (key(), *path), value, (base + next(stamps), 0, number))
-
-        first = item("update", ["image"], ANNOUNCED, 2)
-        one._items.extend([first, item("update", ["x"], 1, 3), item("keyframe", [], None, 1)])
-        one._items.extend([item("update", ["x"], 2, 4), item("update", ["image"], ANNOUNCED, 5)])
-        one._place(first, LARGE + 1, LARGE.nbytes, one._items[-1].stamp[0])
-        await one._drain()
+        await aeventually(lambda: recorder.status.messages >= 2 and recorder._key_recorder(key()).busy is None)
+        recorder._key_recorder(key())._reader._limit = turns = asyncio.Semaphore(0)
+        await apspace[key()].write({"x": 1, "image": LARGE})
+        session = apspace.interface.session
+        keys = session.keys(key())
+        publisher, number = session.stamp(keys)
+        await akvs[key()]["x"].write("lost")
+        await session.transport.roundtrip([("SET", keys.last, f"{publisher} {number}", "EX", 60)])
+        await recorder.fence()
+        for _ in range(8):
+            turns.release()
+        await aeventually(lambda: recorder.status.skipped == 1)
     with open_log(file) as log:
-        times, numbers = log[key()]["x"].history()
-        assert numbers.tolist()[:3] == [0, 1, 2]
-        late = [update.time for update in log.updates() if update.path == (key(), "image")][-1]
-        assert [log[key()]["x"].at(time) for time in (times[1], times[2] - 1e-6, times[2], late)] == [1, 1, 2, 2]
+        assert [update.value["x"] for update in log.updates() if update.kind == "pub"] == [0]
+        assert log[key()]["x"].at(log.end) == "lost"
 
 
+async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, akvs, binterface, file):
+    """Nobody published that. What was published is recorded where it was, once."""
+    await apspace[key()].write({"x": 1})
+    async with Recorder(binterface, [key()], file, keyframe=0.1) as recorder:
+        await akvs[key()].delete()
+        await aeventually(lambda: recorder._key_recorder(key()).absent)
+        await apspace[key()].write({"x": 2})
+        await apspace[key()].delete()
+        await asyncio.sleep(0.3)
+    with open_log(file) as log:
+        assert [(update.kind, update.deleted, update.sequence) for update in log.updates()] == [
+            ("kvs", False, 0),
+            ("stored", True, 0),
+            ("pub", False, 2),
+            ("pub", True, 3),
+        ]
+
+
+@pytest.mark.alone
 async def test_a_key_that_cannot_be_read_is_told_of_once(key, raw, binterface, file, caplog):
     """And it does not keep the recording from ending."""
     raw.set(key(), "no document")
@@ -211,7 +272,35 @@ async def test_any_clock_of_a_publisher_can_be_recorded(key, akvs, binterface, f
     await akvs[key()].write(1)
     async with Recorder(binterface, [key()], file) as recorder:
         event = Event((key(),), 1, deleted=False, size=10, time=clock, received=time.time(), publisher="p", sequence=1)
-        recorder._feed(key()).on_event(event)
+        recorder._key_recorder(key()).on_event(event)
     with open_log(file) as log:
         (update,) = [update for update in log.updates() if update.kind == "pub"]
         assert (update.value, update.published) == (1, published(clock) / 1e9)
+
+
+async def test_a_clock_that_jumps_while_it_is_recorded(key, apspace, binterface, file, monkeypatch):
+    """By years, hours and milliseconds, both ways: each update is there once, in order, at the time that passed."""
+    jump, now, now_ns = 0.0, time.time, time.time_ns
+    monkeypatch.setattr(time, "time", lambda: now() + jump)
+    monkeypatch.setattr(time, "time_ns", lambda: now_ns() + int(jump * 1e9))
+    rng, begun = random.Random(25), now()
+    async with Recorder(binterface, [key()], file) as recorder:
+        for number in range(150):
+            jump = rng.choice([jump, rng.choice([0.0, 3600.0, -3600.0, 1e8, -1e8, 0.002, -0.002])])
+            await apspace[key()].write({"n": number, "array": np.full(3, number)})
+            if number % 10 == 0:
+                await asyncio.sleep(0.02)
+        await asyncio.sleep(0.1)
+    assert (recorder.status.dropped, recorder.status.gaps) == (0, 0)
+    jump, passed = 0.0, now() - begun
+    with open_log(file) as log:
+        updates = list(log.updates(patterns=[key()]))
+        assert [update.value["n"] for update in updates] == list(range(150))
+        times = [update.time for update in updates]
+        assert times == sorted(set(times))
+        assert log.duration <= passed + 0.1
+        for update in updates:
+            assert_same(log.value_at(key(), update.time)["array"], np.full(3, update.value["n"]))
+        again = await asyncio.wait_for(Replayer(binterface, log, remap={key(): key("again")}).play(), passed + 10)
+    assert again.published >= 150
+    assert_same(await reem_async.KeyValueStore(binterface)[key("again")].read(), {"n": 149, "array": np.full(3, 149)})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import asyncio
 import contextlib
+import csv
 import os
 import time
 
@@ -16,10 +17,10 @@ from test_recording import FRAME, IMAGE
 import reem
 import reem.recording
 import reem_async
+from reem_async.concurrency.queues import Every
 from reem_async.errors import BadInput, BadValue
-from reem_async.policy import Every
-from reem_async.recording import Recorder, Replayer, open_log
-from reem_async.recording.export import export
+from reem_async.tools.recording import Recorder, Replayer, open_log
+from reem_async.tools.recording.export import export
 
 
 @pytest.fixture
@@ -84,6 +85,7 @@ async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs
     assert_same(await akvs[target].read(), log[names("arm")].at(log.end))
 
 
+@pytest.mark.alone
 @pytest.mark.parametrize("rate", [10.0, 1e6])
 async def test_faster(names, key, log, akvs, other, rate):
     begun = time.monotonic()
@@ -96,7 +98,7 @@ async def test_faster(names, key, log, akvs, other, rate):
 
 
 async def test_from_the_middle_the_state_comes_first(names, key, log, akvs, other):
-    middle = log.start + 0.2
+    middle = log[names("arm.n")].history()[0][10]  # n was 10 then, and the other key there
     replayer = Replayer(other, log, start=middle, end=middle, remap={names("arm"): key("b"), names("late"): key("c")})
     await replayer.play()
     assert_same({"b": await akvs[key("b")].read()}, {"b": log[names("arm")].at(middle)})
@@ -219,6 +221,40 @@ def test_export_npz(names, log, tmp_path):
         assert_same(arrays[f"{names('late')}[1].frame"], FRAME[None])
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+async def test_deletions_and_what_is_empty_have_rows(key, apspace, server_url, tmp_path, kind):
+    """A row for each update, and in it what tells an empty dict or list from nothing."""
+    file, name = tmp_path / "run.mcap", key("k")
+    async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [name], file):
+        for value in ({"a": 1, "b": 2, "deleted": 0}, {}, {"a": 3, "b": []}, []):
+            await apspace[name].write(value)
+        await apspace[name].write({"a": 4})
+        await apspace[name]["a"].delete()
+        await apspace[name].delete()
+    target = tmp_path / f"a.{kind}"
+    with open_log(file) as log:
+        result = export(log, kind, target)
+        npz = export(log, "npz", tmp_path / "a.npz")
+    assert (result.rows, result.deleted) == (7, "deleted")
+    assert {name, f"{name}.a (deleted)", f"{name} (deleted)"} <= npz.left_out.keys()
+    if kind == "csv":
+        rows = list(csv.DictReader(target.read_text().splitlines()))
+    else:
+        rows = pytest.importorskip("pyarrow.parquet").read_table(target).to_pylist()
+    found = [{column: str(value) for column, value in row.items() if value not in ("", None)} for row in rows]
+    for row in found:
+        del row["time"]
+    assert found == [
+        {f"{name}.a": "1", f"{name}.b": "2", f"{name}.deleted": "0"},
+        {name: "{}"},
+        {f"{name}.a": "3", f"{name}.b": "[]"},
+        {name: "[]"},
+        {f"{name}.a": "4"},
+        {"deleted": f"{name}.a"},
+        {"deleted": name},
+    ]
+
+
 LONG = 2**62 + 1
 """An integer that no float64 holds."""
 
@@ -263,7 +299,7 @@ def test_export_parquet(names, log, tmp_path):
 
 async def test_a_key_called_time_does_not_take_the_place_of_the_instants(key, server_url, other, tmp_path):
     file = tmp_path / "run.mcap"
-    async with reem_async.RedisInterface(server_url, namespace=key()) as interface:
+    async with reem_async.RedisInterface(server_url, namespace=key("foo:")) as interface:
         space = reem_async.PublishSpace(interface)
         async with Recorder(interface, ["*"], file):
             await space["time"].write(1.5)
@@ -297,9 +333,9 @@ def test_an_export_that_is_broken_off_leaves_nothing(log, tmp_path, kind, monkey
     def broken_off(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("reem_async.recording.log.LogPath.values", broken_off)
+    monkeypatch.setattr("reem_async.tools.recording.log.LogPath.values", broken_off)
     monkeypatch.setattr("csv.writer", broken_off)
-    monkeypatch.setattr("reem_async.recording.export._cell", broken_off)
+    monkeypatch.setattr("reem_async.tools.recording.export._cell", broken_off)
     with pytest.raises(KeyboardInterrupt):
         export(log, kind, target)
     assert list(tmp_path.iterdir()) == []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import enum
+import operator
 import secrets
 import socket
 import threading
@@ -18,7 +19,7 @@ from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent, url_
 
 import reem
 import reem_async
-from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, WrongLoop
+from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, PathRefused, WrongLoop
 
 A = np.arange(3.0)
 
@@ -100,6 +101,21 @@ def test_an_array_that_an_edit_wrote_anew_leaves_nothing_when_it_is_replaced_by_
 
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
+def test_a_static_write_removes_arrays_that_another_static_write_put_below_or_above(open_front, key, raw, space):
+    front = open_front(space)
+    front.kvs.track_schema_changes(False)
+    for parent in ({"a": {}}, {"a": {"b": {"image": np.arange(3)}}}):
+        for inner, child in ((["a"], {"b": {"image": np.arange(4)}}), (["a", "b"], {}), (["a", "b"], {"x": b"1"})):
+            front.write([key()], {"a": {"b": 0}})
+            for place, value in (([key()], parent), ([key(), *inner], child)) * 2:
+                with contextlib.suppress(BadType, PathRefused):  # of another shape than it had
+                    front.write(place, value)
+                assert_no_orphans(raw, key())
+            front.delete([key()])
+            assert keys_of(raw, key()) <= {f"{{{key()}}}:last"}
+
+
+@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 def test_a_static_write_after_a_delete_is_registered(open_front, key, raw, space):
     """The delete has removed the registry's entries with the arrays."""
     front = open_front(space)
@@ -168,6 +184,21 @@ async def test_an_unsigned_number_can_be_subtracted(kvs, akvs, key, number):
     kvs[key()]["n"] -= number
     assert await akvs[key()]["n"].read() == 9
     assert await akvs[key()]["n"].decrement(number) == 8
+
+
+@pytest.mark.parametrize("stored", [0.0, -0.0, 0, 5, -5.0])
+async def test_zeros_keep_their_signs_in_arithmetic(akvs, key, stored):
+    """The integer 0 has no negative: -0.0 - 0 is -0.0, and -0.0 + 0 is 0.0."""
+    place = akvs[key()]
+    ways = (place.increment, operator.add), (place.decrement, operator.sub), (place.multiply, operator.mul)
+    for call, operation in ways:
+        for operand in (0, 0.0, -0.0, -3, 2.5):
+            for server_calculates in (False, True):
+                await place.write(stored)
+                if server_calculates:  # it does where this interface has just seen a small result
+                    await place.multiply(1)
+                assert repr(await call(operand)) == repr(operation(stored, operand))
+                assert repr(await place.read()) == repr(operation(stored, operand))
 
 
 def test_an_accessor_of_another_place_is_refused_and_not_taken_for_the_end_of_an_augmented_assignment(
@@ -252,6 +283,7 @@ def silence():
         yield listening.getsockname()[1]
 
 
+@pytest.mark.alone
 async def test_a_server_that_accepts_and_never_answers_is_given_up():
     """In both fronts, for reading and for following."""
     with silence() as port:

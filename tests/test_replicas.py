@@ -19,8 +19,8 @@ from sentinelkit import Watched
 
 import reem
 import reem_async
-from reem_async.cluster_server import EmbeddedCluster
 from reem_async.errors import BadType, BadValue, InterfaceClosed, MissingKey, NotAllowed, NotConnected
+from reem_async.server.cluster import EmbeddedCluster
 
 DOCUMENT = {"n": 1, "l": [1, 2, 3], "s": "text", "image": np.arange(20.0)}
 READING = {"json.get", "json.type", "json.objlen", "json.arrlen", "get", "smembers", "watch", "scan", "type"}
@@ -413,6 +413,7 @@ def test_closing_ends_the_connections_to_replicas_too(world, opened):
             front.read([name])
 
 
+@pytest.mark.alone
 def test_a_replica_that_stands_still_is_left_within_the_time_limit(world, opened):
     """Its primary is asked with the other half of it, and at once from then on."""
     front = opened(world.url, timeout=1.6)

@@ -307,6 +307,7 @@ def test_memory_is_counted(measured):
     assert memory["connection"] > 1000
 
 
+@pytest.mark.alone
 def test_whole_arms_send_what_they_should(measured):
     ran = measured[1]
     assert ran["robots"] == 1

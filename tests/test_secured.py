@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import redis
 import trustme
-from conftest import FRONTS, PATIENCE, assert_same, eventually
+from conftest import FRONTS, PATIENCE, PLAIN, assert_same, eventually
 from own_servers import connect, free_port, own_server
 
 import reem
 import reem_async
-from reem_async._server_process import HOST
 from reem_async.errors import ServerFailed
+from reem_async.server.process import HOST
 
 both = pytest.mark.parametrize("name", list(FRONTS))
 LARGE = 1 << 20
@@ -273,9 +273,11 @@ def test_one_tls_connection_serves_many_calls(certificates, name):
                     front.write(["foo"], number)
                 time.sleep(1.1)
                 assert front.read(["foo"]) == 4
-            assert relay.connections == 1
+            own = PLAIN and name == "asyncio"  # for the look that a document takes which is not known yet
+            assert relay.connections == 1 + own
 
 
+@pytest.mark.alone
 @both
 def test_a_slow_link_is_no_broken_one(certificates, name):
     """8 MB that take several times the time limit arrive, since bytes move all the while."""
@@ -325,6 +327,18 @@ def test_an_authority_that_is_not_known_is_refused(shielded, other_authority, na
     """The system's authorities, and another one than the server's."""
     for options in ({}, {"ssl_ca_certs": other_authority.ca}):
         assert_refused(name, url_of(shielded), "ssl_ca_certs=", **options)
+
+
+@both
+def test_a_sentinel_whose_authority_is_not_known_is_refused_in_the_same_words(shielded, other_authority, name):
+    """However many others of the URL are just not there."""
+    with socket.create_server((HOST, 0)) as taken:
+        gone = taken.getsockname()[1]
+    hosts = f"localhost:{gone},localhost:{shielded},localhost:{gone}"
+    options = {"ssl_ca_certs": other_authority.ca}
+    assert_refused(
+        name, f"rediss+sentinel://{hosts}/mymaster", "certificate is not trusted", "ssl_ca_certs=", **options
+    )
 
 
 @both

@@ -76,6 +76,47 @@ def test_a_write_to_a_demoted_primary_is_not_reported_as_done(front, watched):
     watched.settle()
 
 
+async def test_a_switch_by_an_administrator_is_told_to_followers_and_to_who_only_calls(watched):
+    """And what becomes of connections to the old primary afterwards is nobody's loss."""
+    watched.settle()
+    heard = {"follower": [], "caller": []}
+    async with contextlib.AsyncExitStack() as stack:
+        for name, told in heard.items():
+            interface = await stack.enter_async_context(reem_async.RedisInterface(watched.url))
+            await reem_async.KeyValueStore(interface)["m"].write(1)
+            if name == "follower":
+                mirror = reem_async.SilentSubscriber("m", interface)
+                await mirror.listen()
+            interface.on_state(lambda change, told=told: told.append(change.state))
+        old = watched.now()
+        watched.sentinels[0].execute_command("SENTINEL", "FAILOVER", "mymaster")
+        await aeventually(lambda: heard["follower"] == ["lost", "reconnecting", "connected"])
+        old.client_kill_filter(_type="normal", skipme=True)  # it does that itself, when it hears of its successor
+        await aeventually(lambda: heard["caller"] == ["lost", "connected"])
+        await asyncio.sleep(0.2)
+        assert heard == {"follower": ["lost", "reconnecting", "connected"], "caller": ["lost", "connected"]}
+    await asyncio.to_thread(watched.settle)
+
+
+async def test_what_is_stored_after_a_switch_is_told_by_the_new_primary(watched):
+    """Behind a gap with what is there; a mirror has it too."""
+    watched.settle()
+    async with reem_async.RedisInterface(watched.url) as interface:
+        handle = reem_async.KeyValueStore(interface)["w"]
+        await handle.write(1)
+        async with handle.watch(reem_async.Every(1000)) as updates, handle.mirror() as mirror:
+            assert (await anext(updates)).initial
+            watched.sentinels[0].execute_command("SENTINEL", "FAILOVER", "mymaster")
+            async with asyncio.timeout(20):
+                while not (await anext(updates)).gap:
+                    pass
+                await handle.write(2)
+                update = await anext(updates)
+                assert (update.data, str(update.origin) in ("stored", "found")) == (2, True)
+                assert await mirror.wait_until(lambda value: value == 2) == 2
+    await asyncio.to_thread(watched.settle)
+
+
 async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
     """Killed -9: calls fail until the sentinels have agreed; followers converge, and say that there is a gap."""
     load = Load(watched.url, "robot", failover=True)

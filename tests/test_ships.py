@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
+import gc
 import json
 import struct
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +18,7 @@ from conftest import assert_no_orphans, assert_same, eventually, keys_of, nothin
 import reem
 import reem_async
 from reem_async.errors import BadData, BadType
+from reem_async.ships import NumpyShip, SpecialDatatypeShip
 
 
 class Pose:
@@ -330,3 +335,140 @@ def test_an_array_whose_bytes_are_gone_is_bad_data(front, key, raw):
     with pytest.raises(BadData, match="image"):
         front.read([key()])
     assert front.read([key(), "n"]) == 1
+
+
+# --- ships that claim what JSON could hold ---------------------------------------------------------
+
+
+class TextShip(SpecialDatatypeShip):
+    """Carries what is of one type, as text; counts how often it is asked."""
+
+    def __init__(self, fits, label="text_ship"):
+        self.fits = fits
+        self.label = label
+        self.asked = 0
+
+    def check_fit(self, value):
+        self.asked += 1
+        return self.fits(value)
+
+    def write(self, key, value, client):
+        client.set(key, repr(value))
+
+    def read(self, key, client):
+        client.get(key)
+
+    def interpret_read(self, responses):
+        return ast.literal_eval(responses[0].decode())
+
+    def get_label(self):
+        return self.label
+
+
+class AwaitedTextShip(TextShip):
+    async def check_fit(self, value):
+        return self.fits(value)
+
+
+CLAIMS = {
+    "list": lambda value: isinstance(value, list),
+    "dict": lambda value: isinstance(value, dict) and "custom" in value,
+    "str": lambda value: isinstance(value, str) and value.startswith("te"),
+    "float": lambda value: isinstance(value, float),
+    "tuple": lambda value: isinstance(value, tuple),
+}
+CLAIMED = {"list": [1, 2.5], "dict": {"custom": [1]}, "str": "text", "float": 0.25, "tuple": (1, "a")}
+
+
+@pytest.mark.parametrize("ship", [TextShip, AwaitedTextShip])
+@pytest.mark.parametrize("kind", CLAIMS)
+def test_a_ship_may_claim_a_type_that_json_has(open_front, key, raw, ship, kind):
+    """Any type of data, says the manual: it is asked before the value becomes JSON, at any depth."""
+    if kind == "dict":
+        ship = type(ship.__name__, (ship,), {"claims": (dict,)})  # no short sample has that key
+    ships = [reem.ships.NumpyShip(), ship(CLAIMS[kind])]
+    front, value = open_front(ships=ships), CLAIMED[kind]
+    front.write([key()], {"it": value, "deep": {"a": {"it": value}}, "other": 5, "image": np.arange(3)})
+    assert front.read([key(), "it"]) == value
+    assert type(front.read([key(), "it"])) is type(value)
+    assert front.read([key(), "deep"]) == {"a": {"it": value}}
+    assert (front.read([key(), "other"]), front.type([key(), "deep"])) == (5, dict)
+    front.write([key(), "it"], value)
+    front.write([key("root")], value)
+    assert front.read([key("root")]) == value
+    assert raw.exists(f"{{{key()}}}.it") == 1
+    assert "text_ship" in raw.execute_command("JSON.GET", key("root"))
+    front.write([key(), "it"], 7)
+    front.delete([key(), "deep"])
+    assert front.read([key()])["it"] == 7
+    assert_no_orphans(raw, key())
+
+
+def test_a_claimed_value_is_published_and_appended(interface, server_url, key):
+    """As any other that goes by ship."""
+    with reem.RedisInterface(server_url, ships=[TextShip(CLAIMS["str"])]) as own:
+        kvs, space = reem.KeyValueStore(own), reem.PublishSpace(own)
+        kvs[key()] = {"l": [1], "n": 1}
+        kvs[key()]["l"].append("text")
+        assert kvs[key()]["l"].read() == [1, "text"]
+        with reem.SilentSubscriber(key(), own) as mirror:
+            space[key()]["n"] = "text"
+            eventually(lambda: mirror.value() == {"l": [1, "text"], "n": "text"})
+    with pytest.raises(BadData, match="text_ship"):
+        reem.KeyValueStore(interface)[key()].read()
+
+
+def test_long_lists_of_floats_are_claimed_one_by_one(open_front, key, raw):
+    """There is a quick way for such lists, which asks nobody."""
+    ship = TextShip(lambda value: type(value) is float and value == 0.25)
+    ship.claims = (float,)
+    front = open_front(ships=[ship])
+    front.write([key()], [0.25, 0.5] * 100)
+    assert front.read([key()]) == [0.25, 0.5] * 100
+    assert raw.execute_command("JSON.GET", key()).count("text_ship") == 100
+
+
+def test_where_no_ship_claims_a_type_none_is_asked_for_one(open_front, key):
+    """So that plain values cost nothing more."""
+    ship = TextShip(lambda value: isinstance(value, set) or value.shape == (1,))  # chokes on other types
+    front = open_front(ships=[ship])
+    before = ship.asked
+    front.write([key()], {"l": [1, 2.5, "text", None], "d": {"x": (1, 2)}, "t": "é"})
+    front.write([key(), "l", 0], [0.5] * 100)
+    assert ship.asked == before
+    front.write([key(), "s"], {1})
+    assert front.read([key(), "s"]) == {1}
+
+
+def test_threads_that_meet_new_shapes_at_once_read_them():
+    """A header is parsed without `ast`: in Python 3.11 it fails where a finalizer lets another thread use it."""
+    ship, wrong = NumpyShip(), []
+
+    class Finalized:
+        def __init__(self):
+            self.itself = self
+
+        def __del__(self):
+            time.sleep(0)  # lets another thread go on
+
+    def parse(number):
+        try:
+            for count in range(300):
+                Finalized()
+                shape = (0, number, count)
+                array = np.zeros(shape, [("x", "f4"), ("it's", "u1", 3)])
+                assert ship.unpack(b"".join(ship.pack(array))).shape == shape
+        except BaseException as error:
+            wrong.append(error)
+
+    threads = [threading.Thread(target=parse, args=(number,)) for number in range(4)]
+    before = gc.get_threshold()
+    gc.set_threshold(10)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        gc.set_threshold(*before)
+    assert not wrong

@@ -23,7 +23,7 @@ import reem_async
 import reem_async.snapshots
 from reem_async.errors import BadData, BadKey, Conflict, WrongKind
 from reem_async.server import EmbeddedServer
-from reem_async.snapshots import RdbUnavailable, describe, rdb, restore, save, save_rdb
+from reem_async.tools.snapshots import RdbUnavailable, describe, rdb, restore, save, save_rdb
 
 servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
 
@@ -40,7 +40,7 @@ async def test_keys_that_are_there_are_not_replaced_unasked(here, there, raws, t
     await copy["b"].write({"old": np.arange(9), "l": [np.zeros(3), np.zeros(3)], "x": 1})
     await copy["mine"].write({"x": np.arange(3)})
     before = everything(raws[1])
-    with pytest.raises(Conflict, match=r"'b'.*--replace"):
+    with pytest.raises(Conflict, match=r"'b'.*replace=True"):
         await restore(there, tmp_path / "a.zip")
     assert everything(raws[1]) == before
     assert (await restore(there, tmp_path / "a.zip", "a")).names == ("a",)
@@ -253,5 +253,5 @@ async def test_what_the_beginning_of_an_rdb_file_says(tmp_path, head, count):
 def test_the_modules_that_know_the_format_know_no_server():
     """The file format and the plans are values and functions."""
     for name in ("archive", "files", "values", "plans"):
-        text = (ROOT / f"reem_async/snapshots/{name}.py").read_text(encoding="utf-8")
+        text = (ROOT / f"reem_async/tools/snapshots/{name}.py").read_text(encoding="utf-8")
         assert not any(word in text for word in ("asyncio", "anyio", "session", "transport", "import redis")), name

@@ -13,7 +13,7 @@ from conftest import Keys, RawCluster, assert_no_orphans, assert_same, keys_of
 import reem
 from reem_async.errors import Conflict, NotAllowed
 from reem_async.plan.keys import keys_of as keys_of_name
-from reem_async.plan.memory import Memory
+from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.staging import STAGED, are_missing, looks_at, stage
 from reem_async.plan.writes import exchange, set_change
 
@@ -195,7 +195,7 @@ def test_only_large_values_go_first():
 
 
 def test_an_edit_that_meets_a_conflict_leaves_nothing_on_the_server():
-    keys, memory = keys_of_name("a"), Memory()
+    keys, memory = keys_of_name("a"), ShapeCache()
     _, coming = stage([("SET", "{a}[0]", bytes(70_000))], "{a}", "u")
     it = set_change(keys, (0,), b"1", ())
     plan = exchange(it, [("JSON.GET", "a", "$[0]")], (b"[1]",), memory, coming)

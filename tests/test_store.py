@@ -29,7 +29,7 @@ async def test_write_read_delete_length_and_type_are_awaited(akvs, key):
     assert await akvs[key()].read() == {"number": 100.0, "string": "REEM"}
     await akvs[key()].delete()
     with pytest.raises(MissingKey):
-        await akvs[key()].read()
+        await akvs[key()].delete()
 
 
 async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):

@@ -1,5 +1,7 @@
 """Followers in a process of their own, each with its own interface, as separate programs would have.
 
+They share no memory with publishers: in a fleet, those are on other machines.
+
 `python -m benchmarks.scale.audience` reads what to follow from its first line of input, says "ready",
 and then answers each line that asks to wait until everybody has seen so many updates. It ends with
 its input.
@@ -112,7 +114,7 @@ class Hall:
             self.seen[name] = 0
             namespace, colon, key = name.rpartition(":")
             for _ in range(followers):
-                interface = RedisInterface(url, namespace=namespace + colon, timeout=5.0)
+                interface = RedisInterface(url, namespace=namespace + colon, timeout=5.0, local="off")
                 self._interfaces.append(interface)
                 self._subscribers.append(CallbackSubscriber(key, interface, partial(self._count, name)))
         for each in self._subscribers:

@@ -21,11 +21,10 @@ from typing import Any
 from reem_async import RedisInterface
 from reem_async.plan import Command, wire_commands
 from reem_async.plan.keys import keys_of
-from reem_async.plan.memory import Memory
-from reem_async.plan.notices import published, with_value
 from reem_async.plan.reads import read
+from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.writes import change, set_change
-from reem_async.publish import DocumentPublisher
+from reem_async.store.publish import DocumentPublisher, UpdateNotifier
 from reem_async.transport.packing import pack
 from reem_async.transport.redirects import keys_in
 
@@ -71,15 +70,14 @@ async def script(topic: Topic, namespace: str, sharded: bool) -> Script:
     session = RedisInterface("127.0.0.1", namespace=namespace).session  # never connected
     await session.ships.ready()
     writer = DocumentPublisher(session, topic.name)
-    text, loaded = await writer._prepared((), VALUES[topic.value](1), "")
+    text, loaded = await writer.encoder.encoded((), VALUES[topic.value](1))
     keys = keys_of(topic.name, namespace, 0, sharded)
-    stamp = "0" * 12, 1, time.time(), ()
-    notices = published(keys, *stamp[:2], with_value(*stamp, text, loaded))
-    commands = wire_commands(change(set_change(keys, (), text, loaded, notices=notices), Memory()))
+    telling = UpdateNotifier(session, keys).turn().with_value(text, loaded)
+    commands = wire_commands(change(set_change(keys, (), text, loaded, notices=telling), ShapeCache()))
     watch = bytes_of([("WATCH", *keys_in(commands))]) if sharded else b""
     fetch = b""
     if loaded:  # too large for the notice
-        look = read(keys, (), session.ships, Memory(), (("GET", keys.last),))
+        look = read(keys, (), session.ships, ShapeCache(), (("GET", keys.last),))
         fetch = bytes_of(wire_commands(look.decode([b"[" + text + b"]"])))
     return Script(topic, keys.channel, watch, bytes_of(commands), fetch)
 

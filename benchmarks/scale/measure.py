@@ -116,7 +116,7 @@ class Bench:
         self.running = running
         self.effort = effort
         self.found: dict[str, Any] = {}
-        self.interface = RedisInterface(running.url, namespace=NAMESPACE, timeout=5.0)
+        self.interface = RedisInterface(running.url, namespace=NAMESPACE, timeout=5.0, local="off")
         self.kvs, self.pspace = KeyValueStore(self.interface), PublishSpace(self.interface)
         self._audience: Audience | None = None
         self._published: dict[str, int] = {}

@@ -30,7 +30,7 @@ def replay(running: Running, seconds: float) -> dict[str, Any]:
     with contextlib.ExitStack() as stack:
         audience = stack.enter_context(Audience(running.url, groups))
         spaces = {
-            namespace: PublishSpace(stack.enter_context(RedisInterface(running.url, namespace=namespace)))
+            namespace: PublishSpace(stack.enter_context(RedisInterface(running.url, namespace=namespace, local="off")))
             for namespace in numbered(ROBOTS)
         }
         _pace(spaces, 0.5)

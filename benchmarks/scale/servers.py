@@ -10,8 +10,8 @@ from typing import Any
 
 import redis
 
-from reem_async.cluster_server import EmbeddedCluster
 from reem_async.server import EmbeddedServer
+from reem_async.server.cluster import EmbeddedCluster
 
 from .slots import shared_out
 

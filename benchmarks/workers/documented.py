@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from ..values import FRAME_SHAPE, random_array
+from ..values import FRAME_SHAPE, picture
 
 
 def walk(store: Any, path: list[str]) -> Any:
@@ -18,7 +18,7 @@ def message_maker(payload: str) -> Callable[[], dict[str, Any]]:
     """What makes the next stamped message."""
     if payload == "small":
         return lambda: {"timestamp": time.monotonic_ns()}
-    image = random_array(list(FRAME_SHAPE))
+    image = picture(payload)
     return lambda: {"timestamp": time.monotonic_ns(), "image": image}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import orjson
 
-from ..values import FRAME_SHAPE, random_array
+from ..values import picture
 
 _ROOM = 1 << 17
 _TEXT = re.compile(rb"\{[^}]*\}")
@@ -40,30 +40,31 @@ class Contender:
 
     def publishing(self, channel: str, payload: str) -> Callable[[], Any]:
         """PUBLISH of a small JSON text; a frame's own memory is SET before, in the same system calls."""
-        image = random_array(list(FRAME_SHAPE)).reshape(-1).view("u1").data
+        if payload == "small":
+            return lambda: self.line.simple(
+                _command("PUBLISH", channel, orjson.dumps({"timestamp": time.monotonic_ns()}))
+            )
+        image = picture(payload).reshape(-1).view("u1").data
         head = b"*3\r\n$3\r\nSET\r\n$%d\r\n%b\r\n$%d\r\n" % (len(channel) + 6, f"{channel}:frame".encode(), len(image))
-
-        def small() -> None:
-            self.line.simple(_command("PUBLISH", channel, orjson.dumps({"timestamp": time.monotonic_ns()})))
 
         def frame() -> None:
             told = _command("PUBLISH", channel, orjson.dumps({"timestamp": time.monotonic_ns()}))
             self.line.send([head, image, b"\r\n" + told])
             self.line.simple(b"", replies=2)
 
-        return small if payload == "small" else frame
+        return frame
 
     def subscribe(self, channel: str, payload: str, heard: Callable[[int], None]) -> None:
         """A thread in a blocking read, which fetches the frame a message announces into memory that is there."""
         line, fetch = _Line(self.address), _command("GET", f"{channel}:frame")
         line.simple(_command("SUBSCRIBE", channel), replies=5)  # *3, $9, subscribe, $N and name, less the count
-        image = bytearray(random_array(list(FRAME_SHAPE)).nbytes + 64)
+        image = bytearray(0 if payload == "small" else picture(payload).nbytes + 64)
 
         def listen() -> None:
             while True:
                 for text in _TEXT.findall(line.receive()):
                     stamp = int(orjson.loads(text)["timestamp"])
-                    if payload == "frame":
+                    if payload != "small":
                         self.line.bulk(fetch, memoryview(image))
                     heard(stamp)
 

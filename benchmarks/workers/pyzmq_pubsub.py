@@ -9,7 +9,7 @@ import numpy as np
 import orjson
 import zmq
 
-from ..values import FRAME_SHAPE, random_array
+from ..values import FRAME_SHAPE, PIXELS, picture
 
 
 class Contender:
@@ -34,7 +34,7 @@ class Contender:
         publisher, topic = self.sockets["publisher"], channel.encode()
         if payload == "small":
             return lambda: publisher.send_multipart([topic, orjson.dumps({"timestamp": time.monotonic_ns()})])
-        image = random_array(list(FRAME_SHAPE))
+        image = picture(payload)
         return lambda: publisher.send_multipart([topic, time.monotonic_ns().to_bytes(8), image], copy=False)
 
     def subscribe(self, channel: str, payload: str, heard: Callable[[int], None]) -> None:
@@ -48,7 +48,7 @@ class Contender:
                 parts = subscriber.recv_multipart(copy=payload == "small")
                 if payload == "small":
                     heard(int(orjson.loads(parts[1])["timestamp"]))
-                elif np.frombuffer(parts[2].buffer).reshape(FRAME_SHAPE).shape == FRAME_SHAPE:
+                elif np.frombuffer(parts[2].buffer, PIXELS[payload]).reshape(FRAME_SHAPE).shape == FRAME_SHAPE:
                     heard(int.from_bytes(parts[1].bytes))
 
         threading.Thread(target=listen, daemon=True).start()

@@ -9,7 +9,7 @@ import numpy as np
 import orjson
 import redis
 
-from ..values import FRAME_SHAPE, random_array
+from ..values import FRAME_SHAPE, PIXELS, picture
 
 
 class Contender:
@@ -43,7 +43,7 @@ class Contender:
         """PUBLISH of a small JSON text; for a frame SET of its bytes and PUBLISH of the text, as one transaction."""
         if payload == "small":
             return lambda: self.client.publish(channel, orjson.dumps({"timestamp": time.monotonic_ns()}))
-        image = random_array(list(FRAME_SHAPE))
+        image = picture(payload)
 
         def call() -> None:
             text = orjson.dumps({"timestamp": time.monotonic_ns()})
@@ -59,10 +59,10 @@ class Contender:
         def listen() -> None:
             for message in pubsub.listen():
                 stamp = int(orjson.loads(message["data"])["timestamp"])
-                if payload == "small" or self._frame(channel).shape == FRAME_SHAPE:
+                if payload == "small" or self._frame(channel, payload).shape == FRAME_SHAPE:
                     heard(stamp)
 
         threading.Thread(target=listen, daemon=True).start()
 
-    def _frame(self, channel: str) -> np.ndarray[Any, Any]:
-        return np.frombuffer(self.client.get(f"{channel}:frame")).reshape(FRAME_SHAPE)
+    def _frame(self, channel: str, payload: str) -> np.ndarray[Any, Any]:
+        return np.frombuffer(self.client.get(f"{channel}:frame"), PIXELS[payload]).reshape(FRAME_SHAPE)

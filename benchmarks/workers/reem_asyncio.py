@@ -26,7 +26,7 @@ class Contender:
         from reem_async.connection import RedisInterface
         from reem_async.datatypes import KeyValueStore, PublishSpace
 
-        self.interface = RedisInterface(host=self.target["url"])
+        self.interface = RedisInterface(host=self.target["url"], **self.target["options"])
         await self.interface.initialize()
         self.store: Any = KeyValueStore(self.interface)
         self.space: Any = PublishSpace(self.interface)

@@ -12,7 +12,7 @@ class Contender(DocumentedContender):
         from reem.connection import RedisInterface
         from reem.datatypes import CallbackSubscriber, KeyValueStore, PublishSpace
 
-        self.interface = RedisInterface(host=target["url"])
+        self.interface = RedisInterface(host=target["url"], **target["options"])
         self.interface.initialize()
         self.store = KeyValueStore(self.interface)
         self.space = PublishSpace(self.interface)

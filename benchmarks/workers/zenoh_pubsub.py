@@ -1,4 +1,7 @@
-"""eclipse-zenoh, peer to peer over TCP, scouting off. The publisher listens, the subscriber connects."""
+"""eclipse-zenoh, peer to peer over TCP and, unless it is told otherwise, shared memory; scouting off.
+
+The publisher listens, the subscriber connects.
+"""
 
 import json
 import time
@@ -10,7 +13,7 @@ import numpy as np
 import orjson
 import zenoh
 
-from ..values import FRAME_SHAPE, random_array
+from ..values import FRAME_SHAPE, PIXELS, picture
 
 
 class Contender:
@@ -20,6 +23,7 @@ class Contender:
 
     def __init__(self, target: dict[str, Any]) -> None:
         self.address = f"tcp/127.0.0.1:{target['peer_port']}"
+        self.shares_memory = target["options"].get("shares_memory", True)  # as it does if it is not told otherwise
         self.session: Any = None
         self.kept: list[Any] = []
 
@@ -33,6 +37,7 @@ class Contender:
             config.insert_json5("mode", '"peer"')
             config.insert_json5("scouting/multicast/enabled", "false")
             config.insert_json5("scouting/gossip/enabled", "false")
+            config.insert_json5("transport/shared_memory/enabled", json.dumps(self.shares_memory))
             config.insert_json5("listen/endpoints", json.dumps([self.address] if side == "listen" else []))
             config.insert_json5("connect/endpoints", json.dumps([self.address] if side == "connect" else []))
             self.session = zenoh.open(config)
@@ -46,7 +51,7 @@ class Contender:
         self.kept.append(publisher)
         if payload == "small":
             return lambda: publisher.put(orjson.dumps({"timestamp": time.monotonic_ns()}))
-        image = random_array(list(FRAME_SHAPE))
+        image = picture(payload)
 
         def call() -> None:
             stamp = time.monotonic_ns().to_bytes(8)
@@ -61,7 +66,7 @@ class Contender:
             data = sample.payload.to_bytes()
             if payload == "small":
                 heard(int(orjson.loads(data)["timestamp"]))
-            elif np.frombuffer(data).reshape(FRAME_SHAPE).shape == FRAME_SHAPE:
+            elif np.frombuffer(data, PIXELS[payload]).reshape(FRAME_SHAPE).shape == FRAME_SHAPE:
                 heard(int.from_bytes(sample.attachment.to_bytes()))
 
         self.kept.append(self._open("connect").declare_subscriber(f"bench/{channel}", callback))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadData, ClusterReply, Refused, turned_down
+from ..errors import BadData, ClusterReply, PartialWrite, Refused, turned_down
 
 __all__ = ["Command", "Plan", "Reply", "blamed", "unwrap", "wire_commands"]
 
@@ -22,6 +22,8 @@ Reply = Any
 
 _MULTI: Command = ("MULTI",)
 _EXEC: Command = ("EXEC",)
+_READS = frozenset(["GET", "JSON.GET", "SMEMBERS", "TYPE"])
+"""What REEM's transactions read by. What ships of users' own read by is taken for a change."""
 
 
 class Plan(NamedTuple):
@@ -34,6 +36,7 @@ class Plan(NamedTuple):
         atomic: Send the commands as one MULTI/EXEC.
         held: Keep the connection to this plan and its successors (WATCH lives on a connection).
         bulk: Many bytes are expected back: use a connection where nobody waits behind them.
+        unfinished: What came before was applied: makes the error to raise, from the one that says why the rest was not.
     """
 
     commands: Sequence[Command]
@@ -41,6 +44,7 @@ class Plan(NamedTuple):
     atomic: bool = False
     held: bool = False
     bulk: bool = False
+    unfinished: Callable[[Exception], Exception] | None = None
 
 
 def wire_commands(plan: Plan) -> Sequence[Command]:
@@ -53,6 +57,7 @@ def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
 
     Raises:
         redis.exceptions.RedisError: The server refused the whole transaction; nothing was applied.
+        PartialWrite: It refused only to make it one, and did what came then, command by command.
         BadData: What came back is not the outcome of a transaction.
     """
     if not plan.atomic:
@@ -60,13 +65,29 @@ def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
     outcome = replies[-1]
     if isinstance(outcome, Exception):
         # EXECABORT only says that something was wrong; the reason was the reply to one of the commands.
-        pairs = zip(replies, wire_commands(plan), strict=True)
-        raise next((blamed(reply, command) for reply, command in pairs if isinstance(reply, Exception)), outcome)
+        pairs = list(zip(replies, wire_commands(plan), strict=True))
+        reason = next((blamed(reply, command) for reply, command in pairs if isinstance(reply, Exception)), outcome)
+        raise _apart(reason, pairs[1:-1]) if isinstance(replies[0], Exception) else reason
+    # EXEC answers nil only where a watched key was changed. Without a watch nobody could have said so.
     if outcome is None and plan.held:
         return None
     if type(outcome) is not list or len(outcome) != len(plan.commands):
         raise BadData(f"the server answered a transaction of {len(plan.commands)} commands with {outcome!r:.60}")
     return outcome
+
+
+def _apart(reason: Exception, pairs: Sequence[tuple[Reply, Command]]) -> Exception:
+    """Return the error to raise for commands that were to be a transaction, which MULTI was refused for."""
+    # Each command behind a MULTI that was refused was carried out by itself, as it came.
+    done = [
+        command[:2]
+        for reply, command in pairs
+        if reply is not None and not isinstance(reply, Exception) and command[0] not in _READS
+    ]
+    if not done:
+        return reason
+    shown = ", ".join(" ".join(str(word) for word in command) for command in done)
+    return PartialWrite(f"{reason}; so what belongs together was not kept together, but these were done: {shown:.300}")
 
 
 def blamed(error: Exception, command: Command) -> Exception:

@@ -12,21 +12,22 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..errors import BadType, Overflow
-from . import Command, Plan, Reply
+from ..errors import MissingKey, Overflow, PartialWrite, WrongType
+from . import Plan, Reply
+from .changes import Telling
 from .documents import encode
+from .indexes import from_front, lengths
 from .keys import Keys
-from .memory import Memory
-from .paths import Path, show, to_jsonpath
+from .orphans import permitted
+from .paths import Path, counts_from_end, show, to_jsonpath
 from .placeholders import find
 from .reads import get_command, present
 from .replies import checked, full, loads
+from .shapes import ShapeCache
 
 __all__ = ["calculate", "compute"]
 
 Operation = Callable[[Any, Any], Any]
-Notices = Callable[[], Sequence[Command]]
-"""Makes the commands that tell subscribers, anew for each transaction: notices are numbered."""
 
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 """The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
@@ -42,75 +43,84 @@ def calculate(
     operation: Operation,
     operand: float,
     text: bytes,
-    notices: Notices,
-    memory: Memory,
+    notices: Telling,
+    cache: ShapeCache,
 ) -> Plan:
     """Plan `command` (JSON.NUMINCRBY, JSON.NUMMULTBY) with `operand`, in one transaction; returns the new number.
 
     Raises (in decode):
         MissingKey: Nothing is there.
-        BadType: Not a number.
+        WrongType: Not a number.
         Overflow: The result is out of range; the old value stays.
     """
-    known = memory.number(keys.document, path)
-    if known is None or not -_FAR < operation(known, operand) < _FAR:
-        return compute(keys, path, lambda number: operation(number, operand), notices, memory)
+    # A result seen here a moment ago says how near the ends of 64 bits the next one will be. It is only a guess: the
+    # transaction below reads the number before and after, so whatever somebody else made of it meanwhile shows.
+    known = cache.number(keys.document, path)
+    if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
+        return compute(keys, path, lambda number: operation(number, operand), notices, cache)
     place = to_jsonpath(path)
     commands = [
         get_command(keys, path),
         (command, keys.document, place, text),
         get_command(keys, path),
-        *notices(),
+        *notices.make(path),
     ]
 
     def decode(replies: Sequence[Reply]) -> Any:
         old = _number(present(replies[0], keys, path), keys, path)
         if replies[1] == [None]:  # a float that is stored as text
-            return compute(keys, path, lambda number: operation(number, operand), notices, memory)
+            return compute(keys, path, lambda number: operation(number, operand), notices, cache)
+        # So RedisJSON calls a float that would be infinite; it has left the old value.
         if isinstance(replies[1], Exception) and "not a number" in str(replies[1]):
             raise _overflow(keys, path, old)
         checked(replies[1], keys, path)
         text = present(replies[2], keys, path)
         new, due = loads(text, keys)[0], operation(old, operand)
+        # The types as well: to whoever reads them 2 and 2.0 are different values.
         if type(new) is type(due) and new == due:
-            memory.saw_number(keys.document, path, new)
+            cache.saw_number(keys.document, path, new)
             return new
         return _put_right(keys, path, text, old, due, notices)
 
     return Plan(commands, decode, atomic=True)
 
 
-def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Notices, memory: Memory) -> Plan:
+def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Telling, cache: ShapeCache) -> Plan:
     """Plan to replace the number at `path` by `function` of it; repeats until nobody interferes."""
 
     def look(replies: Sequence[Reply]) -> Any:
+        permitted(replies[0], keys.document)
         old = _number(present(replies[1], keys, path), keys, path)
+        # Refused here, so that nothing is sent that the server would wrap around.
         new = _in_range(function(old), keys, path, old)
-        return _guarded(keys, path, new, notices, again, lambda: finish(new))
+        place = from_front(replies[2:], keys, path, MissingKey)
+        return _guarded(keys, place, new, notices, again, lambda: finish(new))
 
-    def again(notices: Notices) -> Plan:
-        return compute(keys, path, function, notices, memory)
+    def again() -> Plan:
+        return compute(keys, path, function, notices, cache)
 
     def finish(new: Any) -> Any:
-        memory.saw_number(keys.document, path, new)
+        cache.saw_number(keys.document, path, new)
         return new
 
-    return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True)
+    return Plan([("WATCH", keys.document), get_command(keys, path), *lengths(keys, path)], look, held=True)
 
 
-def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices: Notices) -> Plan:
+def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices: Telling) -> Plan:
     """Plan to replace a wrapped result by the right one, or by the old value if that is out of range."""
     fits = _fits(due)
 
     def look(replies: Sequence[Reply]) -> Any:
+        permitted(replies[0], keys.document)
+        # Another value by now: its writer may have calculated with the wrong one, or replaced it. Nobody can tell.
         if present(replies[1], keys, path) != wrong:
             raise Overflow(
                 f"{show(full(keys, path))}: the result left the range of 64 bits and was wrapped around by the server; "
                 "somebody else changed it before it could be put right: write it again"
             )
-        return _guarded(keys, path, due if fits else old, notices, again, finish)
+        return _guarded(keys, path, due if fits else old, notices, again, finish, unfinished)
 
-    def again(notices: Notices) -> Plan:
+    def again() -> Plan:
         return _put_right(keys, path, wrong, old, due, notices)
 
     def finish() -> Any:
@@ -118,37 +128,45 @@ def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices
             raise _overflow(keys, path, old)
         return due
 
-    return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True)
+    def unfinished(error: Exception) -> PartialWrite:
+        return PartialWrite(
+            f"{show(full(keys, path))}: the result left the range of 64 bits, was wrapped around by the server, and "
+            f"could not be put right: {error}; write it again (it was {old!r})"
+        )
+
+    return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True, unfinished=unfinished)
 
 
 def _guarded(
     keys: Keys,
     path: Path,
     value: Any,
-    notices: Notices,
-    again: Callable[[Notices], Plan],
+    notices: Telling,
+    again: Callable[[], Plan],
     then: Callable[[], Any],
+    unfinished: Callable[[Exception], Exception] | None = None,
 ) -> Plan:
     """Plan to set a number on the watched connection; `again` is what to do if somebody else was faster."""
-    told = notices()
     text = encode(value, full(keys, path), lambda _: None, lambda _: "").text
+    commands = [("JSON.SET", keys.document, to_jsonpath(path), text), *notices.make(path)]
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         if replies is None:
-            return again(lambda: told)  # nobody has seen these yet, so their numbers are not used up
+            notices.take_back()
+            return again()
         checked(replies[0], keys, path)
         return then()
 
-    return Plan([("JSON.SET", keys.document, to_jsonpath(path), text), *told], decode, atomic=True, held=True)
+    return Plan(commands, decode, atomic=True, held=True, unfinished=unfinished)
 
 
 def _number(text: bytes, keys: Keys, path: Path) -> Any:
     holder = loads(text, keys)
-    crates = find(holder, keys.name)
+    slots = find(holder, keys.name)
     number = holder[0]
-    if crates or isinstance(number, bool) or not isinstance(number, int | float):
-        what = crates[0].placeholder.label if crates else type(number).__name__
-        raise BadType(
+    if slots or isinstance(number, bool) or not isinstance(number, int | float):
+        what = slots[0].placeholder.label if slots else type(number).__name__
+        raise WrongType(
             f"{show(full(keys, path))} is of type {what}, not a number; read it, calculate, and write it back"
         )
     return number

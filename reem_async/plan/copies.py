@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 from .notices import ANNOUNCED, Notice
 from .paths import Path
 from .trees import MISSING, get, removed, replaced
 
-__all__ = ["applied", "concerns", "is_whole"]
+__all__ = ["Change", "applied", "concerns", "is_whole"]
 
 
-def concerns(notice: Notice, followed: Path) -> bool:
+class Change(Protocol):
+    """As much of an update as tells what it touches."""
+
+    @property
+    def path(self) -> Path:
+        """Where it was made."""
+
+    @property
+    def deleted(self) -> bool:
+        """What was there is gone."""
+
+
+def concerns(notice: Change, followed: Path) -> bool:
     """Return whether an update may change what is at the followed path."""
     for position, (theirs, ours) in enumerate(zip(notice.path, followed, strict=False)):
         if theirs == ours:

@@ -18,13 +18,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 import orjson
 
-from ..errors import BadKey, BadType, BadValue, TooDeep
+from ..errors import BadKey, BadType, BadValue, NotFinite, TooDeep
 from . import placeholders
 from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
-__all__ = ["DEEPEST", "Encoded", "Fits", "Parcel", "encode", "number_text", "plain", "walk"]
+__all__ = ["DEEPEST", "Attachment", "Encoded", "Fits", "encode", "nested_over", "number_text", "plain", "walk"]
 
 DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
@@ -37,12 +37,14 @@ _NOT_BRACKETS = bytes(set(range(256)) - set(b"{}[]"))
 _PLAIN: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__index__, float: float.__float__}
 """How to get at what a subclass holds; its own __str__ and the like may say something else."""
 
+# orjson makes text of dataclasses and datetimes unless it is told to leave them to us; they are refused, or go by ship.
 _OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
+# RedisJSON stores signed integers of 64 bits, and unsigned ones above them; orjson writes just these.
 _LOWEST, _HIGHEST = -(2**63), 2**64 - 1
 
 
 class Fits(Protocol):
-    """Chooses the ship for a value that is not JSON, or None, and describes the parcel."""
+    """Chooses the ship for a value that is not JSON, or None, and describes the attachment."""
 
     def __call__(self, value: Any, /) -> Carrier | None:
         """Return the ship for `value`."""
@@ -59,19 +61,20 @@ class Carrier(Protocol):
         ...
 
 
-class Parcel(NamedTuple):
+class Attachment(NamedTuple):
     """A value that a ship stores under a key of its own."""
 
     suffix: str
     ship: Any
     value: Any
+    size: int
 
 
 class Encoded(NamedTuple):
     """A value ready to be sent: the document's text and what goes by ship."""
 
     text: bytes
-    parcels: tuple[Parcel, ...] = ()
+    attachments: tuple[Attachment, ...] = ()
 
 
 def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
@@ -131,13 +134,15 @@ def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
     return (
         (b"$" in text and placeholders.marked(text))
         or ((b"." in text or b"-" in text or b"+" in text) and may_lose(text))
-        or _may_be_deep(text, value, DEEPEST - above)
+        or nested_over(text, value, DEEPEST - above)
         or _may_be_converted(text, value)
     )
 
 
-def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
-    """Return whether containers are nested over `limit` levels."""
+def nested_over(text: bytes, value: Any, limit: int) -> bool:
+    """Return whether containers in `value`, of which `text` is the JSON, are nested over `limit` levels."""
+    if len(text) < 2 * limit:  # each level takes two brackets
+        return False
     if text.find(b"{", 1) < 0 and text.find(b"[", 1) < 0:
         return limit < 1
     before, after = text[: len(text) // 2], text[len(text) // 2 :]
@@ -151,7 +156,7 @@ def _may_be_deep(text: bytes, value: Any, limit: int) -> bool:
             break
         brackets = stripped
     # What is left are very deep levels, or brackets inside of strings.
-    return bool(brackets) and _levels(value) > limit
+    return bool(brackets) and _levels(value, limit) > limit
 
 
 def _up_to(limit: int, text: bytes, one: bytes, other: bytes) -> bool:
@@ -174,10 +179,10 @@ def _may_be_converted(text: bytes, value: Any) -> bool:
     return (b"\x7f" in dumped or b"\xff" in dumped) and b"null" in text
 
 
-def _levels(value: Any) -> int:
+def _levels(value: Any, limit: int) -> int:
     """Return how deep containers are nested, looking at containers only; stops past the limit."""
     level, depth = [value] if isinstance(value, dict | list | tuple) else [], 0
-    while level and depth <= DEEPEST:
+    while level and depth <= limit:
         depth += 1
         level = [item for each in level for item in _items(each) if isinstance(item, dict | list | tuple)]
     return depth
@@ -187,11 +192,13 @@ def _items(container: Any) -> Iterable[Any]:
     return container.values() if isinstance(container, dict) else container
 
 
-def walk(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
-    """Do as `encode`, with a look at every node."""
-    walker = _Walker(place, fits, name)
+def walk(
+    value: Any, place: Path, fits: Fits, name: Callable[[Path], str], claimed: frozenset[type] = frozenset()
+) -> Encoded:
+    """Do as `encode`, with a look at every node; values of the types `claimed` are offered to ships first."""
+    walker = _AskingWalker(place, fits, name, claimed) if claimed else _Walker(place, fits, name)
     tree = walker.convert(value, ())
-    return Encoded(orjson.dumps(tree), tuple(walker.parcels))
+    return Encoded(orjson.dumps(tree), tuple(walker.attachments))
 
 
 class _Walker:
@@ -202,7 +209,7 @@ class _Walker:
         self._fits = fits
         self._name = name
         self._open: set[int] = set()  # containers being visited: meeting one again is a circle
-        self.parcels: list[Parcel] = []
+        self.attachments: list[Attachment] = []
 
     def convert(self, value: Any, path: Path) -> Any:
         kind = type(value)
@@ -242,6 +249,7 @@ class _Walker:
         return result
 
     def _list(self, value: Sequence[Any], path: Path) -> Any:
+        # Scans and trajectories are such lists: converted together they take a third of the time.
         if len(value) >= _MANY and set(map(type, value)) == {float}:
             for index, item in enumerate(value):
                 if not math.isfinite(item):
@@ -268,10 +276,12 @@ class _Walker:
         return str.__str__(key)
 
     def _other(self, value: Any, path: Path) -> Any:
+        # Ships come before subclasses: whoever wrote one for a subclass of dict wants it to be used.
         ship = self._fits(value)
         if ship is not None:
             return self._parcel(ship, value, path)
-        if isinstance(value, enum.Enum):
+        # An enum that is a str or a number besides is stored as that.
+        if isinstance(value, enum.Enum) and not isinstance(value, str | int | float):
             raise self._refusal(value, path)
         if isinstance(value, np.generic):
             return self._numpy_scalar(value, path)
@@ -293,7 +303,7 @@ class _Walker:
         except (BadType, BadValue) as error:
             raise type(error)(f"{show(self._place + path)}: {error}") from None
         suffix = self._name(path)
-        self.parcels.append(Parcel(suffix, ship, value))
+        self.attachments.append(Attachment(suffix, ship, value, size))
         return str(Placeholder(ship.label, suffix, size, summary))
 
     def _numpy_scalar(self, value: np.generic, path: Path) -> Any:
@@ -312,6 +322,21 @@ class _Walker:
         )
 
 
+class _AskingWalker(_Walker):
+    """Offers what JSON could hold to ships before it becomes JSON."""
+
+    def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str], claimed: frozenset[type]) -> None:
+        super().__init__(place, fits, name)
+        self._claimed = claimed
+
+    def convert(self, value: Any, path: Path) -> Any:
+        ship = self._fits(value) if type(value) in self._claimed else None
+        return self._parcel(ship, value, path) if ship is not None else super().convert(value, path)
+
+    def _list(self, value: Sequence[Any], path: Path) -> Any:
+        return [self.convert(item, (*path, index)) for index, item in enumerate(value)]
+
+
 def _remedy(value: Any) -> str:
     """Return what to do with a value that cannot be stored."""
     import numbers  # whoever stores what can be stored need not wait for it
@@ -326,6 +351,8 @@ def _remedy(value: Any) -> str:
         (np.ndarray, "add NumpyShip() to the interface's ships"),
         ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
     )
+    if (how := getattr(value, "_how_to_read", None)) is not None:
+        return f"it is a handle: store the value there, with {how}"
     anything = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
     return next((text for kinds, text in remedies if isinstance(value, kinds)), anything)
 
@@ -340,7 +367,7 @@ def _check_int(value: int, place: Path) -> int:
 
 def _check_float(value: float, place: Path) -> float:
     if not math.isfinite(value):
-        raise BadValue(f"{show(place)}: {value!r} is not JSON; use None, or a numpy array, which keeps it")
+        raise NotFinite(f"{show(place)}: {value!r} is not JSON; use None, or a numpy array, which keeps it")
     return value
 
 

@@ -60,6 +60,7 @@ def exact_list(values: list[float]) -> list[bytes | None]:
     powers = _POWERS_ARRAY[np.where(usual, places, 0)]
     scaled = array * powers
     usual &= scaled / powers == array
+    # `_places` aims at 53 to 58 bits, so no digits are lost in an int64.
     digits = np.where(usual, scaled, 0.0).astype(np.int64).tolist()
     return [
         b"%de-%d" % (digit, place) if fine else exact_text(value)
@@ -110,6 +111,7 @@ def _search(size: float) -> tuple[int, int] | None:
         scaled = _scale(size, places)
         if not 1 <= scaled < _LIMIT:
             continue
+        # `_scale` rounds too, so the digits that work may be those beside it.
         for near in (scaled, math.nextafter(scaled, 0.0), math.nextafter(scaled, math.inf)):
             digits = int(near)
             if digits < _LIMIT and _as_parsed(digits, -places) == size and float(f"{digits}e{-places}") == size:

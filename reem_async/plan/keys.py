@@ -33,6 +33,11 @@ class Keys(NamedTuple):
     last: str
     publish: str = "PUBLISH"
 
+    @property
+    def sharded(self) -> bool:
+        """Whether it is in a cluster."""
+        return self.publish == "SPUBLISH"
+
 
 @lru_cache(maxsize=4096)
 def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = False) -> Keys:

@@ -7,28 +7,43 @@ announced. What arrives is not trusted: anything unexpected is refused as `BadDa
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import orjson
 
-from ..errors import BadData
+from ..errors import BadData, BadKey, BadType
 from ..ships.registry import Ships
 from . import Command
+from .changes import EncodedAttachment
+from .documents import nested_over
 from .keys import Keys
-from .paths import Path
+from .paths import Path, check_element
 from .placeholders import find, marked
-from .writes import Loaded
+from .slots import Slot, named, starts
 
-__all__ = ["LARGEST_INLINE", "Notice", "announce", "decode", "note_of", "parsed_note", "published", "with_value"]
+__all__ = [
+    "LARGEST_INLINE", "Notice", "View", "announce", "decode", "in_slot", "note_of", "parsed_note", "published",
+    "sizes_of_parts", "with_value",
+]  # fmt: skip
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14
 """Bytes of value up to which it travels in the notice."""
 
 _DEEPEST = 128
+"""Levels of a document that servers take; path and value together have no more."""
 _LONGEST_PATH = 2048
 """Characters; paths are kept for speed, and a stranger may publish any number of them."""
+_LONGEST_PUBLISHER = 64
+"""Characters; publishers are kept too."""
+_MOST = 1 << 53
+"""No counter gets there, and every program that reads JSON has integers up to it."""
+_LATEST = 253_402_300_800
+"""Seconds from 1970 to the year 10000, where calendars end."""
+_LARGEST = 1 << 18
+"""Bytes of a notice: far more than one with LARGEST_INLINE bytes of value and the names of its arrays has."""
 
 ANNOUNCED = object()
 """In place of a value that is to be fetched."""
@@ -45,6 +60,8 @@ class Notice(NamedTuple):
         deleted: It was removed.
         value: The value, or ANNOUNCED.
         size: Bytes of the value, document text and arrays; 0 where only the server knows (arithmetic).
+        slot: Where a large value is in the publisher's memory too; None if it is not.
+        early: This was told before the server had the update.
     """
 
     publisher: str
@@ -54,6 +71,12 @@ class Notice(NamedTuple):
     deleted: bool
     value: Any
     size: int = 0
+    slot: Slot | None = None
+    early: bool = False
+
+
+View = Callable[[Slot, int], "memoryview | None"]
+"""Returns the first bytes of a slot, so many, read-only; None if they are not to be had."""
 
 
 def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, everywhere: bool = False) -> list[Command]:
@@ -85,17 +108,44 @@ def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted:
     return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], size)
 
 
-def with_value(publisher: str, sequence: int, time: float, path: Path, text: bytes, loaded: Sequence[Loaded]) -> bytes:
+def in_slot(
+    publisher: str,
+    sequence: int,
+    time: float,
+    path: Path,
+    slot: Slot,
+    text: bytes,
+    attachments: Sequence[EncodedAttachment],
+) -> bytes:
+    """Return a notice that says where the value is in the publisher's memory; to others it is one without value.
+
+    So it is to all, if it would be too long: of thousands of arrays.
+    """
+    sizes = sizes_of_parts(text, attachments)
+    parts: list[Any] = [[*slot, sizes[0]]]
+    parts += [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
+    notice = _header(publisher, sequence, time, path, "look", parts, sum(sizes))
+    return notice if len(notice) <= LARGEST_INLINE else announce(publisher, sequence, time, path, size=sum(sizes))
+
+
+def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> list[int]:
+    """Return the bytes of what a slot holds of an update: the text of the document, then each attachment."""
+    return [len(text), *(sum([len(piece) for piece in each.blob or ()]) for each in attachments)]
+
+
+def with_value(
+    publisher: str, sequence: int, time: float, path: Path, text: bytes, attachments: Sequence[EncodedAttachment]
+) -> bytes:
     """Return a notice with the value if it is small and made of bytes, else without."""
     size, travels = len(text), True
-    for each in loaded:
+    for each in attachments:
         size += sum([len(piece) for piece in each.blob or ()])
         travels = travels and each.blob is not None
     if size > LARGEST_INLINE or not travels:
         return announce(publisher, sequence, time, path, size=size)
     parts: list[Any] = []
     blobs: list[bytes] = []
-    for each in loaded:
+    for each in attachments:
         blobs.append(b"".join(each.blob or ()))
         parts.append([each.label, each.suffix, len(blobs[-1])])
     return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
@@ -105,63 +155,121 @@ def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, p
     return orjson.dumps([VERSION, publisher, sequence, time, path, kind, size, parts]) + b"\n"
 
 
-def decode(payload: bytes, ships: Ships) -> Notice:
-    """Return the notice in `payload`.
+def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
+    """Return the notice in `payload`; its value may be looked at in the publisher's memory, if there is a `view`.
 
     Raises:
         BadData: Not a notice of REEM, or one of a version this program does not know.
     """
+    if len(payload) > _LARGEST:
+        raise BadData(f"a notice has {len(payload)} bytes, REEM's have at most {_LARGEST}; it was not written by REEM")
     end = payload.find(b"\n")
     try:
         version, publisher, sequence, time, path, kind, size, parts = orjson.loads(payload[: max(end, 0)])
     except (orjson.JSONDecodeError, ValueError, TypeError):
         raise BadData(f"a notice begins with {payload[:60]!r}, which is not REEM's") from None
     _check(version, publisher, sequence, time, path, kind, size, parts)
-    value: Any = ANNOUNCED
+    place, value, slot = _path(path), ANNOUNCED, None
     if kind == "set":
-        value = _value(payload, end + 1, size, parts, ships)
+        value = _value(payload, end + 1, size, parts, ships, _DEEPEST - len(place))
         size = len(payload) - end - 1
-    return Notice(publisher, sequence, float(time), tuple(path), kind == "delete", value, size)
+    elif parts and kind == "look" and (found := named(parts[0])) is not None:
+        slot, text_size = found
+        if view is not None:
+            value = _value_in(slot, text_size, parts[1:], view, ships, _DEEPEST - len(place))
+    return Notice(publisher, sequence, float(time), place, kind == "delete", value, size, slot)
 
 
 def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, kind: Any, size: Any, parts: Any) -> None:
     if version != VERSION:
-        raise BadData(f"a notice has version {version!r}; this program knows {VERSION}: update reem")
+        raise BadData(f"a notice has version {version!r:.40}; this program knows {VERSION}: update reem")
     sound = (
         type(publisher) is str
+        and 0 < len(publisher) <= _LONGEST_PUBLISHER
         and type(sequence) is int
+        and 0 < sequence < _MOST
         and type(time) in (int, float)
+        and 0 <= time < _LATEST
         and type(path) is list
-        and (not path or _is_path(path))
         and kind in ("set", "look", "delete")
         and type(size) is int
-        and size >= 0
+        and 0 <= size < _MOST
         and type(parts) is list
     )
     if not sound:
-        raise BadData("a notice has fields of wrong types; it was not written by REEM")
+        raise BadData("a notice has fields of wrong types or out of range; it was not written by REEM")
 
 
-def _is_path(path: list[Any]) -> bool:
-    return (
-        len(path) <= _DEEPEST
-        and all(type(key) in (str, int) for key in path)
-        and sum([len(key) for key in path if type(key) is str]) <= _LONGEST_PATH
-    )
-
-
-def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships) -> Any:
-    """Return the value a notice carries: the tree, with what the ships make of their fields."""
-    text, position = payload[start : start + size], start + size
-    replies: dict[tuple[str, str], Any] = {}
+def _path(path: list[Any]) -> Path:
+    """Return the path in a notice; raises BadData for one that nobody can have written to."""
+    if not path:
+        return ()
     try:
-        for label, suffix, length in parts:
-            blob = payload[position : position + length]
-            position += length
-            replies[label, suffix] = ships.labelled(label, "an update").ship.interpret_read([blob])
-        holder = [orjson.loads(text)]
-        for crate in find(holder, "a notice: ") if marked(text) else ():
-            crate.container[crate.key] = replies[crate.placeholder.label, crate.placeholder.suffix]
+        return _sound_path(tuple(path))
+    except (TypeError, BadType, BadKey):
+        raise BadData(f"a notice has the path {path!r:.60}, which cannot be; it was not written by REEM") from None
+
+
+@lru_cache(maxsize=4096)
+def _sound_path(path: tuple[Any, ...]) -> Path:
+    """Return `path` if something can be there.
+
+    Of paths that are equal, such as (1,) and (1.0,), only a sound one is remembered: so it is returned for the others.
+    """
+    if len(path) >= _DEEPEST or sum([len(key) for key in path if type(key) is str]) > _LONGEST_PATH:
+        raise BadKey("too long")
+    for key in path:
+        if type(key) not in (str, int) or check_element(key, ()) != key:
+            raise BadType("neither a key nor an index")
+    return path
+
+
+def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships, deepest: int) -> Any:
+    """Return the value a notice carries."""
+    position, blobs = start + size, []
+    try:
+        for _, _, length in parts:
+            blobs.append(payload[position : position + length])
+            position += len(blobs[-1])
+            if len(blobs[-1]) != length:
+                raise BadData(f"of an array of {length} bytes there are {len(blobs[-1])}")
+        if position != len(payload):
+            raise BadData("its parts have other sizes than it says")
+        return _rebuilt(payload[start : start + size], parts, blobs, ships, deepest)
     except Exception as error:  # a ship may raise anything over bytes that are not its own
-        raise BadData(f"a notice holds a value that cannot be rebuilt: {error}") from None
+        raise BadData(f"a notice holds a value that cannot be rebuilt: {error!s:.200}") from None
+
+
+def _value_in(slot: Slot, size: int, parts: list[Any], view: View, ships: Ships, deepest: int) -> Any:
+    """Return the value that is in a slot; ANNOUNCED if it is not to be had there, for whatever reason."""
+    try:
+        sizes = [size, *(length for _, _, length in parts)]
+        if not all(type(length) is int and 0 <= length < _MOST for length in sizes):
+            return ANNOUNCED
+        begins = starts(sizes)
+        content = view(slot, begins[-1])
+        if content is None:
+            return ANNOUNCED
+        blobs = [content[start : start + length] for start, length in zip(begins[1:-1], sizes[1:], strict=True)]
+        return _rebuilt(bytes(content[:size]), parts, blobs, ships, deepest)
+    except Exception:  # a stranger's memory: the server has what is true
+        return ANNOUNCED
+
+
+def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deepest: int) -> Any:
+    """Return the tree, with what the ships make of their fields; raises anything over what is not REEM's.
+
+    It is ANNOUNCED if a ship of this interface has to be awaited, or reads in another way than the publisher's wrote.
+    """
+    replies: dict[tuple[str, str], Any] = {}
+    for (label, suffix, _), blob in zip(parts, blobs, strict=True):
+        ship = ships.labelled(label, "an update").blob
+        if ship is None:
+            return ANNOUNCED
+        replies[label, suffix] = ship.unpack(blob)
+    holder = [orjson.loads(text)]
+    if nested_over(text, holder[0], deepest):
+        raise BadData(f"path and value are nested over {_DEEPEST} levels")
+    for slot in find(holder, "a notice: ") if marked(text) else ():
+        slot.container[slot.key] = replies[slot.placeholder.label, slot.placeholder.suffix]
     return holder[0]

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any
 
-from ..errors import WrongKind
-from . import Command, Plan, Reply
+from ..errors import BadKey, WrongKind
+from . import Command, Plan, Reply, blamed
 from .keys import Keys
-from .memory import Memory
-from .paths import Path
+from .paths import Path, below, parse_suffix
 from .placeholders import find
 from .reads import get_command
 from .replies import explained, loads, registered
+from .shapes import ShapeCache
 from .staging import Staged
 
-__all__ = ["clean", "survey", "unreferred", "watch"]
+__all__ = ["clean", "left_behind", "permitted", "place_of", "survey", "unreferred", "watch"]
 
 
 def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
     """Return the command after which a transaction fails if document or registry, or what is coming, has changed."""
     return ("WATCH", keys.document, keys.registry, *(each.name for each in coming))
+
+
+def permitted(reply: Reply, *names: str) -> None:
+    """Raise what a reply to the WATCH of `names` means if it is an error: nothing would be watched."""
+    if isinstance(reply, Exception):
+        raise blamed(reply, ("WATCH", " ".join(names)))
 
 
 def survey(keys: Keys, path: Path) -> tuple[Command, ...]:
@@ -36,6 +42,8 @@ def unreferred(replies: Sequence[Reply], keys: Keys) -> tuple[bytes, ...] | None
     whole, part, members = replies
     if isinstance(whole, Exception) or isinstance(part, Exception):
         return None
+    # A suffix that stands both inside and outside of the part cannot be: `find` refuses a document that names one
+    # twice.
     kept = _referred(whole, keys) - _referred(part, keys)
     return tuple(sorted(registered(members, keys) - kept))
 
@@ -44,16 +52,20 @@ def _referred(text: Reply, keys: Keys) -> set[bytes]:
     """Return the suffixes that a reply to JSON.GET refers to."""
     if text is None or text == b"[]":
         return set()
-    return {crate.placeholder.suffix.encode() for crate in find(loads(text, keys), keys.name)}
+    return {slot.placeholder.suffix.encode() for slot in find(loads(text, keys), keys.name)}
 
 
-def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
+def clean(
+    keys: Keys, cache: ShapeCache, then: Callable[[], Any], unfinished: Callable[[Exception], Exception] | None = None
+) -> Plan:
     """Plan to remove the ships' keys that the document does not refer to, then go on with `then`.
 
     Looks and removes under WATCH: if anybody writes to the document in between, it looks again.
+    `unfinished` makes the error to raise from the one that kept it from that.
     """
 
     def look(replies: Sequence[Reply]) -> Any:
+        permitted(replies[0], keys.document, keys.registry)
         text = replies[1]
         if isinstance(text, Exception):
             if not isinstance(explained(text, keys, ()), WrongKind):  # nobody knows what the document refers to
@@ -61,17 +73,33 @@ def clean(keys: Keys, memory: Memory, then: Callable[[], Any]) -> Plan:
             text = None  # a foreign type refers to nothing
         members = registered(replies[2], keys)
         orphans = sorted(members - _referred(text, keys))
-        memory.saw_members(keys.document, members)
+        cache.saw_members(keys.document, members)
         if not orphans:
             return Plan([("UNWATCH",)], lambda _: then(), held=True)
         tag = keys.tag.encode()
         removal = [("UNLINK", *(tag + orphan for orphan in orphans)), ("SREM", keys.registry, *orphans)]
-        return Plan(removal, lambda replies: remove(replies, members - frozenset(orphans)), atomic=True, held=True)
+        left = members - frozenset(orphans)
+        return Plan(removal, lambda replies: remove(replies, left), atomic=True, held=True, unfinished=unfinished)
 
     def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
+        # Somebody wrote to the document since the look: what it refers to may be something else now.
         if replies is None:
-            return clean(keys, memory, then)
-        memory.saw_members(keys.document, left)
+            return clean(keys, cache, then, unfinished)
+        cache.saw_members(keys.document, left)
         return then()
 
-    return Plan([watch(keys), get_command(keys, ()), ("SMEMBERS", keys.registry)], look, held=True)
+    commands = [watch(keys), get_command(keys, ()), ("SMEMBERS", keys.registry)]
+    return Plan(commands, look, held=True, unfinished=unfinished)
+
+
+def place_of(member: bytes) -> Path:
+    """Return where a member of the registry belongs; what REEM did not enter there belongs to no place."""
+    try:
+        return parse_suffix(member.decode())
+    except (BadKey, UnicodeDecodeError):
+        return ("\0",)
+
+
+def left_behind(known: Iterable[bytes], path: Path, written: Collection[bytes]) -> list[bytes]:
+    """Return the known keys that belong at `path`, which leads through no list, and are not written there again."""
+    return [member for member in known if member not in written and below(place_of(member), path)]

@@ -13,20 +13,27 @@ from functools import lru_cache
 
 import orjson
 
-from ..errors import BadKey, BadType
+from ..errors import BadKey, BadType, BadValue
 
 __all__ = [
-    "Path", "below", "check_element", "check_top_key", "counts_from_end", "has_index", "may_hold", "parse",
-    "parse_suffix", "show", "suffix", "to_jsonpath",
+    "LONGEST_TOP_KEY", "Path", "below", "check_element", "check_name", "check_namespace", "check_top_key",
+    "counts_from_end", "has_index", "is_namespace", "may_hold", "parse", "parse_suffix", "shorten", "show", "suffix",
+    "to_jsonpath",
 ]  # fmt: skip
 
 Path = tuple[str | int, ...]
 
 LONGEST_TOP_KEY = 512
-"""Bytes a top-level key may have in UTF-8."""
+"""Bytes that a top-level key may have in UTF-8, the namespace before it included."""
+
+_LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1
+"""Beyond, RedisJSON panics, and the server ends."""
 
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
+# Three kinds of steps: `.key`, `[0]`, and `["any text"]`, quoted as in JSON. The dot before a key may be missing.
 _TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"~]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)
+
+_LIKE_A_PATH = re.compile(r"""[.\[\]"]""")
 
 _TYPED = re.compile(_TOKEN.pattern.replace("~", ""), re.DOTALL)  # `~` is only special in names on the server
 
@@ -36,26 +43,62 @@ def check_element(key: object, parent: Path) -> str | int:
 
     Raises:
         BadType: Neither a str nor an int.
-        BadKey: A str that the server's paths cannot address.
+        BadKey: A str that the server's paths cannot address, or an int of more than 64 bits.
     """
     if isinstance(key, enum.Enum):
         raise BadKey(f"{show(parent)}: {shorten(key)} is an enum; use its .value")
     if isinstance(key, str):
-        if "\\" in key or ('"' in key and "'" in key) or not _encodable(key):
+        # RedisJSON skips spaces after an opening quote: " x" would name "x".
+        if key.startswith(" ") or "\\" in key or ('"' in key and "'" in key) or not _encodable(key):
             raise BadKey(
-                f"{show(parent)}: the key {shorten(key)} cannot be addressed by a path (it has a backslash, "
-                "both kinds of quotes, or half a surrogate pair); read or write the dict that holds it instead"
+                f"{show(parent)}: the key {shorten(key)} cannot be addressed by a path (it begins with a space, or has "
+                "a backslash, both kinds of quotes, or half a surrogate pair); read or write the dict that holds it"
             )
         return key if type(key) is str else str.__str__(key)
     if isinstance(key, bool) or not hasattr(key, "__index__"):
         raise BadType(
             f"{show(parent)}: {shorten(key)} ({type(key).__name__}) is neither a key (str) nor a list index (int)"
         )
-    return int(key.__index__())
+    index = int(key.__index__())
+    if not _LOWEST_INDEX <= index <= _HIGHEST_INDEX:
+        raise BadKey(f"{show(parent)}: no list has an item {shorten(index)}; indexes have 64 bits")
+    return index
 
 
-def check_top_key(key: object) -> str:
-    """Return `key` if it can name a top-level entry, else raise BadKey."""
+def check_name(key: object, parent: Path) -> str:
+    """Return `key` if it can be a key of the dict at `parent`; raises BadKey."""
+    if not isinstance(key, str):
+        raise BadKey(f"{show(parent)}: the keys of a dict are str, not {shorten(key)} ({type(key).__name__})")
+    return str(check_element(key, parent))
+
+
+def check_namespace(namespace: object) -> str:
+    """Return `namespace` if it can go before top-level keys, else raise.
+
+    Raises:
+        BadType: Not a str, or one with braces.
+        BadValue: It does not end with a separator, so that it would meet with others, or cannot be sent.
+    """
+    if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
+        raise BadType(f"the namespace {shorten(namespace)} is not a str without braces")
+    if not is_namespace(namespace):
+        raise BadValue(
+            f"the namespace {shorten(namespace)} does not end with a separator, so its keys would be mixed with those "
+            f"of namespaces that begin with it (the key '0pose' of 'robot1' is the key 'pose' of 'robot10'); "
+            f"write {shorten(namespace + ':')}"
+        )
+    if not _encodable(namespace) or len(namespace.encode()) >= LONGEST_TOP_KEY:
+        raise BadValue(f"the namespace {shorten(namespace)} is not UTF-8, or leaves no room for keys; shorten it")
+    return namespace
+
+
+def is_namespace(text: str) -> bool:
+    """Return whether `text` may go before keys: it is empty, or ends with a separator, no letter or digit."""
+    return not text[-1:].isalnum()
+
+
+def check_top_key(key: object, room: int = LONGEST_TOP_KEY) -> str:
+    """Return `key` if it can name a top-level entry and has at most `room` bytes, else raise BadKey."""
     if not isinstance(key, str) or isinstance(key, enum.Enum):
         raise BadKey(f"the top-level key {shorten(key)} is not a str; use str(key)")
     key = str.__str__(key)
@@ -63,8 +106,9 @@ def check_top_key(key: object) -> str:
         raise BadKey("the top-level key is empty; give it a name")
     if "{" in key or "}" in key:
         raise BadKey(f"the top-level key {shorten(key)} has a brace; Redis Cluster uses them to place keys")
-    if not _encodable(key) or len(key.encode()) > LONGEST_TOP_KEY:
-        raise BadKey(f"the top-level key {shorten(key)} is over {LONGEST_TOP_KEY} bytes or not UTF-8; shorten it")
+    if not _encodable(key) or len(key.encode()) > room:
+        beside = "" if room == LONGEST_TOP_KEY else f" ({LONGEST_TOP_KEY} with its namespace)"
+        raise BadKey(f"the top-level key {shorten(key)} is over {room} bytes{beside} or not UTF-8; shorten it")
     return key
 
 
@@ -89,15 +133,21 @@ def shorten(value: object, limit: int = 60) -> str:
 def to_jsonpath(path: Path) -> str:
     """Return the JSONPath below the document's root, every element quoted: `$["a"][0]`.
 
-    The server takes what stands between the quotes as it is, so nothing is escaped; `check_element`
-    has refused what could end the quotes early.
+    The server takes what stands between the quotes as it is, so nothing is escaped; what could end the
+    quotes early is refused here too: paths also come from notices, which anybody may have published.
+
+    Raises:
+        BadKey: The server's paths cannot address it.
     """
-    return "$" + "".join(_bracket(key) for key in path)
+    return "$" + "".join(_bracket(check_element(key, path[:place])) for place, key in enumerate(path))
 
 
 def _bracket(key: str | int) -> str:
     if isinstance(key, int):
-        return f"[{key}]"
+        # The server takes an index that is too negative for the first item, but not such a slice.
+        return f"[{key}]" if key >= -1 else f"[{key}:{key + 1}]"
+    # RedisJSON knows no escapes inside of quotes, so the kind of quotes is chosen by the key; `check_element` refuses
+    # both.
     return f"['{key}']" if '"' in key else f'["{key}"]'
 
 
@@ -162,15 +212,22 @@ def parse(text: str) -> Path:
         raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
     if text in ("", "."):
         return ()
-    found = _split(text, _TYPED) if text[0] in ".[" else _split("." + text, _TYPED, 1)
-    return tuple(check_element(key, ()) for key in found)
+    if text[0] in ".[":
+        return tuple(check_element(key, ()) for key in _split(text, _TYPED))
+    top, *rest = _split("." + text, _TYPED, 1)
+    # Any text may be a top-level key.
+    return (top, *(check_element(key, (top,)) for key in rest))
 
 
 def show(path: Path) -> str:
-    """Return a full path, top-level key first, the way people write it: `foo.bar[0]`."""
+    """Return a full path, top-level key first, the way people write it: `foo.bar[0]`.
+
+    A top-level key that would be read as a path is quoted, as others are: `["m.a"].x`.
+    """
     if not path:
         return "(root)"
-    return str(path[0]) + suffix(path[1:])
+    top = str(path[0])
+    return (_step(top) if _LIKE_A_PATH.search(top) else top) + suffix(path[1:])
 
 
 @lru_cache(maxsize=4096)

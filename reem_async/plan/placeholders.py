@@ -15,6 +15,7 @@ user's string that begins with the mark, `float` for a float no decimal text of 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 from urllib.parse import quote, unquote
@@ -23,7 +24,16 @@ from ..errors import BadData
 from .paths import Path, shorten, suffix
 
 __all__ = [
-    "INLINE_LABELS", "MARK", "Crate", "Placeholder", "find", "inline_float", "inline_text", "marked", "parse",
+    "INLINE_LABELS",
+    "MARK",
+    "Placeholder",
+    "Slot",
+    "Unfetched",
+    "find",
+    "inline_float",
+    "inline_text",
+    "marked",
+    "parse",
 ]  # fmt: skip
 
 MARK = "$ship "
@@ -50,6 +60,23 @@ class Placeholder(NamedTuple):
         return _written(self)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Unfetched:
+    """An array, or another value that a ship carries, that was left at the server: what the document says of it.
+
+    Two are equal only if they are the same object, which stands for one state of what is at the server.
+
+    Attributes:
+        label: The ship's label: "numpy", "bytes".
+        size: Bytes of the value, 0 where the ship does not say.
+        summary: What it is, for people: `float64[640,480,3]`.
+    """
+
+    label: str
+    size: int
+    summary: str
+
+
 @lru_cache(maxsize=4096)
 def _written(it: Placeholder) -> str:
     words = [MARK[:-1], quote(it.label, safe=_SAFE), quote(it.suffix, safe=_SAFE), str(it.size)]
@@ -60,7 +87,7 @@ def _written(it: Placeholder) -> str:
 _SAFE = "".join(chr(code) for code in range(33, 127) if chr(code) != "%")
 
 
-class Crate(NamedTuple):
+class Slot(NamedTuple):
     """A placeholder found in a decoded tree, and where: `container[key]` is to be replaced."""
 
     placeholder: Placeholder
@@ -93,6 +120,7 @@ def _parse(text: str) -> Placeholder | str | float:
         return rest
     if label == "float":
         return _parse_float(rest)
+    # 18 digits are below 2**63: a stranger's number must not become a large int of Python.
     words = rest.split(" ", 2)
     if not label or len(words) < 2 or not words[1].isascii() or not words[1].isdigit() or len(words[1]) > 18:
         raise BadData(f"the server holds {shorten(text)}, which looks like a placeholder of REEM but is none")
@@ -119,7 +147,7 @@ def marked(text: bytes) -> bool:
     return b"$" in text and _MARK_BYTES in text
 
 
-def find(holder: list[Any], name: str) -> list[Crate]:
+def find(holder: list[Any], name: str) -> list[Slot]:
     """Resolve what stands in place inside `holder` and return the placeholders that are left.
 
     `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
@@ -129,11 +157,12 @@ def find(holder: list[Any], name: str) -> list[Crate]:
         BadData: A string has the mark but is no placeholder, or two stand for the same key: a document of a
             few bytes could demand any number of copies. Says where, below the top-level key `name`.
     """
-    crates: list[Crate] = []
+    slots: list[Slot] = []
     stack: list[Any] = [holder]
     while stack:
         container = stack.pop()
         for key, value in container.items() if type(container) is dict else enumerate(container):
+            # A stack and not recursion: what a stranger wrote may be nested deeper than Python calls may.
             kind = type(value)
             if kind is dict or kind is list:
                 stack.append(value)
@@ -143,12 +172,13 @@ def find(holder: list[Any], name: str) -> list[Crate]:
                 except BadData as error:
                     raise BadData(f"{name}{_place(holder[0], value)}: {error}") from None
                 if type(meaning) is Placeholder:
-                    crates.append(Crate(meaning, container, key))
+                    slots.append(Slot(meaning, container, key))
                 else:
                     container[key] = meaning
-    if len(crates) > 1 and len({crate.placeholder.suffix for crate in crates}) < len(crates):
+    # A set only where there are several: most documents with arrays have one or two.
+    if len(slots) > 1 and len({slot.placeholder.suffix for slot in slots}) < len(slots):
         raise BadData(f"{name}: several placeholders name the same key, which REEM does not write; write it anew")
-    return crates
+    return slots
 
 
 def _place(tree: Any, text: str) -> str:

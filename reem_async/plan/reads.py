@@ -7,45 +7,68 @@ read is done again with what they name: a mixture is never returned.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from ..errors import BadData, Conflict, WrongKind
+from ..errors import BadData, Conflict, MissingDocument, MissingKey, WrongKind, WrongType
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
-from .memory import Memory
 from .paths import Path, show, to_jsonpath
-from .placeholders import Crate, Placeholder, find, marked
+from .placeholders import Placeholder, Slot, Unfetched, find, marked
 from .replies import checked, explained, full, loads, missing, type_name
+from .shapes import ShapeCache
 from .sizes import LARGE
+from .trees import MISSING
 
-__all__ = ["Sealed", "length", "read", "type_of"]
+__all__ = [
+    "HeldValues",
+    "RawRead",
+    "count_in",
+    "entries_command",
+    "exists",
+    "has_key",
+    "keys_at",
+    "length",
+    "nothing",
+    "read",
+    "type_of",
+]
 
+# Reads of a document whose arrays come and go faster than it is read. Each takes a round trip of about 0.1 ms, so 50
+# are far more than any program needs, and no writer keeps a reader for ever.
 _TRIES = 50
 
+HeldValues = Mapping[tuple[str, str], Any]
+"""Values that ships made of attachments, by label and suffix, which are what the server has."""
 
-class Sealed(NamedTuple):
+_NOTHING: HeldValues = {}
+
+
+class RawRead(NamedTuple):
     """What a read brought, ships' replies not yet interpreted.
 
     Attributes:
-        holder: A list of one: the tree, with placeholders where `crates` says.
+        holder: A list of one: the tree, with placeholders where `slots` says.
         name: The top-level key.
-        crates: Where each ship's value goes, the ship, and the reply to interpret.
+        slots: Where each ship's value goes, the ship, and the reply to interpret.
         commands: What was asked in the end, and
         raw: what was received for it, to tell later whether anything changed.
         also: The replies to what was asked besides, if it was asked for.
+        left: What stands in the tree for attachments that were left at the server, by label and suffix.
     """
 
     holder: list[Any]
     name: str
-    crates: list[tuple[Crate, Registered, Reply]]
+    slots: list[tuple[Slot, Registered, Reply]]
     commands: tuple[Command, ...]
     raw: tuple[Any, ...]
     also: tuple[Any, ...] = ()
+    left: Mapping[tuple[str, str], Unfetched] = {}
 
 
-def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
+def interpret(name: str, slot: Slot, ship: Registered, reply: Reply) -> Any:
     """Return what the ship makes of a reply: the value, or something to await.
 
     Raises:
@@ -54,14 +77,15 @@ def interpret(name: str, crate: Crate, ship: Registered, reply: Reply) -> Any:
     try:
         return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
-        raise BadData(f"{name}{crate.placeholder.suffix.partition('~')[0]}: {error}") from None
+        raise BadData(f"{name}{slot.placeholder.suffix.partition('~')[0]}: {error}") from None
     except Exception as error:
-        where = f"{name}{crate.placeholder.suffix.partition('~')[0]}"
+        where = f"{name}{slot.placeholder.suffix.partition('~')[0]}"
         raise BadData(f"{where}: the ship {ship.label!r} could not make a value of it: {error!r}") from error
 
 
 def _plain(reply: Reply) -> Reply:
     """Return a reply as redis-py would: large strings are bytes there, not bytearrays."""
+    # The transport reads large strings into a bytearray, without a copy. Ships of users know redis-py's bytes only.
     if isinstance(reply, bytearray):
         return bytes(reply)
     if isinstance(reply, list):
@@ -76,70 +100,109 @@ def get_command(keys: Keys, path: Path) -> Command:
     return ("JSON.GET", keys.document, to_jsonpath(path))
 
 
-def read(keys: Keys, path: Path, ships: Ships, memory: Memory, also: tuple[Command, ...] = ()) -> Plan:
-    """Plan to read the value at `path`; the result is `Sealed`, or MissingKey is raised.
+def read(
+    keys: Keys,
+    path: Path,
+    ships: Ships,
+    cache: ShapeCache,
+    also: tuple[Command, ...] = (),
+    held: HeldValues = _NOTHING,
+    largest: float = math.inf,
+) -> Plan:
+    """Plan to read the value at `path`; the result is `RawRead`, or MissingKey is raised.
 
-    What is asked `also` goes into the transaction, where there is one. One round trip, if the arrays
-    there are those the last read met; else two or more.
+    What is asked `also` is of the same instant, in one transaction; then that nothing is there is no error: the
+    result holds MISSING. One round trip, if the arrays there are those the last read met; else two or more.
+
+    Attachments that are `held` are not fetched. Which these are is looked at again as the reply is decoded: what has
+    left `held` by then is fetched in another round trip. Attachments of more than `largest` bytes are not fetched:
+    an `Unfetched` is in the tree, the same as in `held` if that has one; their keys are only touched.
     """
-    known = memory.layout(keys.document, path)
+    # States of a read: without a guess it asks for the document alone, and is done if there are no placeholders in it.
+    # Else `_Fetch` asks for document and arrays in one transaction, until the placeholders are those that were asked
+    # for.
+    known = cache.layout(keys.document, path)
     if known:
-        return _Fetch(keys, path, ships, memory, known, also).plan()
+        return _Fetch(keys, path, ships, cache, known, also, held, largest).plan()
 
     command = get_command(keys, path)
 
     def decode(replies: Sequence[Reply]) -> Any:
-        text = present(replies[0], keys, path)
+        text = _found(replies[0], keys, path, bool(also))
+        # Only where a note is asked for besides: a follower wants to know that nothing is there, and as of when.
+        if text is None:
+            return RawRead([MISSING], keys.name, [], (command,), (None,), tuple(replies[1:]))
         holder = loads(text, keys)
-        crates = find(holder, keys.name) if marked(text) else []
-        if not crates:
-            return Sealed(holder, keys.name, [], (command,), (text,))
-        met = tuple(crate.placeholder for crate in crates)
-        return _Fetch(keys, path, ships, memory, met, also).plan()
+        slots = find(holder, keys.name) if marked(text) else []
+        if not slots:
+            return RawRead(holder, keys.name, [], (command,), (text,), tuple(replies[1:]))
+        met = tuple(slot.placeholder for slot in slots)
+        return _Fetch(keys, path, ships, cache, met, also, held, largest).plan()
 
-    return Plan([command], decode)
+    return Plan([command, *also], decode, atomic=bool(also))
+
+
+def _found(reply: Reply, keys: Keys, path: Path, may_lack: bool) -> bytes | None:
+    """Return the text of a reply to JSON.GET; None if nothing is there and that `may` be."""
+    try:
+        return present(reply, keys, path)
+    except MissingKey:
+        if may_lack:
+            return None
+        raise
 
 
 def present(reply: Reply, keys: Keys, path: Path) -> bytes:
     """Return the text of a reply to JSON.GET; raise MissingKey if there is nothing."""
     text: bytes | None = reply if type(reply) is bytes else checked(reply, keys, path)
+    # nil: there is no document. An empty list: there is one, and nothing at the path.
     if text is None or text == b"[]":
-        raise missing(keys, path)
+        raise missing(keys, path, text)
     return text
 
 
 class _Fetch:
     """Reads document and ships' keys in one transaction, again if the guess was wrong."""
 
-    __slots__ = ("also", "keys", "memory", "path", "ships", "tries", "wanted")
+    __slots__ = ("also", "cache", "held", "keys", "largest", "path", "ships", "tries", "wanted")
 
     def __init__(
         self,
         keys: Keys,
         path: Path,
         ships: Ships,
-        memory: Memory,
+        cache: ShapeCache,
         wanted: tuple[Placeholder, ...],
         also: tuple[Command, ...] = (),
+        held: HeldValues = _NOTHING,
+        largest: float = math.inf,
     ) -> None:
+        self.held = held
+        self.largest = largest
         self.keys = keys
         self.path = path
         self.ships = ships
-        self.memory = memory
+        self.cache = cache
         self.wanted = wanted
         self.also = also
         self.tries = 0
 
     def plan(self) -> Plan:
         where = show(full(self.keys, self.path))
-        asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in self.wanted}
-        self.memory.saw_layout(self.keys.document, self.path, self.wanted)
+        lacking = [each for each in self.wanted if (each.label, each.suffix) not in self.held]
+        fetched = [each for each in lacking if each.size <= self.largest]
+        asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in fetched}
+        left = {(each.label, each.suffix) for each in lacking if each.size > self.largest}
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
-        commands = (get_command(self.keys, self.path), *reads, *self.also)
-        bulk = sum(each.size for each in self.wanted) >= LARGE
+        # Read-only, and enough for CLIENT TRACKING: the server tells of changes to keys that were read, whatever the
+        # command.
+        touches = [("TYPE", self.keys.tag + suffix) for _, suffix in left]
+        commands = (get_command(self.keys, self.path), *reads, *touches, *self.also)
+        # By the sizes in the placeholders of the last read; a wrong one only chooses the other connection.
+        bulk = sum(each.size for each in fetched) >= LARGE
         return Plan(
             commands,
-            lambda replies: self._decode(asked, commands, replies),
+            lambda replies: self._decode(asked, left, commands, replies),
             atomic=True,
             bulk=bulk,
         )
@@ -147,30 +210,46 @@ class _Fetch:
     def _decode(
         self,
         asked: dict[tuple[str, str], Registered],
+        left: set[tuple[str, str]],
         commands: tuple[Command, ...],
         replies: Sequence[Reply],
     ) -> Any:
-        text = present(replies[0], self.keys, self.path)
+        end = 1 + len(asked) + len(left)
+        text = _found(replies[0], self.keys, self.path, bool(self.also))
+        if text is None:
+            return RawRead([MISSING], self.keys.name, [], commands, (None,), tuple(replies[end:]))
         holder = loads(text, self.keys)
-        crates = find(holder, self.keys.name)
-        met = tuple(crate.placeholder for crate in crates)
-        end = 1 + len(asked)
-        got = dict(zip(asked, replies[1:end], strict=True))
-        if any((each.label, each.suffix) not in got for each in met):
+        slots = find(holder, self.keys.name)
+        met = tuple(slot.placeholder for slot in slots)
+        got = dict(zip(asked, replies[1:], strict=False))
+        places = [(each.label, each.suffix) for each in met]
+        # Left at the server: by its size now, which may be another one than when it was asked for.
+        touched = {place for place, each in zip(places, met, strict=True) if each.size > self.largest} & (
+            left | got.keys()
+        )
+        # A placeholder of which nothing was asked: the document was changed since the last read. What came is thrown
+        # away, since arrays of a later instant do not belong to it.
+        if any(place not in got and place not in self.held and place not in touched for place in places):
             return self._again(met)
-        if met != self.wanted:
-            self.memory.saw_layout(self.keys.document, self.path, met)
-        crated = [
-            (crate, asked[place], self._intact(got[place], place[1]))
-            for crate in crates
-            for place in [(crate.placeholder.label, crate.placeholder.suffix)]
-        ]
-        return Sealed(holder, self.keys.name, crated, commands, (text, *replies[1:end]), tuple(replies[end:]))
+        # Only now: a guess that was wrong must not be remembered.
+        self.cache.saw_layout(self.keys.document, self.path, met)
+        placed, unfetched = [], {}
+        for slot, place in zip(slots, places, strict=True):
+            if place in got and place not in touched:
+                placed.append((slot, asked[place], self._intact(got[place], place[1])))
+            elif place in touched:
+                it = slot.placeholder
+                slot.container[slot.key] = unfetched[place] = Unfetched(it.label, it.size, it.summary)
+            else:
+                slot.container[slot.key] = self.held[place]
+        raw = (text, *replies[1:end])
+        return RawRead(holder, self.keys.name, placed, commands, raw, tuple(replies[end:]), unfetched)
 
     def _intact(self, reply: Reply, suffix: str) -> Reply:
         """Return a ship's reply; raise BadData if another type of data is under its key."""
         if not isinstance(reply, Exception):
             return reply
+        # A stranger has put a list or a hash under the ship's key; any other error is the server's own.
         if isinstance(explained(reply, self.keys, self.path), WrongKind):
             where = f"{self.keys.name}{suffix.partition('~')[0]}"
             raise BadData(f"{where}: what is under {self.keys.tag}{suffix} is not what the ship wrote: {reply}")
@@ -186,6 +265,18 @@ class _Fetch:
         return self.plan()
 
 
+def exists(keys: Keys) -> Plan:
+    """Plan to find out whether there is a document in one round trip; what REEM did not write is none."""
+
+    def decode(replies: Sequence[Reply]) -> bool:
+        try:
+            return type_name(checked(replies[0], keys, ())) is not None
+        except WrongKind:
+            return False
+
+    return Plan([("JSON.TYPE", keys.document, "$")], decode)
+
+
 def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
     """Plan to find the Python type at `path`: one round trip, two for what is text on the server.
 
@@ -194,18 +285,61 @@ def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
 
     def decode(replies: Sequence[Reply]) -> Any:
         name = type_name(checked(replies[0], keys, path))
+        # JSON.TYPE answers an empty list, or nil, where nothing is.
         if name is None:
-            raise missing(keys, path)
+            raise missing(keys, path, replies[0])
         return _PYTHON_TYPES.get(name) or Plan([get_command(keys, path)], decode_text)
 
     def decode_text(replies: Sequence[Reply]) -> Any:
         holder = loads(present(replies[0], keys, path), keys)
-        crates = find(holder, keys.name)
-        if not crates:
+        slots = find(holder, keys.name)
+        if not slots:
             return type(holder[0])
-        return ships.labelled(crates[0].placeholder.label, show(full(keys, path))).carries
+        return ships.labelled(slots[0].placeholder.label, show(full(keys, path))).carries
 
     return Plan([("JSON.TYPE", keys.document, to_jsonpath(path))], decode)
+
+
+def keys_at(keys: Keys, path: Path) -> Plan:
+    """Plan to list the keys of the dict at `path` in one round trip; raises MissingKey or WrongType in decode."""
+
+    def decode(replies: Sequence[Reply]) -> list[str]:
+        reply = checked(replies[0], keys, path)
+        if not reply:
+            raise missing(keys, path, reply)
+        if not isinstance(reply[0], list):
+            raise _no_dict(keys, path)
+        return [name.decode() for name in reply[0]]
+
+    return Plan([("JSON.OBJKEYS", keys.document, to_jsonpath(path))], decode)
+
+
+def has_key(keys: Keys, path: Path, key: str) -> Plan:
+    """Plan to tell in one round trip if the dict at `path` has a key; raises MissingKey or WrongType in decode."""
+
+    def decode(replies: Sequence[Reply]) -> bool:
+        kind = type_name(checked(replies[0], keys, path))
+        if kind is None:
+            raise missing(keys, path, replies[0])
+        if kind != "object":
+            raise _no_dict(keys, path)
+        return type_name(checked(replies[1], keys, path)) is not None
+
+    places = to_jsonpath(path), to_jsonpath((*path, key))
+    return Plan([("JSON.TYPE", keys.document, place) for place in places], decode, atomic=True)
+
+
+def _no_dict(keys: Keys, path: Path) -> WrongType:
+    return WrongType(
+        f"{show(full(keys, path))} is not a dict and has no keys; use .read(), and look into what it gives"
+    )
+
+
+def nothing(keys: Keys, path: Path, why: MissingKey) -> RawRead:
+    """Return what a read brought that raised `why`."""
+    # What JSON.GET has answered: `exchange` compares it with the reply that it gets under WATCH.
+    reply = None if isinstance(why, MissingDocument) else b"[]"
+    return RawRead([], keys.name, [], (get_command(keys, path),), (reply,))
 
 
 _PYTHON_TYPES = {
@@ -224,15 +358,30 @@ def length(keys: Keys, path: Path) -> Plan:
 
     def decode(replies: Sequence[Reply]) -> Any:
         if type_name(checked(replies[0], keys, path)) is None:
-            raise missing(keys, path)
-        counts = [reply[0] for reply in replies[1:] if isinstance(reply, list) and reply]
-        return next((count for count in counts if count is not None), None)
+            raise missing(keys, path, replies[0])
+        return next((count for count in map(count_in, replies[1:]) if count is not None), None)
 
     return Plan(
         [
             ("JSON.TYPE", keys.document, place),
-            ("JSON.OBJLEN", keys.document, place),
+            entries_command(keys.document, place),
             ("JSON.ARRLEN", keys.document, place),
         ],
         decode,
     )
+
+
+def entries_command(document: str, place: str) -> Command:
+    """Return the command that tells how many entries a dict has; `count_in` reads its reply.
+
+    JSON.OBJLEN of a key that is not there names the path in its error, at which RedisJSON 2.8 panics, and the
+    server ends, if the path has a character whose code point ends in 00, such as U+4E00. Who asks for the keys
+    in its place gets more than is needed, but never that.
+    """
+    return ("JSON.OBJLEN" if place.isascii() else "JSON.OBJKEYS", document, place)
+
+
+def count_in(reply: Reply) -> int | None:
+    """Return the number in a reply to JSON.OBJLEN or JSON.ARRLEN, or of the keys in one to JSON.OBJKEYS; or None."""
+    first = reply[0] if isinstance(reply, list) and reply else None
+    return len(first) if isinstance(first, list) else first

@@ -12,7 +12,9 @@ from ..errors import (
     BadData,
     ClusterReply,
     LoginRefused,
+    MissingDocument,
     MissingKey,
+    MissingTop,
     NoJsonSupport,
     NotAllowed,
     PathRefused,
@@ -26,6 +28,7 @@ from ..errors import (
     turned_down,
 )
 from . import Plan, Reply, unwrap
+from .documents import nested_over
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
 
@@ -65,7 +68,10 @@ _REFUSALS: dict[str, tuple[type[Refused], str]] = {
     "BUSY": (ServerNotReady, "the server is busy with somebody's script, nothing was applied; call again"),
 }
 _NO_JSON = re.compile(r"ERR unknown command [`'\"]?JSON\.", re.IGNORECASE)
+# Characters of a server's own words that are quoted in an error.
 _LONGEST_QUOTE = 120
+_DEEPEST = 130
+"""Levels of a reply: RedisJSON parses documents of up to 127. Deeper ones would end in a RecursionError elsewhere."""
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 
@@ -73,6 +79,8 @@ def refusal(text: str) -> Refused | None:
     """Return the error to raise for an error reply that is about the server, None for one about the command."""
     if _NO_JSON.match(text):
         return NoJsonSupport(no_json())
+    # So servers begin when they refuse EXEC itself; the reason comes behind.
+    text = text.removeprefix("EXECABORT Transaction discarded because of: ")
     kind, remedy = _REFUSALS.get(text.partition(" ")[0], (None, ""))
     return kind(f"{remedy} (it says: {text[:_LONGEST_QUOTE]})") if kind is not None else None
 
@@ -87,10 +95,12 @@ def decoded(plan: Plan, replies: list[Reply]) -> Any:
         return plan.decode(unwrap(plan, replies))
     except (ReemError, RedisError):
         raise
+    # Decoders take the shape of replies for granted. What has another shape comes from no Redis server: something else
+    # listens at the address, or a proxy has mixed up two connections.
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         commands = ", ".join(str(command[0]) for command in plan.commands)
         raise BadData(
-            f"the server's replies to {commands:.80} are not what a server with RedisJSON sends ({error!r:.120}); "
+            f"the server's replies to {commands:.80} are not what a server of documents sends ({error!r:.120}); "
             "is the address that of a Redis server?"
         ) from error
 
@@ -104,7 +114,7 @@ def loads(text: bytes, keys: Keys) -> list[Any]:
     """Return the list of one value that the server answers to a path in JSON.
 
     Raises:
-        BadData: Not JSON, or not a list of one.
+        BadData: Not JSON, not a list of one, or nested deeper than documents are.
     """
     try:
         holder = orjson.loads(text)
@@ -112,6 +122,9 @@ def loads(text: bytes, keys: Keys) -> list[Any]:
         raise BadData(f"{keys.name}: the server sent {text[:60]!r}, which is not JSON") from None
     if type(holder) is not list or len(holder) != 1:
         raise BadData(f"{keys.name}: the server sent {text[:60]!r} where a list of one value was due")
+    # Whoever gets the value may walk through it by recursion.
+    if nested_over(text, holder, _DEEPEST):
+        raise BadData(f"{keys.name}: the server sent a value of over {_DEEPEST} levels, which RedisJSON does not hold")
     return holder
 
 
@@ -126,14 +139,16 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
     """Return the error to raise for an error reply: one that says what to do, or the server's own."""
     text = str(error)
     where = show(full(keys, path))
+    # About the user's rights or the server's state, not about the path: such an error is given a place to name.
     if isinstance(error, Refused | ClusterReply):
         return turned_down(error).at(where)
+    # RedisJSON has no codes for its errors, so they are told by their words.
     if "wrong Redis type" in text or text.startswith("WRONGTYPE"):
         return WrongKind(keys.document, where)
     if "that doesn't exist" in text:
         return missing(keys, path)
     if "created at the root" in text:
-        return PathRefused(f"{where}: nothing is stored at {keys.name!r}; write {keys.name} itself first, as a dict")
+        return MissingTop(f"{where}: nothing is stored at {keys.name!r}; write {keys.name} itself first, as a dict")
     if "index out of range" in text:
         return out_of_range(keys, path)
     return error
@@ -141,6 +156,7 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
 
 def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
     """Return what the registry of ships' keys holds, from a reply to SMEMBERS; raises BadData if it is none."""
+    # The usual case, without building a frozenset. RESP3 has sets, and a reply from EXEC a list.
     if not reply and type(reply) in (list, set):
         return _NO_MEMBERS
     members = checked(reply, keys, ())
@@ -150,15 +166,16 @@ def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
 
 
 def no_json() -> str:
-    """Return what to do about a server without RedisJSON."""
+    """Return what to do about a server whose JSON is not RedisJSON's."""
     return (
-        "the server has no RedisJSON; use Redis 8 (see compose.yaml), Redis Stack, valkey-bundle, "
-        "or start one with `reem up`"
+        "the server has JSON, but not this command of RedisJSON; use Redis 8 (see compose.yaml), valkey-bundle, a "
+        "server without any JSON, or start one with `reem up`"
     )
 
 
 def settable(keys: Keys, path: Path) -> Plan:
     """Plan to find out whether something can be set at `path`. Its decode raises PathRefused if not."""
+    # The types of everything on the way, in one round trip: the first that cannot hold the next one is the reason.
     places = [path[:length] for length in range(len(path) + 1)]
     commands = [("JSON.TYPE", keys.document, to_jsonpath(place)) for place in places]
 
@@ -167,7 +184,8 @@ def settable(keys: Keys, path: Path) -> Plan:
         for place, kind, inner in zip(places[:-1], kinds[:-1], path, strict=True):
             whole, outer = show(full(keys, path)), show(full(keys, place))
             if kind is None:
-                raise PathRefused(f"{whole}: there is no {outer} to write into")
+                refusal = PathRefused if place else MissingTop
+                raise refusal(f"{whole}: there is no {outer} to write into")
             if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
                 raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}")
         if kinds[-1] is None and isinstance(path[-1], int):
@@ -194,11 +212,16 @@ def out_of_range(keys: Keys, path: Path) -> PathRefused:
 
 def type_name(reply: Reply) -> str | None:
     """Return the name of the JSON type in a reply to JSON.TYPE: [[b"object"]], [b"object"], [None], [[]] or None."""
+    # RESP2 and RESP3, and versions of RedisJSON, nest it in as many lists as they like.
     while isinstance(reply, list):
         reply = reply[0] if reply else None
     return reply.decode() if isinstance(reply, bytes) else None
 
 
-def missing(keys: Keys, path: Path) -> MissingKey:
-    """Return the error for a path where nothing is stored."""
-    return MissingKey(f"nothing is stored at {show(full(keys, path))}")
+def missing(keys: Keys, path: Path, reply: Reply = ()) -> MissingKey:
+    """Return the error for a path where nothing is stored, given the reply that says so.
+
+    The server answers nil, or a list of one nil, where not even the top-level key is there.
+    """
+    kind = MissingDocument if reply is None or reply == [None] else MissingKey
+    return kind(f"nothing is stored at {show(full(keys, path))}")

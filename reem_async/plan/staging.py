@@ -14,13 +14,13 @@ from typing import NamedTuple
 from . import Command, Reply
 from .sizes import has_large
 
-__all__ = ["STAGED", "Staged", "are_missing", "is_large", "looks_at", "stage"]
+__all__ = ["KEPT", "STAGED", "Staged", "are_missing", "as_given", "is_large", "looks_at", "stage"]
 
 STAGED = ":staged:"
 """Follows the tag of a top-level key in the names of what was sent and not yet put in place."""
 
-_KEPT = 60
-"""Seconds."""
+KEPT = 60
+"""Seconds for which a server keeps what was not put in place."""
 
 
 class Staged(NamedTuple):
@@ -49,11 +49,25 @@ def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Comm
         if is_large(command):
             _, key, blob = command
             name = f"{tag}{STAGED}{unique}.{len(coming)}"
-            coming.append(Staged(name, ("SET", name, blob, "EX", _KEPT)))
+            coming.append(Staged(name, ("SET", name, blob, "EX", KEPT)))
+            # PERSIST first: RENAME keeps the time to live, and the array would be gone after a minute.
             moving += [("PERSIST", name), ("RENAME", name, key)]
         else:
             moving.append(command)
     return moving, coming
+
+
+def as_given(moved: Sequence[Command], coming: Sequence[Staged], replies: Sequence[Reply]) -> list[Reply]:
+    """Return the replies to a transaction as it was given to `stage`: a large SET became two commands of `moved`."""
+    names = {each.name for each in coming}
+    extra = {place for place, command in enumerate(moved) if command[0] == "PERSIST" and command[1] in names}
+    answers, outcome = list(replies), replies[-1]
+    if isinstance(outcome, list):
+        answers[-1] = [reply for place, reply in enumerate(outcome, 1) if place not in extra]
+    for place in extra:
+        if isinstance(answers[place], Exception):  # it is why the transaction was refused
+            answers[place + 1] = answers[place]
+    return [reply for place, reply in enumerate(answers) if place not in extra]
 
 
 def is_large(command: Command) -> bool:

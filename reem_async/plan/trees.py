@@ -45,10 +45,12 @@ def replaced(tree: Any, path: Path, value: Any) -> Any:
         return value
     key, rest = path[0], path[1:]
     if isinstance(key, str) and type(tree) is dict:
+        # JSON.SET makes the last element of a path only, never its parents.
         if rest and key not in tree:
             raise CannotApply
         return {**tree, key: replaced(tree.get(key), rest, value)}
     if isinstance(key, int) and type(tree) is list and -len(tree) <= key < len(tree):
+        # Only the containers on the way are copied: whoever holds the old tree keeps the old instant.
         items = tree.copy()
         items[key] = replaced(items[key], rest, value)
         return items

@@ -11,99 +11,57 @@ removed under WATCH, after a look at what the document refers to.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-from ..errors import BadKey, BadType, Conflict, MissingKey, PartialWrite
+from ..errors import Conflict, MissingKey, PathRefused, WrongType
 from . import Command, Plan, Reply
+from .changes import REFUSED, SILENT, Change, EncodedAttachment, Telling
+from .indexes import from_front, lengths
 from .keys import Keys
-from .memory import Memory
-from .orphans import clean, survey, unreferred, watch
-from .paths import Path, below, has_index, may_hold, parse_suffix, show, to_jsonpath
-from .replies import checked, diagnose, explained, full, registered, settable, type_name
+from .orphans import left_behind, permitted, place_of, survey, unreferred, watch
+from .outcome import Outcome
+from .paths import Path, counts_from_end, has_index, may_hold, show, to_jsonpath
+from .replies import checked, full, settable, type_name
+from .shapes import ShapeCache
 from .staging import Staged, are_missing, looks_at, stage
 
 __all__ = [
-    "Change",
-    "Loaded",
     "append_change",
     "appendable",
     "change",
     "delete_change",
     "exchange",
+    "into_new",
+    "is_watched",
     "make_parents",
     "set_change",
     "takes",
 ]
 
 
-class Loaded(NamedTuple):
-    """A parcel ready to go: the commands its ship recorded.
-
-    Attributes:
-        suffix: The key's name after the tag.
-        label: The ship's label.
-        commands: What stores it.
-        blob: Its bytes in pieces, where the ship works that way: they can travel in a notice.
-    """
-
-    suffix: str
-    label: str
-    commands: tuple[Command, ...]
-    blob: tuple[Any, ...] | None = None
-
-
-class Change(NamedTuple):
-    """One change of a document.
-
-    Attributes:
-        keys: The document's names.
-        path: What is changed, below the top-level key.
-        command: The JSON command that does it.
-        judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
-        loaded: What goes by ship.
-        replaces: Whether what was at `path` is gone afterwards.
-        looks: Whether to look for ships' keys that it replaces; if not, somebody vouches for there being none.
-        gone: The suffixes of those that it replaces, if this is known for certain: the document is watched.
-        notices: What tells subscribers, in the same transaction.
-        retraction: Makes what tells them if the server refuses the change after all.
-    """
-
-    keys: Keys
-    path: Path
-    command: Command
-    judge: Callable[[Reply], Any]
-    loaded: tuple[Loaded, ...] = ()
-    replaces: bool = True
-    looks: bool = True
-    gone: tuple[bytes, ...] | None = None
-    notices: Sequence[Command] = ()
-    retraction: Callable[[], Sequence[Command]] | None = None
-
-
-REFUSED = object()
-"""The server did nothing and did not say why."""
-
 _NO_MEMBERS: frozenset[bytes] = frozenset()
-_STORED: list[Reply] = [b"OK", []]
-_STORED_UNSEEN: list[Reply] = [b"OK"]
-"""The usual replies to a write without arrays, with a look at the registry and without: there is nothing more to do."""
+_STORED: tuple[list[Reply], ...] = ([b"OK"], [b"OK", []])
+_TOLD: tuple[list[Reply], ...] = ([b"OK", b"OK"], [b"OK", [], b"OK"])
+"""The usual replies to a write without arrays, without a look at the registry and with: there is nothing more to do.
+
+Where subscribers are told, behind that are the note of the update and how many they are; the latter is left out."""
 
 
 def set_change(
     keys: Keys,
     path: Path,
     text: bytes,
-    loaded: tuple[Loaded, ...],
+    attachments: tuple[EncodedAttachment, ...],
     looks: bool = True,
-    notices: Sequence[Command] = (),
-    retraction: Callable[[], Sequence[Command]] | None = None,
+    notices: Telling = SILENT,
 ) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
     command = ("JSON.SET", keys.document, to_jsonpath(path), text)
-    return Change(keys, path, command, _judged_set, loaded, True, looks, None, notices, retraction)
+    return Change(keys, path, command, _judged_set, attachments, True, looks, None, notices, PathRefused)
 
 
 def _judged_set(reply: Reply) -> Any:
+    # JSON.SET answers nil, and not an error, where the parent is missing or cannot hold the element.
     return REFUSED if reply is None else None
 
 
@@ -118,27 +76,30 @@ def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
     return Change(keys, path, ("JSON.DEL", keys.document, to_jsonpath(path)), judge, **notices)
 
 
-def append_change(keys: Keys, path: Path, texts: Sequence[bytes], loaded: tuple[Loaded, ...], **notices: Any) -> Change:
-    """Return the change that appends to the list at `path`; raises MissingKey or BadType if there is none."""
+def append_change(
+    keys: Keys, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...], **notices: Any
+) -> Change:
+    """Return the change that appends to the list at `path`; raises MissingKey or WrongType if there is none."""
 
     def judge(reply: Reply) -> Any:
+        # An empty list: nothing is there. nil in it: something else than a list is.
         if reply in ([], [None]):
             raise _no_list(keys, path, nothing=not reply)
         return None
 
     command = ("JSON.ARRAPPEND", keys.document, to_jsonpath(path), *texts)
-    return Change(keys, path, command, judge, loaded, replaces=False, **notices)
+    return Change(keys, path, command, judge, attachments, replaces=False, **notices)
 
 
 def _no_list(keys: Keys, path: Path, *, nothing: bool) -> Exception:
     where = show(full(keys, path))
     if nothing:
         return MissingKey(f"nothing is stored at {where}; write a list there first")
-    return BadType(f"{where} is not a list; only lists can be appended to")
+    return WrongType(f"{where} is not a list; only lists can be appended to")
 
 
 def appendable(keys: Keys, path: Path) -> Plan:
-    """Plan to make sure that there is a list at `path`. Its decode raises MissingKey or BadType if there is none.
+    """Plan to make sure that there is a list at `path`. Its decode raises MissingKey or WrongType if there is none.
 
     For what goes by ship: the transaction would store it even if the server refused to append.
     """
@@ -151,81 +112,114 @@ def appendable(keys: Keys, path: Path) -> Plan:
     return Plan([("JSON.TYPE", keys.document, to_jsonpath(path))], decode)
 
 
-def takes(keys: Keys, path: Path, loaded: tuple[Loaded, ...], memory: Memory) -> Plan | None:
-    """Plan to make sure that something can be set at `path`, of which `loaded` goes by ship; None if that is known.
+def takes(keys: Keys, path: Path, attachments: tuple[EncodedAttachment, ...], cache: ShapeCache) -> Plan | None:
+    """Plan to make sure that something can be set at `path`, with `attachments` in it; None if that is known.
 
     The transaction would store what goes by ship even if the server refused to set the rest.
     """
-    known = memory.sure_members(keys.document)
-    if not path or any(each.suffix.encode() in known for each in loaded):
+    # An array that was seen at just this place shows that the place can hold one.
+    known = cache.sure_members(keys.document)
+    if not path or any(each.suffix.encode() in known for each in attachments):
         return None
     return settable(keys, path)
 
 
-def change(it: Change, memory: Memory) -> Plan:
-    """Plan one change, in one round trip unless somebody else changed the shape meanwhile, in two in lists of arrays.
+def change(it: Change, cache: ShapeCache) -> Plan:
+    """Plan one change, in one round trip unless somebody else changed the shape meanwhile.
+
+    In two in lists of arrays, and where it counts from the end of a list.
 
     Args:
         it: The change.
-        memory: What is known of the server.
+        cache: What is known of the server.
     """
-    return _change_exactly(it, memory) if has_index(it.path) and _moves(it, memory) else _change(it, memory)
+    return _change_watched(it, cache) if is_watched(it, cache) else _change(it, cache)
 
 
-def _change(it: Change, memory: Memory, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
+def is_watched(it: Change, cache: ShapeCache) -> bool:
+    """Return whether it has to be looked first which items of a list are meant, and what refers to them."""
+    return has_index(it.path) and (counts_from_end(it.path) or _moves(it, cache))
+
+
+def _change(it: Change, cache: ShapeCache, *, held: bool = False, given_up: Callable[[], Plan] | None = None) -> Plan:
     """Plan the transaction; if the connection is `held`, it watches keys, and `given_up` is next if one changed."""
-    memory.forget_numbers(it.keys.document)
-    known = memory.members(it.keys.document)
+    known = cache.members(it.keys.document)
     stale = _stale(it, known) if known or it.gone else []
     commands: list[Command] = []
     after: list[Command] = []
-    if it.loaded or stale:
-        _expect(it, memory, known, stale)
+    if it.attachments or stale:
+        # The order within the transaction: room is made, ships' keys are filled, the document names them, the registry
+        # has them, the registry is looked at, subscribers are told. Readers see all of it or nothing.
         commands = _clearing(it, stale)
-        commands.extend(command for each in it.loaded for command in each.commands)
-    if it.loaded:
-        after.append(("SADD", it.keys.registry, *(each.suffix for each in it.loaded)))
+        commands.extend(command for each in it.attachments for command in each.commands)
+    if it.attachments:
+        after.append(("SADD", it.keys.registry, *(each.suffix for each in it.attachments)))
     if it.looks:
         after.append(("SMEMBERS", it.keys.registry))
     main = len(commands)
-    commands += (it.command, *after, *it.notices)
+    told = it.notices.make(it.path)
+    commands += (it.command, *after, *told)
+    # Most writes are small, without arrays, and nothing is special about the replies: one comparison tells.
+    usual = None if main else (_TOLD if told else _STORED)[it.looks]
 
     def decode(replies: Sequence[Reply] | None) -> Any:
+        # EXEC was answered with nil: somebody wrote to the document after the look.
         if replies is None:
             assert given_up is not None  # only watched transactions are given up
+            it.notices.take_back()
             return given_up()
-        if it.looks and replies == _STORED and len(commands) == len(_STORED):
-            memory.saw_members(it.keys.document, _NO_MEMBERS)
+        # Any write may have replaced the number that a calculation left.
+        cache.forget_numbers(it.keys.document)
+        if (replies if not told else replies[:-1]) == usual and (not told or type(replies[-1]) is int):
+            if it.looks:
+                cache.saw_members(it.keys.document, _NO_MEMBERS)
             return None
-        if replies == _STORED_UNSEEN:
-            return None
-        return _Outcome(it, memory, commands, replies, main).next()
+        return Outcome(it, cache, commands, replies, main).next()
 
-    return Plan(commands, decode, len(commands) > (2 if it.looks else 1) or held, held)
+    whole = held or len(commands) > (2 if it.looks else 1) or _is_tried(it, cache)
+    return Plan(commands, decode, whole, held)
 
 
-def _moves(it: Change, memory: Memory) -> bool:
+def _is_tried(it: Change, cache: ShapeCache) -> bool:
+    """Return whether to send it as a transaction because its look at the registry may be denied.
+
+    Servers abort a transaction when they deny one of its commands: so nothing is written by a user who lacks a
+    right. It takes time, hence only until a look was seen to succeed. Not where it would fail for other reasons:
+    deletions, which Redis without memory takes alone only, and clusters, where it would wait while its slot moves.
+    """
+    if not it.looks or cache.may_look(it.keys.document):
+        return False
+    return it.command[0] != "JSON.DEL" and not it.keys.sharded
+
+
+def _moves(it: Change, cache: ShapeCache) -> bool:
     """Return whether it, in a list, may replace something that has moved from the place after which it is named."""
-    known = memory.members(it.keys.document)
-    return it.replaces and it.looks and any(may_hold(it.path, _place(member)) for member in known)
+    known = cache.members(it.keys.document)
+    return it.replaces and it.looks and any(may_hold(it.path, place_of(member)) for member in known)
 
 
-def _change_exactly(it: Change, memory: Memory, coming: Sequence[Staged] = ()) -> Plan:
-    """Plan to look first, and then to remove with what is replaced whatever nothing refers to any more."""
+def _change_watched(it: Change, cache: ShapeCache, coming: Sequence[Staged] = ()) -> Plan:
+    """Plan to look first which items are meant, and what nothing refers to once they are replaced."""
+    surveyed = survey(it.keys, it.path) if _moves(it, cache) else ()
+    start, end = 1 + len(surveyed), 1 + len(surveyed) + len(looks_at(coming))
 
     def look(replies: Sequence[Reply]) -> Plan:
-        if are_missing(replies[4:]):
-            return _unwatched(lambda: _send(it, coming, lambda: _change_exactly(it, memory, coming)))
-        gone = unreferred(replies[1:4], it.keys)
-        if gone is None:
-            return _unwatched(lambda: _change(it, memory))
-        exact = it._replace(gone=gone)
-        return _change(exact, memory, held=True, given_up=lambda: _again(it, coming, attempt))
+        # States of a watched change: WATCH and look -> (what was staged is gone: send it again, and look) ->
+        # transaction -> (given up: send what is large ahead, once, and look again) -> done.
+        permitted(replies[0], it.keys.document, it.keys.registry)
+        if are_missing(replies[start:end]):
+            return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
+        # Document and registry are of the instant of the look, and the transaction fails if either is not the same any
+        # more.
+        gone = unreferred(replies[1:start], it.keys) if surveyed else None
+        exact = _from_front(it, replies[end:])._replace(gone=gone)
+        return _change(exact, cache, held=True, given_up=lambda: _again(it, coming, attempt))
 
     def attempt(it: Change, coming: Sequence[Staged]) -> Plan:
-        return _change_exactly(it, memory, coming)
+        return _change_watched(it, cache, coming)
 
-    return Plan([watch(it.keys, coming), *survey(it.keys, it.path), *looks_at(coming)], look, held=True)
+    commands = [watch(it.keys, coming), *surveyed, *looks_at(coming), *lengths(it.keys, it.path)]
+    return Plan(commands, look, held=True)
 
 
 def _unwatched(then: Callable[[], Plan]) -> Plan:
@@ -236,12 +230,12 @@ def _again(it: Change, coming: Sequence[Staged], attempt: Callable[[Change, Sequ
     """Plan the next attempt, somebody else having written meanwhile; what is large is sent before it, once."""
     if coming:
         return attempt(it, coming)
-    loaded = []
-    for each in it.loaded:
+    attachments = []
+    for each in it.attachments:
         commands, sent = stage(each.commands, it.keys.tag, each.suffix)
         coming = [*coming, *sent]
-        loaded.append(each._replace(commands=tuple(commands)))
-    moved = it._replace(loaded=tuple(loaded))
+        attachments.append(each._replace(commands=tuple(commands)))
+    moved = it._replace(attachments=tuple(attachments))
     return _send(moved, coming, lambda: attempt(moved, coming)) if coming else attempt(it, ())
 
 
@@ -258,117 +252,35 @@ def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
     """Return the known keys that only what is replaced can refer to, and that are not written again."""
     if not it.replaces or not it.looks:
         return []
-    written = {each.suffix.encode() for each in it.loaded}
+    written = {each.suffix.encode() for each in it.attachments}
     if it.gone is not None:
         return [member for member in it.gone if member not in written]
+    # Items move, their keys keep their names: below a path through a list nothing can be told by names.
     if has_index(it.path):
         return []
-    return [member for member in known if member not in written and below(_place(member), it.path)]
-
-
-def _expect(it: Change, memory: Memory, known: frozenset[bytes], stale: list[bytes]) -> None:
-    """Note what may exist from now on: the reply that tells may be lost."""
-    written = frozenset([each.suffix.encode() for each in it.loaded])
-    if it.looks and (stale or not written <= known):
-        memory.expects_members(it.keys.document, known | written)
-
-
-def _place(member: bytes) -> Path:
-    """Return where a member of the registry belongs; what REEM did not enter there belongs to no place."""
-    try:
-        return parse_suffix(member.decode())
-    except (BadKey, UnicodeDecodeError):
-        return ("\0",)
+    return left_behind(known, it.path, written)
 
 
 def _clearing(it: Change, stale: list[bytes]) -> list[Command]:
     """Return the commands that make room: no leftovers, and no foreign type under a ship's key."""
     tag = it.keys.tag.encode()
-    gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.loaded]
+    # What will be filled is unlinked first: a foreign type under that name would have SET fail in mid-transaction.
+    gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.attachments]
     commands: list[Command] = [("UNLINK", *gone)]
     if stale:
         commands.append(("SREM", it.keys.registry, *stale))
     return commands
 
 
-class _Outcome:
-    """What became of a change: the result, or the next plan that puts things right and then says so."""
-
-    __slots__ = ("commands", "it", "main", "memory", "replies")
-
-    def __init__(
-        self, it: Change, memory: Memory, commands: Sequence[Command], replies: Sequence[Reply], main: int
-    ) -> None:
-        self.it = it
-        self.memory = memory
-        self.commands = commands
-        self.replies = replies
-        self.main = main
-
-    def next(self) -> Any:
-        members = self._members()
-        judged = self._judged()
-        refused = judged is REFUSED or isinstance(judged, Exception)
-        if refused and self.it.retraction is not None:
-            retraction = self.it.retraction()
-            return Plan(retraction, lambda _: self._settle(members, judged), atomic=True)
-        return self._settle(members, judged)
-
-    def _members(self) -> frozenset[bytes]:
-        """Return what the registry held right after the change."""
-        if not self.it.looks:
-            return frozenset()
-        place = self.main + (2 if self.it.loaded else 1)
-        members = registered(self.replies[place], self.it.keys)
-        self.memory.saw_members(self.it.keys.document, members)
-        return members
-
-    def _judged(self) -> Any:
-        """Return the result, REFUSED, or the error to raise."""
-        reply = self.replies[self.main]
-        if isinstance(reply, Exception):
-            return explained(reply, self.it.keys, self.it.path)
-        for command, other in zip(self.commands, self.replies, strict=True):
-            if isinstance(other, Exception):
-                return self._partial(command, other)
-        try:
-            return self.it.judge(reply)
-        except Exception as error:
-            return error
-
-    def _partial(self, command: Command, error: Exception) -> PartialWrite:
-        where = show(full(self.it.keys, self.it.path))
-        return PartialWrite(
-            f"{where}: the document was written, but the server refused {command[0]} {command[1]!s:.60}: {error}; "
-            "what this command should have stored cannot be read: write again"
-        )
-
-    def _settle(self, members: frozenset[bytes], judged: Any) -> Any:
-        if self._suspects(members, judged):
-            return clean(self.it.keys, self.memory, lambda: self._finish(judged))
-        return self._finish(judged)
-
-    def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
-        """Return whether a key may exist that the document does not refer to."""
-        if judged is REFUSED or isinstance(judged, Exception):
-            # Of nothing that was not there to be deleted, or appended to, there can be leftovers of a broken call.
-            return bool(self.it.loaded) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
-        if not members or not self.it.replaces or self.it.gone is not None:
-            return False
-        written = {each.suffix.encode() for each in self.it.loaded}
-        return any(member not in written and may_hold(self.it.path, _place(member)) for member in members)
-
-    def _finish(self, judged: Any) -> Any:
-        if judged is REFUSED:
-            return diagnose(self.it.keys, self.it.path)
-        if isinstance(judged, Exception):
-            raise judged
-        return judged
+def into_new(keys: Keys, it: EncodedAttachment) -> EncodedAttachment:
+    """Return an attachment that, if there is no document yet, has an empty dict made for it in the same transaction."""
+    return it._replace(commands=(("JSON.SET", keys.document, "$", b"{}", "NX"), *it.commands))
 
 
 def make_parents(keys: Keys, path: Path) -> Plan:
     """Plan to put an empty dict wherever a parent of `path` is missing; leaves everything else alone."""
     prefixes = [path[:length] for length in range(len(path))]
+    # NX: what is there already, be it no dict at all, stays.
     commands = [("JSON.SET", keys.document, to_jsonpath(prefix), b"{}", "NX") for prefix in prefixes]
 
     def decode(replies: Sequence[Reply]) -> None:
@@ -378,8 +290,14 @@ def make_parents(keys: Keys, path: Path) -> Plan:
     return Plan(commands, decode)
 
 
+def _from_front(it: Change, counts: Sequence[Reply]) -> Change:
+    """Return the change at its place counted from the front, given the replies to `lengths`."""
+    place = from_front(counts, it.keys, it.path, it.absent)
+    return it._replace(path=place, command=(*it.command[:2], to_jsonpath(place), *it.command[3:]))
+
+
 def exchange(
-    it: Change, reads: Sequence[Command], before: tuple[Any, ...], memory: Memory, coming: Sequence[Staged] = ()
+    it: Change, reads: Sequence[Command], before: tuple[Any, ...], cache: ShapeCache, coming: Sequence[Staged] = ()
 ) -> Plan:
     """Plan a change that is made only if what `reads` fetch is still `before`.
 
@@ -388,20 +306,24 @@ def exchange(
     """
     where = show(full(it.keys, it.path))
     end = 4 + len(reads)
+    counts = end + len(looks_at(coming))
 
     def refuse(_: Sequence[Reply]) -> Plan:
         raise Conflict(f"{where} was changed by somebody else while it was edited; nothing was written: edit it again")
 
     def compare(replies: Sequence[Reply]) -> Plan:
+        permitted(replies[0], it.keys.document, it.keys.registry)
+        # Bytes are compared, not values: 1 and 1.0, or another order of keys, count as a change by somebody else.
         if tuple(replies[4:end]) != before:
             return Plan([("UNLINK", *(each.name for each in coming))], refuse, held=True) if coming else refuse(())
-        if are_missing(replies[end:]):
+        if are_missing(replies[end:counts]):
             return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
-        exact = it._replace(gone=unreferred(replies[1:4], it.keys))
-        return _change(exact, memory, held=True, given_up=lambda: _again(it, coming, attempt))
+        exact = _from_front(it, replies[counts:])._replace(gone=unreferred(replies[1:4], it.keys))
+        return _change(exact, cache, held=True, given_up=lambda: _again(it, coming, attempt))
 
     def attempt(it: Change, coming: Sequence[Staged]) -> Plan:
-        return exchange(it, reads, before, memory, coming)
+        return exchange(it, reads, before, cache, coming)
 
-    commands = [watch(it.keys, coming), *survey(it.keys, it.path), *reads, *looks_at(coming)]
+    looks = [*survey(it.keys, it.path), *reads, *looks_at(coming), *lengths(it.keys, it.path)]
+    commands = [watch(it.keys, coming), *looks]
     return Plan(commands, compare, held=True)

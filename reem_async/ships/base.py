@@ -15,11 +15,16 @@ class SpecialDatatypeShip(ABC):
     Every method may be a plain function or `async def`. A ship never talks to the server itself:
     the `client` it is given records commands (with redis-py's names: `set`, `hset`, `rpush`, ...)
     and REEM sends them inside the transaction of the whole write or read. Values of exactly the
-    types str, int, float, bool, None, dict, list and tuple are JSON and never offered to ships.
+    types str, int, float, bool, None, dict, list and tuple are JSON; they are offered to ships only if one claims such
+    a type: its `check_fit` takes one of a few short samples, or its `claims` names the type. Then every value is
+    looked at in Python, which costs time: an interface whose ships claim none does not pay for it.
     """
 
     carries: type | None = None
     """The one type this ship gives back, if that is known without reading. Optional."""
+
+    claims: tuple[type, ...] = ()
+    """Of the types that JSON has, those of which `check_fit` takes values that are not short. Optional."""
 
     @abstractmethod
     def check_fit(self, value: Any) -> bool | Awaitable[bool]:

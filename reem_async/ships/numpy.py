@@ -10,7 +10,6 @@ bytes that are there. Nothing is evaluated or unpickled.
 
 from __future__ import annotations
 
-import ast
 import math
 import re
 from collections.abc import Callable
@@ -24,21 +23,34 @@ from .base import BlobShip
 
 __all__ = ["NumpyShip", "flat", "flat_buffer"]
 
+# The .npy format, as numpy.lib.format describes it: magic, version (two bytes), length of the header (two bytes in
+# version 1, four later, little-endian), the header as a Python literal, the data.
 _MAGIC = b"\x93NUMPY"
 _KINDS = "biufcSUVMm"
+# Byte order, kind, item size, and for dates and durations a unit: "<f8", "|S10", "<M8[10us]".
 _CODE = re.compile(r"[<>|=][biufcSUVMm]\d{1,9}(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
+# Limits for what a stranger may have written: they bound the memory and the recursion that a header can cost. No real
+# robot comes near them: numpy itself has at most 64 dimensions.
 _MOST_FIELDS = 1000
+# As many as numpy itself has.
 _MOST_DIMENSIONS = 64
+# Bytes of one item: a record of many fields, or a long text.
 _LARGEST_ITEM = 1 << 20
+# Bytes: 64 KB describe a thousand fields.
 _LARGEST_HEADER = 1 << 16
 _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
-# All that a header is made of: strings, short integers, two words, brackets. No names, operators or f-strings
-# reach Python's parser, which may need very long over them.
-_HEADER = re.compile(
-    r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*"|\d{1,15}(?![\w'"])|True|False|[\[\](){},:]|[ ]|\n)++"""
+# All that a header is made of. There are no names, operators or f-strings, and integers are short.
+_TOKEN = re.compile(
+    r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>\d{1,15}(?![\w'"])|True|False)"""
+    r"""|(?P<opening>[\[({])|(?P<closing>[\])}])|(?P<between>[,:])|[ \n]+"""
 )
-_QUOTED = re.compile(r"""'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*\"""")
+# The escapes that `repr` writes; others, such as \N{...}, are refused.
+_ESCAPE = re.compile(r"\\(?:x([0-9a-f]{2})|u([0-9a-f]{4})|U([0-9a-f]{8})|(.))")
+_SHORT_ESCAPES = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\", "'": "'", '"': '"'}
+_PAIRS = {"(": ")", "[": "]", "{": "}"}
+# Brackets in brackets.
 _DEEPEST = 64
+# Bytes of a header that is kept parsed with many others; longer ones are kept with few others, see below.
 _SHORT = 1 << 9
 _SMALL = 1 << 12
 """Bytes of data up to which copying them costs less than handling two pieces."""
@@ -72,6 +84,7 @@ class NumpyShip(BlobShip):
 
     def pack(self, value: np.ndarray[Any, Any]) -> tuple[Any, ...]:
         """Return an .npy file: small in one piece, else the header and the data, shared with a contiguous array."""
+        # Two pieces for large arrays: joining them would copy all of the data once more.
         header = _header(value.dtype, value.shape)
         return (header + value.tobytes(),) if value.nbytes <= _SMALL else (header, flat(value))
 
@@ -82,14 +95,17 @@ class NumpyShip(BlobShip):
         view = memoryview(blob)
         size = _header_size(bytes(view[:12]), len(view))
         dtype, shape = _header_parser(size)(bytes(view[:size]))
+        # Python's integers do not overflow, as numpy's would for a shape that somebody made up.
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
         try:
             array = (
+                # frombuffer refuses an empty buffer, so arrays without items are made anew.
                 np.frombuffer(view, dtype, offset=size).reshape(shape) if len(view) > size else np.empty(shape, dtype)
             )
         except ValueError as error:
             raise BadData(f"an array has the shape {list(shape)}, which cannot be: {error}") from None
+        # The reply may be in a cache or belong to other arrays as well; a caller who wants to write makes a copy.
         array.flags.writeable = False
         return array
 
@@ -102,6 +118,7 @@ def flat(array: np.ndarray[Any, Any]) -> memoryview | bytes:
     """
     if array.nbytes == 0:
         return b""
+    # As bytes, since numpy exports no buffer of some dtypes (datetime64).
     view = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
     if len(view) != array.nbytes or view.nbytes != array.nbytes:
         raise BadType(f"{array.dtype} has no flat bytes")
@@ -137,6 +154,7 @@ def _header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     """Return the header of an .npy file: magic, version, length, a Python literal, blanks up to 64 bytes."""
     text = f"{{'descr': {_descr(dtype)!r}, 'fortran_order': False, 'shape': {shape!r}, }}"
     data = text.encode()
+    # Version 1 is what all readers know. Version 3 says that the header is UTF-8 (names of fields), or is a long one.
     version, length_size = (b"\x01\x00", 2) if text.isascii() and len(data) < 60_000 else (b"\x03\x00", 4)
     size = -(-(len(_MAGIC) + 2 + length_size + len(data) + 1) // 64) * 64
     length = size - len(_MAGIC) - 2 - length_size
@@ -152,6 +170,7 @@ def _descr(dtype: np.dtype[Any]) -> Any:
         )
     try:
         descr = np.lib.format.dtype_to_descr(dtype)
+        # Checked by parsing it again: some dtypes lose padding or overlapping fields in their description.
         same = _dtype(descr) == dtype
     except (TypeError, ValueError):
         same = False
@@ -162,6 +181,7 @@ def _descr(dtype: np.dtype[Any]) -> Any:
 
 def _header_size(start: bytes, length: int) -> int:
     """Return how many bytes come before the data, of an .npy file of `length` bytes that begins with `start`."""
+    # Byte 6 is the major version, byte 7 the minor one, which is always 0.
     if len(start) < 10 or not start.startswith(_MAGIC) or start[6] not in (1, 2, 3) or start[7] != 0:
         raise BadData(f"an array begins with {start!r}; REEM did not write it")
     before = 10 if start[6] == 1 else 12
@@ -175,14 +195,12 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
     """Return dtype and shape from the header of an .npy file, checked; raises BadData."""
     try:
         text = header[10 if header[6] == 1 else 12 :].decode("utf-8" if header[6] == 3 else "latin-1")
-        # A field has up to three pairs of round brackets: its own, and those of a title and a shape.
-        if text.count("(") > 3 * _MOST_FIELDS + 1 or not _HEADER.fullmatch(text) or _depth(text) > _DEEPEST:
-            raise ValueError(text)
-        fields = ast.literal_eval(text)
+        fields = _literal(text)
+        # Arrays in Fortran order are not written by REEM: reading them would need a copy or strides.
         if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
             raise ValueError(fields)
         return _dtype(fields["descr"]), _check_shape(fields["shape"])
-    except (SyntaxError, TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
+    except (TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
         raise BadData(f"an array has the header {header[10:100]!r}, which is not that of plain data") from None
 
 
@@ -195,16 +213,61 @@ def _header_parser(size: int) -> Callable[[bytes], tuple[np.dtype[Any], tuple[in
     return _parse_short if size <= _SHORT else _parse_long
 
 
-def _depth(text: str) -> int:
-    """Return how deep brackets are nested, text in quotes left aside."""
-    depth = deepest = 0
-    for character in _QUOTED.sub("", text):
-        if character in "([{":
-            depth += 1
-            deepest = max(deepest, depth)
-        elif character in ")]}":
-            depth -= 1
-    return deepest
+def _literal(text: str) -> Any:
+    """Return the value of a Python literal made of strings, short integers, two words and brackets.
+
+    Not with `ast`: in Python 3.11 it raises SystemError at times when two threads use it at once.
+
+    Raises:
+        ValueError: It is something else, or nested too deep.
+    """
+    # One level for each open bracket: the bracket, and the items found in it so far. No recursion, so depth costs no
+    # stack.
+    levels: list[tuple[str, list[Any]]] = [("", [])]
+    position, complete = 0, False  # whether an item is there that a comma or the end has to follow
+    while position < len(text):
+        token = _TOKEN.match(text, position)
+        if token is None or len(levels) > _DEEPEST:
+            raise ValueError(text)
+        position, (kind, items) = token.end(), levels[-1]
+        if token.lastgroup is None:
+            continue
+        # Two items in a row without a comma between them.
+        if token.lastgroup in ("text", "word", "opening") and complete:
+            raise ValueError(text)
+        if token.lastgroup == "text":
+            items.append(_unquoted(token["text"]))
+        elif token.lastgroup == "word":
+            items.append(token["word"] == "True" if token["word"][0] in "TF" else int(token["word"]))
+        elif token.lastgroup == "opening":
+            levels.append((token["opening"], []))
+        elif token.lastgroup == "closing":
+            if _PAIRS.get(levels.pop()[0]) != token["closing"]:
+                raise ValueError(text)
+            levels[-1][1].append(_closed(kind, items, complete))
+        # A comma or colon after nothing; or in a dict a colon where a value was complete, a comma where a key was.
+        elif not complete or (kind == "{" and len(items) % 2 == 1) != (token["between"] == ":"):
+            raise ValueError(text)
+        complete = token.lastgroup not in ("opening", "between")
+    if len(levels) != 1 or len(levels[0][1]) != 1 or not complete:
+        raise ValueError(text)
+    return levels[0][1][0]
+
+
+def _closed(kind: str, items: list[Any], complete: bool) -> Any:
+    """Return the list, tuple or dict of what stands between brackets; `complete` if no comma is the last."""
+    if kind == "[":
+        return items
+    if kind == "{":
+        return dict(zip(items[::2], items[1::2], strict=True))
+    if complete and len(items) == 1:
+        raise ValueError(items)  # brackets alone make no tuple
+    return tuple(items)
+
+
+def _unquoted(text: str) -> str:
+    """Return what a quoted text says; raises ValueError or KeyError for escapes that `repr` does not write."""
+    return _ESCAPE.sub(lambda it: _SHORT_ESCAPES[it[4]] if it[4] else chr(int(it[1] or it[2] or it[3], 16)), text[1:-1])
 
 
 def _dtype(descr: Any) -> np.dtype[Any]:
@@ -233,6 +296,7 @@ def _checked_field(field: Any, fields: list[int]) -> tuple[Any, ...]:
         raise ValueError(field)
     name, descr, *shape = field
     names = name if isinstance(name, tuple) else (name,)
+    # A name, or a title and a name.
     if len(names) > 2 or not all(isinstance(text, str) for text in names):
         raise ValueError(name)
     checked = (name, _checked(descr, fields))

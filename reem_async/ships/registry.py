@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 from ..errors import BadData, BadType
@@ -15,9 +16,15 @@ from .numpy import NumpyShip
 
 __all__ = ["Registered", "Ships", "default_ships"]
 
+# Stands for the key in the command that a ship records; no real key begins with a zero byte.
 _STAND_IN = "\0the key\0"
 _METHODS = ("check_fit", "write", "read", "interpret_read", "get_label")
 _JSON_TYPES = frozenset({str, int, float, bool, type(None)})
+_SAMPLES: tuple[Any, ...] = (
+    *("", "text", 0, 1, 0.0, 0.5, False, True, None),
+    *([], [0], [0.5] * 100, ["text"], [[0.5]], (), (0,), (0.5,) * 3, {}, {"a": 0}, {"a": {"b": [0.5]}}),
+)
+"""What ships are shown to find out whether one takes what JSON could hold."""
 
 
 def default_ships() -> list[SpecialDatatypeShip]:
@@ -33,6 +40,7 @@ def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
 def _is_plain_blob(ship: BlobShip) -> bool:
     """Return whether `pack` and `unpack` are all there is to it."""
     kind = type(ship)
+    # A subclass that overrides these has its own commands: it takes the general way, not the one for a single string.
     plain = all(getattr(kind, name) is getattr(BlobShip, name) for name in ("write", "read", "interpret_read"))
     return plain and not inspect.iscoroutinefunction(kind.unpack)
 
@@ -69,6 +77,10 @@ class Ships:
     Args:
         ships: The ships, first come first served; they replace the default list.
         new_recorder: Makes an object with redis-py's command methods and a list `commands`.
+
+    Attributes:
+        claimed: The types that JSON has of which a ship takes some values.
+        asks_first: Whether there are such types, or asynchronous ships have yet to be asked.
     """
 
     def __init__(self, ships: Iterable[SpecialDatatypeShip], new_recorder: Callable[[], Any]) -> None:
@@ -77,7 +89,11 @@ class Ships:
         self.asynchronous = any(is_asynchronous(ship) for ship in self.given)
         self._registered: list[Registered] = []
         self._by_label: dict[str, Registered] = {}
+        self.claimed: frozenset[type] = frozenset()
+        self.asks_first = True
+        # Ships that have to be awaited cannot be asked here; `ready` does it before the first call that needs them.
         if not self.asynchronous:
+            self._claim(kind for ship in self.given for kind in _claims(ship))
             for ship in self.given:
                 recorder = new_recorder()
                 ship.read(_STAND_IN, recorder)
@@ -86,20 +102,29 @@ class Ships:
 
     async def ready(self) -> None:
         """Ask asynchronous ships for their labels and read commands; does nothing the second time."""
+        # Not a flag: several tasks may be in here at once, and the list is complete only at the end.
         if len(self._registered) == len(self.given):
             return
-        found = []
+        found: list[Registered] = []
+        claimed: set[type] = set()
         for ship in self.given:
+            claimed.update(await _asked_claims(ship))
             recorder = self.new_recorder()
             await _settled(ship.read(_STAND_IN, recorder))
             found.append(Registered(ship, await _settled(ship.get_label()), _only(recorder.commands, ship)))
         # Another task may have been here meanwhile: what it found is the same, and is replaced at once.
         self._registered, self._by_label = [], {}
+        self._claim(claimed)
         for registered in found:
             self._register(registered)
 
+    def _claim(self, kinds: Iterable[type]) -> None:
+        self.claimed = frozenset(kinds)
+        self.asks_first = bool(self.claimed)
+
     def _register(self, registered: Registered) -> None:
         self._registered.append(registered)
+        # The first ship with a label is the one that reads, as it is the first that is asked to write.
         self._by_label.setdefault(registered.label, registered)
 
     def fits(self, value: Any) -> Registered | None:
@@ -111,8 +136,9 @@ class Ships:
 
     async def choices(self, value: Any) -> Callable[[Any], Registered | None]:
         """Return what `fits` would say for everything inside `value`, asking ships that must be awaited."""
+        # By identity: values need not be hashable, and equal ones may be of different types. `value` keeps them alive.
         chosen: dict[int, Registered | None] = {}
-        for leaf in _leaves(value, set()):
+        for leaf in _leaves(value, set(), self.claimed):
             chosen[id(leaf)] = await self._first_fit(leaf)
         return lambda leaf: chosen.get(id(leaf))
 
@@ -148,14 +174,36 @@ async def _settled(result: Any) -> Any:
     return await result if inspect.isawaitable(result) else result
 
 
-def _leaves(value: Any, seen: set[int]) -> Iterator[Any]:
-    """Yield what is inside `value` and not of a built-in type; circles are refused later."""
-    kind = type(value)
-    if kind in _JSON_TYPES or id(value) in seen:
+def _claims(ship: SpecialDatatypeShip) -> Iterator[type]:
+    """Yield the types that JSON has, of which the ship says that it takes some, or does when shown samples."""
+    yield from getattr(ship, "claims", ())
+    # Known not to take what JSON has; asking them would cost each new interface 40 calls.
+    if type(ship) in (NumpyShip, BytesShip):
         return
-    if kind not in (dict, list, tuple):
+    for sample in _SAMPLES:
+        with suppress(Exception):  # it was made to look at other types only
+            if ship.check_fit(sample):
+                yield type(sample)
+
+
+async def _asked_claims(ship: SpecialDatatypeShip) -> set[type]:
+    found: set[type] = set(getattr(ship, "claims", ()))
+    for sample in _SAMPLES:
+        with suppress(Exception):
+            if await _settled(ship.check_fit(sample)):
+                found.add(type(sample))
+    return found
+
+
+def _leaves(value: Any, seen: set[int], claimed: frozenset[type]) -> Iterator[Any]:
+    """Yield what is inside `value` and not of a built-in type that no ship claims; circles are refused later."""
+    kind = type(value)
+    if id(value) in seen:
+        return
+    if kind in claimed or (kind not in _JSON_TYPES and kind not in (dict, list, tuple)):
         yield value
     if isinstance(value, dict | list | tuple):
+        # Against lists that hold themselves.
         seen.add(id(value))
         for item in value.values() if isinstance(value, dict) else value:
-            yield from _leaves(item, seen)
+            yield from _leaves(item, seen, claimed)

@@ -8,16 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from ..errors import BadData, ReemError, WrongKind
+from ..errors import SELF_EXPLANATORY, BadData, NotConnected, ReemError, Refused, WrongKind
+from ..plain.documents import is_document
 from ..plan import Command, Plan, Reply, wire_commands
 from ..plan.replies import decoded
-from ..state import States
+from .state import States
+
+if TYPE_CHECKING:
+    from .options import Options
 
 __all__ = ["Held", "Transport", "drive"]
 
 _UNWATCH: Command = ("UNWATCH",)
+_UNAPPLIED = (NotConnected, Refused)
+"""Errors of a plan that the server did nothing for."""
 
 
 class Held(Protocol):
@@ -43,6 +49,11 @@ class Transport(Held, Protocol):
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
+        ...
+
+    @property
+    def options(self) -> Options:
+        """How the server is reached; in a cluster, one of its nodes."""
         ...
 
     @property
@@ -105,6 +116,8 @@ async def drive(transport: Transport, plan: Plan) -> Any:
     """
     while True:
         try:
+            # Everything up to the last held plan goes over one connection: WATCH lives on it. The lock on the
+            # connection is given back before an error is raised, since it is no fault of the connection.
             if plan.held:
                 async with transport.hold() as held:
                     outcome = await _drive_held(held, plan)
@@ -115,32 +128,53 @@ async def drive(transport: Transport, plan: Plan) -> Any:
                 outcome = decoded(plan, replies)
         except WrongKind as error:
             raise await _named(transport, error) from None
+        except _UNAPPLIED as error:
+            told = _told(plan, error)
+            # These errors say all there is to know; our own frames and those of redis-py would only stand before them.
+            raise told.with_traceback(None) from (None if told is error else error)
+        except SELF_EXPLANATORY as error:
+            raise error.with_traceback(None) from None
+        # Results are values of users, or of REEM, and never plans.
         if type(outcome) is not Plan:
             return outcome
         plan = outcome
 
 
+def _told(plan: Plan, error: Exception) -> Exception:
+    """Return what to raise for an error that means that `plan` was not applied: others before it may have been."""
+    return error if plan.unfinished is None else plan.unfinished(error)
+
+
 async def _named(transport: Transport, error: WrongKind) -> WrongKind:
     """Return the error with the type that is there."""
     (kind,) = await transport.roundtrip([("TYPE", error.key)])
-    return WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?")
+    text = False
+    if kind == b"string":  # of another program, or a document as servers without JSON keep it
+        (begins,) = await transport.roundtrip([("GETRANGE", error.key, "0", "0")])
+        text = isinstance(begins, bytes) and is_document(begins)
+    return WrongKind(error.key, error.where, kind.decode() if isinstance(kind, bytes) else "?", text=text)
 
 
 class _Raised(NamedTuple):
     """What a decode raised: no fault of the connection, which can be lent again."""
 
-    error: ReemError
+    error: Exception
 
 
 async def _drive_held(held: Held, plan: Plan) -> Any:
     outcome: Any = plan
     while type(outcome) is Plan and outcome.held:
-        replies = await held.roundtrip(wire_commands(outcome))
+        try:
+            replies = await held.roundtrip(wire_commands(outcome))
+        except NotConnected as error:
+            raise _told(outcome, error) from error
         try:
             outcome = decoded(outcome, replies)
+        # The replies are not the protocol's: the connection is not to be used again, so it leaves with the error.
         except BadData:
             raise
         except ReemError as error:
+            # The next borrower must not have his transaction fail over keys that he does not know of.
             await held.roundtrip([_UNWATCH])
-            return _Raised(error)
+            return _Raised(_told(outcome, error) if isinstance(error, _UNAPPLIED) else error)
     return outcome

@@ -9,20 +9,22 @@ from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, 
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
 
-from ..background import in_background
-from ..errors import InterfaceClosed, ReemError, WrongLoop
+from ..concurrency.locks import Locks
+from ..concurrency.tasks import Tasks
+from ..concurrency.timeouts import patience
+from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
-from ..state import States
 from . import Held
 from .identity import WHO, who
-from .nearby import Nearby
-from .options import Options
-from .patience import patience
+from .options import Options, ShorterWay
+from .state import States
+from .text import HeldText, Text
 from .wire import BUFFER, Wire, open_wire
 
 __all__ = ["AsyncTransport"]
 
+# Connections for WATCH that are kept for the next one who needs one; more at the same time are made and closed again.
 _SPARE = 4
 _PING: Command = ("PING",)
 _COURTESIES = 3
@@ -49,12 +51,19 @@ class AsyncTransport:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = 0
         self._closed = False
+        # Two shared connections: False for small calls, True for large values, which nobody waits behind.
         self._lanes: dict[bool, Wire] = {}
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
+        self._open: set[Wire] = set()
+        # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
         self._leaving: set[Wire] = set()
-        self._orders: dict[str, asyncio.Lock] = {}
+        self._orders = Locks(asyncio.Lock)
+        self._text = Text()
+        # By document: what cancelled callers have left on its way. A later write to the same document waits for it.
         self._left: dict[str, set[asyncio.Future[Any]]] = {}
+        # Not cancelled by `close`: callers share an attempt to connect, which ends by itself, within its time limit.
+        self._tasks = Tasks()
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
         self._farewell: AsyncGenerator[None, None] | None = None
@@ -63,18 +72,39 @@ class AsyncTransport:
         """Send `commands` on the shared wire, or on the one for large values; awaited, it is the replies."""
         large = has_large(commands)
         wire = self._lanes.get(bulk or large)
+        # The hot path is one look at what can be wrong; everything else is decided in `_lane`.
         if wire is None or not wire.alive or self._loop is not asyncio.get_running_loop() or self._closed:
             return self._connected(commands, bulk or large)
+        if wire.plain:
+            return self._as_text(commands, bulk)
         return self.upload(wire, commands) if large else wire.roundtrip(commands)
 
     async def _connected(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         wire = await self._lane(bulk)
+        if wire.plain:
+            return await self._as_text(commands, bulk)
         return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))
+
+    async def _as_text(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+        """Send to a server that has no JSON."""
+        sent = self._text.shortcut(commands)
+        if sent is not None:
+            return self._text.finished(commands, await self._as_it_is(sent, bulk=bulk))
+        return await self._text.roundtrip(self._as_it_is, self, commands, bulk)
+
+    async def _as_it_is(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send what any server takes."""
+        large = has_large(commands)
+        wire = self._lanes.get(bulk or large)
+        if wire is None or not wire.alive:
+            wire = await self._lane(bulk or large)
+        return await (self.upload(wire, commands) if large else wire.roundtrip(commands))
 
     async def upload(self, wire: Wire, commands: Sequence[Command]) -> list[Reply]:
         """Send what is large. A caller who is cancelled leaves it on its way, with a note of that."""
         shared = self._lanes.get(False)
         wire.limit_buffer(_PORTION if shared is not None and shared.idle < _COMPANY else BUFFER)
+        # What was begun must be sent to its end: half a command would be read together with the next one.
         arrived: asyncio.Future[list[Reply] | Exception] = wire.begin(commands)
         try:
             outcome = await asyncio.shield(arrived)
@@ -99,8 +129,9 @@ class AsyncTransport:
         self.check()
         opening = self._opening.get(bulk)
         if opening is None:
-            opening = self._opening[bulk] = in_background(self._open_lane(bulk), "reem connect")
+            opening = self._opening[bulk] = self._tasks.start(self._open_lane(bulk), "reem connect")
             opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # all may have gone away
+        # One caller who is cancelled does not take the connection from the others who wait for it.
         return await asyncio.shield(opening)
 
     async def _open_lane(self, bulk: bool) -> Wire:
@@ -108,6 +139,7 @@ class AsyncTransport:
             wire = self._lanes[bulk] = await self._opened(large=bulk)
             return wire
         finally:
+            # Not if all was forgotten meanwhile, and another attempt has begun since.
             if self._opening.get(bulk) is asyncio.current_task():
                 del self._opening[bulk]
 
@@ -121,26 +153,43 @@ class AsyncTransport:
         """Return a new connection, unless the interface was closed while it was made."""
 
         def gone(wire: Wire, reason: Exception) -> None:
-            self.states.lost(reason)
+            self._open.discard(wire)
             if on_lost is not None:
+                self.states.lost(reason)
                 on_lost(wire, reason)
+            elif not isinstance(reason, InterfaceClosed):
+                self._missed(reason)
 
         nearby = self._options.nearby
         wire = await (open_wire(self._options, large=large) if nearby is None else self._nearest(nearby, large))
+        # Closed while this was made: nobody else knows of the connection.
         if self._closed:
             await wire.close()
             self.check()
+        self._open.add(wire)
         wire.on_push, wire.on_lost = on_push, gone
         wire.send([WHO], lambda replies: self.states.opened(self._options.address, who(replies)))
         return wire
 
-    async def _nearest(self, nearby: Nearby, large: bool) -> Wire:
+    def _missed(self, reason: Exception) -> None:
+        """Find out whether the server is gone with a connection for calls: nobody may call for a long time."""
+        for other in list(self._open):  # one that does not answer in time breaks as well; the last one tells
+            other.send([_PING], lambda _: None)
+        if not self._open and self.states.lost(reason):
+            self._tasks.start(self._made_anew(), "reem connect")
+
+    async def _made_anew(self) -> None:
+        with contextlib.suppress(ReemError, OSError):  # the next call says what is the matter
+            await self._lane(False)
+
+    async def _nearest(self, nearby: ShorterWay, large: bool) -> Wire:
         """Return a new connection: through the server's socket, if it is found."""
         through = await self._through(nearby, large)
         if through is not None:
             return through
         wire = await open_wire(self._options, large=large)
         try:
+            # Only the server itself says where its socket is, so the first connection always goes to the address.
             nearby.learn(await wire.roundtrip([WHO]))
             through = await self._through(nearby, large)
         except BaseException:
@@ -151,7 +200,7 @@ class AsyncTransport:
         await wire.close()
         return through
 
-    async def _through(self, nearby: Nearby, large: bool) -> Wire | None:
+    async def _through(self, nearby: ShorterWay, large: bool) -> Wire | None:
         way = nearby.way
         if way is None:
             return None
@@ -180,6 +229,8 @@ class AsyncTransport:
             self._loop = loop
             self._farewell = self._end_with_loop()
             with contextlib.suppress(StopIteration):
+                # Stepped by hand up to its `yield`: the event loop knows it from then on, and ends it when it shuts
+                # down.
                 self._farewell.__anext__().__await__().send(None)
 
     async def _end_with_loop(self) -> AsyncGenerator[None, None]:
@@ -195,6 +246,7 @@ class AsyncTransport:
         self._lanes.clear()
         self._opening.clear()
         self._spare.clear()
+        self._open.clear()
         self._leaving.clear()
         self._orders.clear()
         self._left.clear()
@@ -208,11 +260,12 @@ class AsyncTransport:
         wire = self._spare.pop() if self._spare else await self._opened()
         lent = _Lent(self, wire)
         try:
-            yield lent
+            # It may have watched keys, and is not asked to forget them after an error: it is closed.
+            yield HeldText(lent, self._text) if wire.plain else lent
         except BaseException:
             if lent.is_uploading:  # its reply tells when what is on its way has arrived
                 self._leaving.add(wire)
-                in_background(self._close_idle(wire), "reem close")
+                self._tasks.start(self._close_idle(wire), "reem close")
             else:
                 await wire.close()
             raise
@@ -223,9 +276,15 @@ class AsyncTransport:
 
     async def _close_idle(self, wire: Wire) -> None:
         with contextlib.suppress(ReemError):
+            # Answered in order, so behind what is on its way.
             await wire.roundtrip([_PING])
         self._leaving.discard(wire)
         await wire.close()
+
+    @property
+    def options(self) -> Options:
+        """How the server is reached."""
+        return self._options
 
     @property
     def timeout(self) -> float:
@@ -248,11 +307,15 @@ class AsyncTransport:
         """Wait until the calls under way on the shared wire, or about to begin, are answered; returns that it did."""
         self.check()
         for _ in range(_COURTESIES):
+            # Calls that were made in this turn of the loop are sent in the next.
             await asyncio.sleep(0)
             wire = self._lanes.get(False)
             if wire is None or not wire.busy:
                 break
-            await wire.roundtrip([_PING])  # answered after all the others
+            try:
+                await wire.roundtrip([_PING])  # answered after all the others
+            except ConnectionLost:  # of their connection; the call has another one
+                break
         return True
 
     def is_settled(self, document: str) -> bool:
@@ -270,7 +333,7 @@ class AsyncTransport:
         """Return the lock of `key`."""
         if self._loop is not asyncio.get_running_loop() or self._pid != os.getpid():
             self.check()  # a lock of another event loop, or of the parent process, is no lock here
-        return self._orders.get(key) or self._orders.setdefault(key, asyncio.Lock())
+        return self._orders.of(key)
 
     def broken_off(self) -> None:
         """Do nothing: in an event loop calls end by being cancelled, which gives everything back."""

@@ -7,28 +7,30 @@ the core over this transport is run to its end by a single step.
 from __future__ import annotations
 
 import collections
-import contextlib
 import os
 import select
 import socket
 import struct
-import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
-from typing import Any
 
-from ..courtesy import give_way
+import redis.exceptions
+
+from ..concurrency.aside import aside
+from ..concurrency.locks import Locks, ThreadLock
+from ..concurrency.scheduling import give_way
+from ..concurrency.timeouts import LOOKS, moved_last, patience, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
-from ..state import States
+from . import Held
 from .identity import WHO, who
-from .nearby import Nearby
-from .options import Options
+from .options import Options, ShorterWay
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import LOOKS, moved_last, patience, unsent
+from .state import States
+from .text import PROBE, HeldText, Text, is_plain, lists_json
 
 __all__ = ["BlockingTransport"]
 
@@ -63,11 +65,14 @@ class _Line:
         self._poll = select.poll() if hasattr(select, "poll") else None
         if self._poll is not None:
             self._poll.register(self._socket, select.POLLIN)
-        self._small = SmallReader()
+        self._small = SmallReader(options.largest)
+        self._largest = options.largest
         self._large: LargeReader | None = None
         self.broken = False
-        self.introduction = self.exchange([WHO])
-        self._states.opened(options.address, who(self.introduction))
+        known = lists_json(self._connection.handshake_metadata)
+        self.introduction, *probed = self.exchange([WHO] if known else [WHO, PROBE])
+        self.plain = bool(probed) and is_plain(probed[0])
+        self._states.opened(options.address, who([self.introduction]))
 
     def _set_limit(self, limit: float) -> None:
         """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
@@ -100,7 +105,7 @@ class _Line:
                 self._send_large(pieces, limit)
                 receive = partial(self._receive_patiently, limit)
             if bulk and self._large is None:
-                self._large = LargeReader()
+                self._large = LargeReader(self._largest)
             replies = self._replies((bulk and self._large) or self._small, len(commands), receive)
             self.broken = False
             return replies
@@ -119,7 +124,11 @@ class _Line:
             raise
 
     def _replies(self, reader: Reader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
-        """Read `count` replies. Nothing is left over: nothing else was asked."""
+        """Read `count` replies. Nothing is left over: nothing else was asked.
+
+        Raises:
+            redis.exceptions.InvalidResponse: Something is.
+        """
         replies: list[Reply] = []
         gets = reader.gets
         while True:
@@ -129,8 +138,12 @@ class _Line:
             reader.received(received)
             while (reply := gets()) is not MORE:
                 replies.append(reply)
-                if len(replies) == count:
-                    return replies
+            if replies:
+                reader.fed = 0
+            if len(replies) > count:
+                raise redis.exceptions.InvalidResponse("more replies than were asked for")
+            if len(replies) == count:
+                return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
         """Send large values, letting small calls of other threads pass; bytes that move begin the limit anew."""
@@ -212,7 +225,8 @@ class BlockingTransport:
         self._under_way: set[_Line] = set()  # lines of calls that have nothing large to send
         self._pid = os.getpid()
         self._closed = False
-        self._orders: dict[str, _Locked] = {}
+        self._orders = Locks(ThreadLock)
+        self._text = Text()
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
 
@@ -224,7 +238,7 @@ class BlockingTransport:
     def _forked(self) -> None:
         # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
         # descriptors, without a word to the server.)
-        self._idle, self._orders, self._pid = collections.deque(), {}, os.getpid()
+        self._idle, self._orders, self._pid = collections.deque(), Locks(ThreadLock), os.getpid()
         self._under_way = set()
 
     def _take(self) -> _Line:
@@ -232,16 +246,18 @@ class BlockingTransport:
             self.check()
         if self._pid != os.getpid():
             self._forked()
+        stale: _Line | None = None
         while True:
             try:
                 line = self._idle.pop()
             except IndexError:
-                line = self._opened()
-                break
+                if stale is not None:  # there was none left
+                    stale.lost("the server closed an idle connection")
+                return aside(self._opened)
             if line.fresh():
-                break
-            line.lost("the server closed an idle connection")
-        return line
+                return line
+            line.close()
+            stale = line
 
     def _opened(self) -> _Line:
         """Return a new connection: through the server's socket, if that is looked for and found."""
@@ -252,7 +268,7 @@ class BlockingTransport:
         if through is not None:
             return through
         line = _Line(self._options, self.states, self._under_way)
-        nearby.learn(line.introduction)
+        nearby.learn([line.introduction])
         try:
             through = self._through(nearby)
         except BaseException:
@@ -263,7 +279,7 @@ class BlockingTransport:
         line.close()
         return through
 
-    def _through(self, nearby: Nearby) -> _Line | None:
+    def _through(self, nearby: ShorterWay) -> _Line | None:
         way = nearby.way
         if way is None:
             return None
@@ -277,6 +293,8 @@ class BlockingTransport:
         self._under_way.discard(line)
         if line.broken or self._closed:
             line.close()
+            while self._idle:  # likely of the same fate; a new one says how things are
+                self._idle.pop().close()
             return
         self._idle.append(line)
 
@@ -285,22 +303,32 @@ class BlockingTransport:
         line = self._take()
         try:
             self._under_way.add(line)
-            return line.exchange(commands, bulk)
+            if not line.plain:
+                return line.exchange(commands, bulk)
+            sent = self._text.shortcut(commands)
+            if sent is not None:
+                return self._text.finished(commands, line.exchange(sent, bulk))
+            return await self._text.roundtrip(line.roundtrip, _Mine(self, line), commands, bulk)
         finally:
             self._give(line)
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[_Line]:
+    async def hold(self) -> AsyncIterator[Held]:
         """Lend a connection; it is broken if the caller leaves with an error."""
         line = self._take()
         try:
             self._under_way.add(line)
-            yield line
+            yield HeldText(line, self._text) if line.plain else line
         except BaseException:
             line.close()
             raise
         finally:
             self._give(line)
+
+    @property
+    def options(self) -> Options:
+        """How the server is reached."""
+        return self._options
 
     @property
     def timeout(self) -> float:
@@ -334,11 +362,11 @@ class BlockingTransport:
         """Return the lock of `key`."""
         if self._pid != os.getpid():
             self._forked()
-        return self._orders.get(key) or self._orders.setdefault(key, _Locked())
+        return self._orders.of(key)
 
     def broken_off(self) -> None:
         """Give back what a call of this thread holds that ended in an exception of somebody else's: Ctrl-C, mostly."""
-        for order in list(self._orders.values()):
+        for order in self._orders.all():
             order.let_go()
 
     async def close(self) -> None:
@@ -353,29 +381,21 @@ class BlockingTransport:
             self._idle.pop().close()
 
 
-class _Locked:
-    """A thread lock with the face of an asynchronous one; waiting for it blocks the thread.
+class _Mine:
+    """A connection that is taken already, lent once more; it is broken if the caller leaves with an error."""
 
-    Ctrl-C may come between any two steps, also just after it was taken, or before it is given back: `let_go` is for
-    that. And a thread that has it, in a handler of signals for example, does not wait for itself.
-    """
+    def __init__(self, transport: BlockingTransport, line: _Line) -> None:
+        self._line = line
+        self._text = transport._text
+        self.ordered = transport.ordered
 
-    __slots__ = ("_lock",)
+    def hold(self) -> _Mine:
+        """Lend it."""
+        return self
 
-    def __init__(self) -> None:
-        self._lock = threading.RLock()
+    async def __aenter__(self) -> Held:
+        return HeldText(self._line, self._text)
 
-    async def __aenter__(self) -> None:
-        self._lock.acquire()
-
-    async def __aexit__(self, *_: Any) -> None:
-        try:
-            self._lock.release()
-        except RuntimeError:  # a call in a handler of signals has let go of all
-            return
-
-    def let_go(self) -> None:
-        """Give it back if this thread still has it."""
-        with contextlib.suppress(RuntimeError):
-            while True:
-                self._lock.release()
+    async def __aexit__(self, kind: object, *_: object) -> None:
+        if kind is not None:
+            self._line.close()

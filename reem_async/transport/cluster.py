@@ -22,14 +22,14 @@ import redis.exceptions
 
 from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected, TlsRefused
 from ..plan import Command, Reply
-from ..state import States
 from . import Held, Transport
-from .endpoints import NewTransport, address_of, listed
+from .addresses import NewTransport, address_of, listed
 from .options import Address, NodeOptions, Options
 from .publication import Publication
 from .redirects import Moved, key_slot, publishes, refusal, slot_of, slots_of
 from .rooted import Rooted
-from .route import HeldAcross, Route, asked_of, places_refused
+from .route import HeldAcross, Route, asked_of, looked_early, places_refused
+from .state import States
 
 __all__ = ["ClusterOptions", "ClusterTransport"]
 
@@ -90,13 +90,17 @@ class ClusterTransport(Rooted):
         self._options = options
         self._new_transport = new_transport
         self._nodes: dict[Address, Transport] = {}
+        # By slot; None before the first look, and for slots that no node has.
         self._owners: list[Transport | None] = [None] * SLOTS
         self._primaries: tuple[Address, ...] = ()
         self._replicas: dict[Transport, tuple[Address, ...]] = {}
+        # When a node did not answer last: it is asked for the layout behind all others.
         self._failed: dict[Address, float] = {}
+        # Nodes that a connection was lost to, and that nobody has reached since.
         self._gone: set[Address] = set()
         self._looked = 0.0
         self.states = States()
+        # Any node will do: it lends its locks and its event loop, and lives as long as this.
         self._root = self._node(options.seeds[0])
 
     def _node(self, address: Address) -> Transport:
@@ -117,9 +121,11 @@ class ClusterTransport(Rooted):
             if commands[-1][0] == "EXEC":
                 return await (self._publish(commands, bulk) if publishes(commands) else self._apply(commands, bulk))
             slots = slots_of(commands)
+            # Commands of several top-level keys, as listings and migrations send them; a plan that writes has one slot.
             if len(set(slots)) > 1:
                 return await self._scattered(commands, slots, bulk)
         slot = slot_of(commands)
+        # The hot path: one look into a list, and one round trip if the layout is still what it was.
         owner = None if slot is None else self._owners[slot]
         if owner is None:
             return await self._apply(commands, bulk)
@@ -153,8 +159,17 @@ class ClusterTransport(Rooted):
         return list(self._nodes.values())
 
     async def nodes(self) -> Sequence[Transport]:
-        """Return the primaries, which together hold all keys."""
+        """Return the primaries, which together hold all keys.
+
+        Raises:
+            NotConnected: No node answers, or slots have none.
+        """
         await self.look()
+        if missing := self._owners.count(None):
+            raise NotConnected(
+                f"{missing} slots of the cluster at {self._options.address} have no node, so a part of the keys cannot "
+                "be reached; `redis-cli --cluster check host:port` tells which, and --cluster fix mends it"
+            )
         return [self._node(address) for address in self._primaries]
 
     async def owner(self, key: str | bytes, *, anew: bool = False) -> Transport:
@@ -198,6 +213,7 @@ class ClusterTransport(Rooted):
         self.check()
         asked = time.monotonic()
         async with self._root.ordered("the layout of the cluster"):
+            # Another caller has looked while this one waited for the lock.
             if self._looked > asked - _LOOK_PAUSE:
                 return
             known = {*self._primaries, *self._nodes, *self._options.seeds}
@@ -215,6 +231,7 @@ class ClusterTransport(Rooted):
                 self._learn(reply, address[0])
                 self._looked = time.monotonic()
                 return
+        # A certificate that is not trusted needs somebody to act, and no waiting mends it.
         kind = TlsRefused if isinstance(reason, TlsRefused) else NotConnected
         raise kind(f"no node of the cluster answers; the last one tried: {reason}") from reason
 
@@ -236,12 +253,14 @@ class ClusterTransport(Rooted):
             address, *others = [_address(host, port, asked) for host, port, *_ in rows]
             primaries[address] = None
             owner = self._node(address)
+            # CLUSTER SLOTS names ranges, both ends included; of each the primary first.
             owners[first : last + 1] = [owner] * (last + 1 - first)
             replicas[owner] = tuple(others)
         self._owners, self._primaries, self._replicas = owners, tuple(primaries), replicas
-        if self._gone and not self._gone.intersection(primaries):  # whoever was lost is not needed any more
-            self._gone.clear()
-            self.states.opened(self._options.address, None)
+        if self._gone:
+            self._gone.intersection_update(primaries)  # the others are not needed any more
+            if not self._gone:
+                self.states.opened(self._options.address, None)
 
     def moved(self, problem: Any, asked: Transport) -> Transport:
         """Note what a redirection says, and return the node it names."""
@@ -251,6 +270,7 @@ class ClusterTransport(Rooted):
                 (address[0] for address, node in self._nodes.items() if node is asked), self._options.seeds[0][0]
             )
         node = self._node((host, port))
+        # MOVED is for good. ASK is about one key while its slot moves, so it changes nothing here.
         if isinstance(problem, Moved):
             self._owners[problem.slot_id] = node
         return node
@@ -265,7 +285,7 @@ class ClusterTransport(Rooted):
         replies: list[Reply] | None = None,
         asked: Transport | None = None,
     ) -> list[Reply]:
-        """Send `commands` until a node has applied them all, each once.
+        """Send `commands` until a node has applied them all, each once; what was not in time is answered by an error.
 
         Args:
             commands: What to send.
@@ -273,37 +293,66 @@ class ClusterTransport(Rooted):
             problem: Why they, or some of them, were not applied by
             asked: the node that was asked already, and
             replies: what it replied.
+
+        Raises:
+            NotConnected: Nothing was applied in time.
         """
         route = Route(self, slot_of(commands), asked)
         whole = commands[-1][0] == "EXEC"
+        # A place for each command; what stands in it before its reply is never looked at.
         answers: list[Reply] = list(replies or commands)
         left = places_refused(answers) if replies is not None and not whole else list(range(len(commands)))
-        if problem is not None:
-            await route.refused(problem)
-        while True:
-            try:
-                node = await route.node()
-                got = await asked_of(node, [commands[place] for place in left], route.asking, bulk)
-            except NotConnected as error:
-                await route.refused(error)
-                continue
-            problem = refusal(got)
-            for place, reply in zip(left, got, strict=True):
-                answers[place] = reply
-            if problem is None:
-                return answers
-            if not whole:
-                left = places_refused(answers)
-            await route.refused(problem)
+        early = looked_early(commands, left)
+        try:
+            if problem is not None:
+                await route.refused(problem)
+            while True:
+                try:
+                    node = await route.node()
+                    got = await asked_of(node, [commands[place] for place in left], route.asking, bulk)
+                except NotConnected as error:
+                    await route.refused(error)
+                    continue
+                problem = refusal(got)
+                for place, reply in zip(left, got, strict=True):
+                    answers[place] = reply
+                if problem is None:
+                    break
+                # A transaction is applied or not. Of other commands some may be: only those that were not are sent
+                # again.
+                if not whole:
+                    left = places_refused(answers)
+                    early |= looked_early(commands, left)
+                await route.refused(problem)
+            left = sorted(early)
+            for place in left:
+                answers[place] = (await self._apply([commands[place]], bulk))[0]
+        except NotConnected as error:
+            if len(left) == len(commands):
+                raise
+            for place in left:  # the others were applied
+                answers[place] = error
+        return answers
 
     async def _scattered(self, commands: Sequence[Command], slots: Sequence[int | None], bulk: bool) -> list[Reply]:
-        """Send commands that belong to several slots, slot by slot."""
+        """Send commands that belong to several slots: node by node, then one by one what a node did not take."""
         answers: list[Reply] = list(commands)
-        for slot in dict.fromkeys(slots):
-            places = [place for place, each in enumerate(slots) if each == slot]
-            got = await self.roundtrip([commands[place] for place in places], bulk=bulk)
+        nodes: dict[Transport | None, list[int]] = {}
+        for place, slot in enumerate(slots):
+            nodes.setdefault(None if slot is None else self._owners[slot], []).append(place)
+        left = nodes.pop(None, [])
+        for node, places in nodes.items():
+            assert node is not None
+            try:
+                got = await node.roundtrip([commands[place] for place in places], bulk=bulk)
+            except NotConnected:  # nothing was applied
+                left += places
+                continue
             for place, reply in zip(places, got, strict=True):
                 answers[place] = reply
+            left += [places[refused] for refused in places_refused(got)]
+        for place in sorted(left):
+            (answers[place],) = await self.roundtrip([commands[place]], bulk=bulk)
         return answers
 
     async def _publish(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
@@ -311,6 +360,7 @@ class ClusterTransport(Rooted):
         slot = slot_of(commands)
         assert slot is not None  # there is a notice, so there is a key
         route, publication = Route(self, slot), Publication(commands)
+        # Each has a connection of its own, for WATCH; one key's notices keep their order, since it has one slot.
         async with self._root.ordered(f"publishing {slot % _PUBLISHING}"):
             while True:
                 try:
@@ -318,18 +368,19 @@ class ClusterTransport(Rooted):
                     problem, replies = await publication.send_ahead(node, route.asking)
                     if problem is None and replies is None:
                         async with node.hold() as held:
-                            problem, replies = await publication.publish(held, route.asking, bulk)
+                            problem, replies = await publication.publish(held, route, bulk)
                     if replies is not None:
                         return replies
                 except NotConnected as error:
                     problem = error
                 await (route.contended() if problem is None else route.refused(problem))
 
-    def lost(self, address: Address, reason: Exception) -> None:
-        """Note that a connection to a node broke."""
+    def lost(self, address: Address, reason: Exception) -> bool:
+        """Note that the connections to a node broke; return whether it is missed."""
         if not isinstance(reason, InterfaceClosed):
             self._gone.add(address)
         self.states.lost(reason)
+        return address in self._gone and self.states.last.state != "closed"
 
     def opened(self, address: Address, server: str | None) -> None:
         """Note a connection to a node; all is well when no node is missed any more."""
@@ -356,6 +407,6 @@ class _NodeStates(States):
         """Pass it on."""
         self._cluster.opened(self._node, server)
 
-    def lost(self, reason: Exception) -> None:
+    def lost(self, reason: Exception) -> bool:
         """Pass it on."""
-        self._cluster.lost(self._node, reason)
+        return self._cluster.lost(self._node, reason)

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit, urlunsplit
 
+from ..concurrency.aside import ensure_imported
 from ..errors import BadType, BadValue
 from . import Transport
+from .addresses import NewTransport
 from .nearby import look_nearby
 from .options import Options
 
 if TYPE_CHECKING:
     from .replicas import Replicated
 
-__all__ = ["NewTransport", "address_of", "listed", "way_to"]
-
-NewTransport = Callable[[Options], Transport]
-"""Makes the transport to one server: on an event loop, or for plain threads."""
+__all__ = ["way_to"]
 
 _CLUSTER = ("redis+cluster://", "rediss+cluster://")
 _SENTINEL = ("redis+sentinel://", "rediss+sentinel://")
@@ -37,12 +34,15 @@ def way_to(
         raise BadType(f"read_from_replicas={replicas!r} is not True or False")
     url = host if isinstance(host, str) else getattr(host, "url", "")
     if url.startswith(_CLUSTER):
+        # Imported only where an address asks for it: a program for one server starts without it.
+        ensure_imported("reem_async.transport.cluster")
         from .cluster import ClusterOptions, ClusterTransport
 
         cluster = ClusterOptions(url, timeout, options)
         nodes = ClusterTransport(cluster, new_transport)
         return cluster, nodes, _readers(nodes, cluster, new_transport) if replicas else nodes
     if url.startswith(_SENTINEL):
+        ensure_imported("reem_async.transport.sentinel")
         from .sentinel import SentinelOptions, SentinelTransport
 
         watched = SentinelOptions(url, timeout, options)
@@ -61,33 +61,7 @@ def way_to(
 
 
 def _readers(primaries: Replicated, options: Options, new_transport: NewTransport) -> Transport:
+    ensure_imported("reem_async.transport.replicas")
     from .replicas import Readers
 
     return Readers(primaries, options, new_transport)
-
-
-def address_of(url: str, port: int) -> tuple[str, int]:
-    """Return host and port of a plain URL; `port` if it names none."""
-    parts = urlsplit(url)
-    return parts.hostname or "localhost", parts.port or port
-
-
-def listed(url: str, example: str) -> list[str]:
-    """Return a URL that lists several hosts as one plain URL for each: redis+x://u@a:1,b:2/c as redis://u@a:1/c, ...
-
-    Raises:
-        BadValue: No host, or a port that is no number; never quotes the URL, which may hold a password.
-    """
-    parts = urlsplit(url)
-    login, at, hosts = parts.netloc.rpartition("@")
-    urls = []
-    for each in hosts.split(","):
-        one = urlsplit(f"//{each}")
-        try:
-            sound = bool(one.hostname) and (one.port is None or one.port > 0)
-        except ValueError:
-            sound = False
-        if not sound:
-            raise BadValue(f"{each!r} is not a host with a port; write it like {example}")
-        urls.append(urlunsplit((parts.scheme.partition("+")[0], login + at + each, parts.path, parts.query, "")))
-    return urls

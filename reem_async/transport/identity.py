@@ -17,6 +17,7 @@ _RUN = re.compile(rb"run_id:([0-9a-f]{8,64})")
 
 def who(replies: Any) -> str | None:
     """Return what the server's process calls itself, None if it did not say (or if an error is given)."""
+    # An error, or a user who may not ask: restarts are then not told of, and all else goes on.
     text = replies[0] if isinstance(replies, list) and replies else None
     found = _RUN.search(text) if isinstance(text, bytes | bytearray) else None
     return None if found is None else found[1].decode()

@@ -46,7 +46,7 @@ class Nearby:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._vain: str | None = None
-        self.way: Way | None = None
+        self.way: Options | None = None
 
     def learn(self, replies: Any) -> None:
         """Note what the server at the address says of itself, asked who it is.
@@ -54,13 +54,14 @@ class Nearby:
         Where its port is another one, something stands in between, on purpose: a tunnel, or a proxy.
         """
         process = who(replies)
+        # The socket of this process was tried and does not work (another container, no right to it): not again.
         if process is None or process == self._vain:
             return
         port, pid, path = (pattern.search(replies[0]) for pattern in (_PORT, _PID, _SOCKET))
         if port and pid and path and int(port[1]) == int(self._options.settings.get("port", 6379)):
             self.way = Way(self._options, os.fsdecode(path[1]), process, int(pid[1]))
 
-    def give_up(self, way: Way, error: Exception) -> None:
+    def give_up(self, way: Options, error: Exception) -> None:
         """Note that `way` could not be gone. As long as the same process is at the address, it is not tried again.
 
         Raises:
@@ -68,7 +69,7 @@ class Nearby:
         """
         if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
             raise error
-        self._vain, self.way = way.process, None
+        self._vain, self.way = (way.process if isinstance(way, Way) else None), None
 
 
 class Way(Options):
@@ -87,7 +88,9 @@ class Way(Options):
         self._pid = pid
         settings = {name: value for name, value in by_address.settings.items() if not name.startswith("socket_keepa")}
         settings.pop("socket_type", None)
-        super().__init__("localhost", by_address.timeout, settings | {"unix_socket_path": path})
+        super().__init__(
+            "localhost", by_address.timeout, settings | {"unix_socket_path": path, "largest_value": by_address.largest}
+        )
 
     @property
     def address(self) -> str:
@@ -100,6 +103,7 @@ class Way(Options):
         log_in = connection.on_connect_check_health
 
         async def check_first(**options: Any) -> None:
+            # Before AUTH is sent: a stranger who listens at the path must not get the password.
             self._check_listener(connection._writer.get_extra_info("socket"))
             await log_in(**options)
 
@@ -129,6 +133,7 @@ class Way(Options):
     def _check_listener(self, listening: Any) -> None:
         """Raise redis.exceptions.ConnectionError if somebody else listens there: he gets no password."""
         with socket.socket(fileno=os.dup(listening.fileno())) as connected:
+            # A copy of the descriptor: closing this socket object must not close the connection.
             told = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         if _CREDENTIALS.unpack(told)[0] != self._pid:
             raise redis.exceptions.ConnectionError("another process listens at the server's socket")

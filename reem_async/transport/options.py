@@ -12,19 +12,20 @@ import ssl
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import redis
 import redis.asyncio
 import redis.exceptions
 from redis.asyncio.connection import parse_url
 
+from ..concurrency.timeouts import LONGEST, check_timeout
 from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
 from ..plan import Command
 from ..plan.replies import refusal
-
-if TYPE_CHECKING:
-    from .nearby import Nearby
+from .packing import Packer
+from .parsing import LARGEST
 
 __all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machine", "question", "question_here"]
 
@@ -32,22 +33,41 @@ Address = tuple[str, int]
 """Host and port."""
 
 _SCHEMES = ("redis://", "rediss://", "unix://")
+_LEAST = 1 << 20
+"""Bytes a string in a reply must be allowed: REEM itself asks for pages of names, and INFO."""
 _TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
+
+
+class ShorterWay(Protocol):
+    """What is known of a shorter way to a server than its address.
+
+    Attributes:
+        way: How to reach the server that way; None as long as none is known, or of use.
+    """
+
+    way: Options | None
+
+    def learn(self, replies: Any) -> None:
+        """Note what the server at the address says of itself."""
+
+    def give_up(self, way: Options, error: Exception) -> None:
+        """Note that `way` could not be gone; raises the error if the server does not answer at all."""
 
 
 class Options:
     """How to reach one server.
 
     Args:
-        host: A host name, a URL (`redis://`, `rediss://`, `unix://`), or an `EmbeddedServer`.
+        host: A host name, `host:port`, a URL (`redis://`, `rediss://`, `unix://`), or an `EmbeddedServer`.
         timeout: Seconds without a byte moving after which a call is given up.
-        options: redis-py's connection options (`port`, `db`, `username`, `password`, `ssl`, ...).
+        options: redis-py's connection options (`port`, `db`, `username`, `password`, `ssl`, ...), and `largest_value`.
 
     Raises:
         BadValue: A URL that cannot be parsed, or an option that cannot be meant.
         BadType: An option that redis-py does not know.
 
     Attributes:
+        largest: Bytes that a string in a reply may have.
         nearby: What is known of a shorter way to the same server, if one is looked for; else None.
 
     Warns:
@@ -55,11 +75,14 @@ class Options:
     """
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
-        self.timeout = timeout
-        self.nearby: Nearby | None = None
+        self.nearby: ShorterWay | None = None
         self.settings = {**_address(host), **options}
+        limit = self.settings.pop("socket_timeout", timeout)  # redis-py's name for it; None is no limit there
+        self.timeout = timeout = LONGEST if limit is None else check_timeout(limit)
         if self.settings.setdefault("protocol", 3) not in (3, "3"):
             raise BadValue("REEM speaks protocol 3 (notices and replies share a connection); leave protocol= out")
+        self.largest = _size(self.settings.pop("largest_value", LARGEST))
+        # A login with TLS takes several round trips, which a time limit for single calls does not mean.
         self.handshake_timeout = max(timeout, 1.0)
         self.settings.setdefault("socket_connect_timeout", self.handshake_timeout)
         self.tls = bool(self.settings.pop("ssl", False))
@@ -70,6 +93,7 @@ class Options:
         if self.tls:
             self._check_tls()
         try:
+            # Made only to have redis-py refuse wrong options now, and not at the first call; nothing is connected.
             self.asynchronous_connection()
             self.blocking_connection()
         except TypeError as error:
@@ -139,13 +163,14 @@ class Options:
         # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12.
         settings = {"socket_timeout": None, **self.settings}
         if self.socket_path is not None:
-            return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
-        return (module.SSLConnection if self.tls else module.Connection)(**settings)
+            return _greeted(module.UnixDomainSocketConnection(path=self.socket_path, **settings))
+        return _greeted((module.SSLConnection if self.tls else module.Connection)(**settings))
 
     def blocking_connection(self) -> Any:
         """Return a fresh connection of redis, not yet connected."""
         module: Any = redis.connection
-        settings = {"socket_timeout": self.handshake_timeout, **self.settings}
+        # redis-py's time limit is for the handshake only; then the transport sets its own on the socket.
+        settings = {"socket_timeout": self.handshake_timeout, "command_packer": Packer(), **self.settings}
         if self.socket_path is not None:
             return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
         return (module.SSLConnection if self.tls else module.Connection)(**settings)
@@ -161,6 +186,7 @@ class Options:
             return TlsRefused(f"no TLS connection to {self.address}: it was closed at once; {_CERTIFICATE}")
         text = self._without_password(str(error))
         code = "NOAUTH" if "HELLO must be called" in text else getattr(error, "status_code", None)
+        # redis-py takes the code off the texts of errors that it knows, and keeps it in `status_code`.
         told = refusal(f"{code} {text}") if code else refusal(text)
         if told is None and isinstance(error, redis.exceptions.AuthenticationError):
             told = LoginRefused(f"the login was refused: {text}")
@@ -169,7 +195,7 @@ class Options:
         if isinstance(error, redis.exceptions.ResponseError):
             return NotConnected(
                 f"the server at {self.address} does not take the greeting ({text:.200}); "
-                "REEM needs Redis 7 or Valkey with RedisJSON, or newer"
+                "REEM needs Redis 7, or Valkey, or newer"
             )
         return NotConnected(
             f"no server answers at {self.address} ({_shown(reason, text)}); start one with `reem up` or with "
@@ -186,9 +212,30 @@ class Options:
 
     def _without_password(self, text: str) -> str:
         """Return an error's text, or a word in its place if the server quotes the login in it."""
+        # Servers quote the words of a command that they do not know; those of AUTH are the password.
         text = text.partition("with args beginning")[0]
         secret = self.settings.get("password")
         return "its answer quotes the password" if secret and str(secret) in text else text
+
+
+def _greeted(connection: Any) -> Any:
+    """Have a connection of redis.asyncio look at the reply to HELLO, its first one, as redis-py's blocking one does.
+
+    And keep it, under the same name.
+    """
+    read = connection.read_response
+
+    async def first(*args: Any, **kwargs: Any) -> Any:
+        connection.read_response = read
+        greeting = await read(*args, **kwargs)
+        # A proxy, or an old server, that answers in another protocol: its replies would be read wrong.
+        if not isinstance(greeting, dict) or 3 not in (greeting.get(b"proto"), greeting.get("proto")):
+            raise redis.exceptions.ConnectionError("Invalid RESP version")
+        connection.handshake_metadata = greeting
+        return greeting
+
+    connection.read_response = first
+    return connection
 
 
 class NodeOptions(Options):
@@ -203,10 +250,20 @@ class NodeOptions(Options):
     def __init__(self, of: Options, address: Address, settings: dict[str, Any] | None = None) -> None:
         host, port = address
         settings = of.settings if settings is None else settings
-        super().__init__(host, of.timeout, {**settings, "host": host, "port": port, "ssl": of.tls})
+        super().__init__(
+            host, of.timeout, {**settings, "host": host, "port": port, "ssl": of.tls, "largest_value": of.largest}
+        )
 
     def _warn_of_listeners(self) -> None:
         """Say nothing: it was said of them all."""
+
+
+def _size(given: Any) -> int:
+    """Return the limit for strings in replies that was given: an int, or digits in a URL; raises BadValue."""
+    size = int(given) if isinstance(given, str) and given.isascii() and given.isdigit() else given
+    if type(size) is not int or size < _LEAST:
+        raise BadValue(f"largest_value={given!r} is not a number of bytes of at least {_LEAST}")
+    return size
 
 
 def connecting_by(connection: Any, way: Callable[..., Any]) -> Any:
@@ -269,6 +326,7 @@ def is_this_machine(host: str) -> bool:
 
 def _reason(error: BaseException) -> BaseException:
     """Return what is behind an error of redis-py: the TLS error or the operating system's, else itself."""
+    # redis-py wraps some errors with `from` and some without.
     chain, link = [error], error.__cause__ or error.__context__
     while link is not None and link not in chain:
         chain.append(link)
@@ -305,6 +363,19 @@ def _shown(reason: BaseException, text: str) -> str:
     return f"{text:.200}" or type(reason).__name__
 
 
+def _host_and_port(host: str) -> dict[str, Any]:
+    """Return the connection settings of `host`, `host:port`, `[IPv6]:port`, or an IPv6 address alone."""
+    if ":" not in host or (host.count(":") > 1 and not host.startswith("[")):
+        return {"host": host}
+    try:
+        parts = urlsplit(f"//{host}")
+        if parts.netloc == host and parts.hostname and parts.port:
+            return {"host": parts.hostname, "port": parts.port}
+    except ValueError:
+        pass
+    raise BadValue(f"{host!r} is not a host with a port; write it like localhost:6379 or [::1]:6379")
+
+
 def _address(host: Any) -> dict[str, Any]:
     """Return the connection settings that `host` stands for."""
     socket_path = getattr(host, "socket_path", None)
@@ -316,7 +387,7 @@ def _address(host: Any) -> dict[str, Any]:
     if "://" not in host:
         if "@" in host:
             raise BadValue("host is a name alone; user and password go in username=, password= or in a URL, redis://")
-        return {"host": host}
+        return _host_and_port(host)
     if not host.startswith(_SCHEMES):
         raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")
     try:

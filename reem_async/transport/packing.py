@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import hiredis
+from redis.connection import HiredisRespSerializer
 
 from ..plan import Command
 from ..plan.sizes import LARGE, has_large
 
-__all__ = ["SLOW", "Piece", "pack"]
+__all__ = ["SLOW", "Packer", "Piece", "as_text", "pack"]
 
 Piece = bytes | memoryview
 
@@ -25,6 +26,7 @@ SLOW = 1 << 13
 
 def pack(commands: Sequence[Command]) -> list[Piece]:
     """Return the bytes of `commands`, small ones joined, large buffers as they are."""
+    # The hot path: one join for all commands of a small call.
     if not has_large(commands):
         return [_joined(commands)]
     pieces: list[Piece] = []
@@ -37,6 +39,19 @@ def pack(commands: Sequence[Command]) -> list[Piece]:
     if small:
         pieces.append(b"".join(small))
     return pieces
+
+
+def as_text(word: Any) -> Any:
+    """Return a word as it is sent; numbers as text: hiredis crashes if a signal's handler raises as it formats one."""
+    return str(word) if isinstance(word, int | float) else word
+
+
+class Packer(HiredisRespSerializer):
+    """redis-py's way of packing what it sends itself, with numbers as text, such as that of the protocol in HELLO."""
+
+    def pack(self, *words: Any) -> Any:
+        """Return the bytes of one command."""
+        return super().pack(*map(as_text, words))
 
 
 def _joined(commands: Sequence[Command]) -> bytes:

@@ -13,10 +13,11 @@ import hiredis
 import redis.exceptions
 from redis._parsers import BaseParser
 
+from ..errors import ClusterNode
 from ..plan import Reply
 from ..plan.replies import refusal
 
-__all__ = ["MORE", "NOT_THE_PROTOCOL", "LargeReader", "Reader", "SmallReader"]
+__all__ = ["LARGEST", "MORE", "NOT_THE_PROTOCOL", "LargeReader", "Reader", "SmallReader", "error_of"]
 
 NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError, TypeError, ValueError)
 """What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
@@ -24,33 +25,55 @@ NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError
 MORE: Any = object()
 """What a parser says when it needs more bytes; False and None are replies."""
 
+LARGEST = 1 << 29
+"""Bytes a string in a reply may have unless a user says otherwise: a server takes no larger ones, as it comes."""
+_IN_ALL = 8
+"""How many times as much a whole reply may have: the arrays of a document come together."""
+# Bytes that are received at once, and from which a string is received in place.
 _BUFFER = 1 << 17
 _LARGE = 1 << 15
 _STEP = 1 << 24
 """How much more memory a string may be given than has arrived of it: its length is only a claim."""
+# Levels of lists in lists, and elements of one list. No reply to REEM's commands comes near.
 _DEEPEST = 128
+_MOST_ELEMENTS = 1 << 24
+_LONG, _DIGITS = 8, b"0123456789"
+"""Where a digit stands in the first line of a reply if it announces much: at least ten million of anything."""
+_MUCH = 1 << 24
+"""Bytes after which is asked, again and again, how many of them wait for the end of one string."""
+_BULK = b"$="
 
 
-def _error(text: str) -> Exception:
+def error_of(text: str) -> Exception:
     """Return the exception that an error reply stands for."""
     try:
         return refusal(text) or _parse_error(text)
-    except Exception:  # redis-py takes some texts apart and trusts them to be whole
-        return redis.exceptions.ResponseError(text)
+    except Exception:  # redis-py takes the places in MOVED and ASK apart and trusts them to be whole
+        return ClusterNode(f"the server is a node of a Redis Cluster and names none that has this key: {text:.120}")
 
 
 _parse_error: Any = BaseParser.parse_error
 
 
 class Reader(Protocol):
-    """A parser that says where it wants the next bytes."""
+    """A parser that says where it wants the next bytes, and refuses replies that are too large.
+
+    Attributes:
+        fed: Bytes received of the reply that is under way; whoever takes a reply sets it to 0.
+    """
+
+    fed: int
 
     def target(self) -> memoryview:
         """Return where to put received bytes."""
         ...
 
     def received(self, count: int) -> None:
-        """Take note of `count` bytes put there."""
+        """Take note of `count` bytes put there.
+
+        Raises:
+            redis.exceptions.InvalidResponse: The reply is too large.
+        """
         ...
 
     def gets(self) -> Reply:
@@ -63,14 +86,21 @@ class Reader(Protocol):
 
 
 class SmallReader:
-    """hiredis, handing out error replies as redis-py's exceptions."""
+    """hiredis, handing out error replies as redis-py's exceptions.
 
-    def __init__(self) -> None:
+    Args:
+        largest: Bytes a string in a reply may have.
+    """
+
+    def __init__(self, largest: int = LARGEST) -> None:
+        self.fed = 0
+        self._largest, self._in_all, self._look_at = largest, largest * _IN_ALL, _MUCH
         self._parser = hiredis.Reader(
-            protocolError=redis.exceptions.InvalidResponse, replyError=_error, notEnoughData=MORE
+            protocolError=redis.exceptions.InvalidResponse, replyError=error_of, notEnoughData=MORE
         )
         self._buffer = bytearray(_BUFFER)
         self._view = memoryview(self._buffer)
+        # Bound once: both are called for each reply.
         self._feed: Any = self._parser.feed
         self.gets = self._parser.gets
 
@@ -80,7 +110,39 @@ class SmallReader:
 
     def received(self, count: int) -> None:
         """Parse `count` bytes."""
+        self.fed += count
+        if self.fed == count and self._buffer[_LONG] in _DIGITS:  # a reply begins here, perhaps with a long number
+            self._look_at = _MUCH
+            _check_announced(bytes(self._view[:32]), self._largest)
         self._feed(self._buffer, 0, count)
+        if self.fed > self._look_at:  # of a string, hiredis keeps all until it is whole
+            self._look_at = self.fed + _MUCH
+            _check_size(self._parser.len() - _BUFFER, self._largest)
+            _check_size(self.fed - _BUFFER, self._in_all)
+
+
+def _check_announced(start: bytes, largest: int) -> None:
+    """Refuse a reply that says at its start that it is too large. What cannot be read is the parser's to refuse."""
+    line, end, _ = start[1:].partition(b"\r\n")
+    if not end or not line.isdigit():
+        return
+    if start[0] in _BULK:
+        _check_size(int(line), largest)
+    elif start[0] in b"*~>%":
+        _check_elements(int(line))
+
+
+def _check_size(size: int, limit: int) -> None:
+    if size > limit:
+        raise redis.exceptions.InvalidResponse(
+            f"a reply, or a string in it, of {size} bytes or more, where {limit} is the limit "
+            "(RedisInterface(..., largest_value=) sets it for a string)"
+        )
+
+
+def _check_elements(count: int) -> None:
+    if count > _MOST_ELEMENTS:
+        raise redis.exceptions.InvalidResponse(f"a list of {count} elements, where {_MOST_ELEMENTS} is the limit")
 
 
 class _Open:
@@ -95,13 +157,21 @@ class _Open:
 
 
 class LargeReader:
-    """The Redis protocol, version 3; strings over 32 KB are received in place and come as bytearrays."""
+    """The Redis protocol, version 3; strings over 32 KB are received in place and come as bytearrays.
 
-    def __init__(self) -> None:
+    Args:
+        largest: Bytes a string in a reply may have.
+    """
+
+    def __init__(self, largest: int = LARGEST) -> None:
+        self.fed = 0
+        self._largest, self._in_all = largest, largest * _IN_ALL
         self._buffer = bytearray(_BUFFER)
         self._view = memoryview(self._buffer)
         self._start = self._end = 0
         self._open: list[_Open] = []
+        # A large string that is being received: `_filled` of its `_size` bytes are there, the line end behind it is
+        # not.
         self._large: bytearray | None = None
         self._size = 0
         self._filled = 0
@@ -109,11 +179,13 @@ class LargeReader:
     def target(self) -> memoryview:
         """Return where to put received bytes."""
         if self._large is not None and self._filled < self._size:
+            # It grows as bytes arrive, doubling, so that a length that is only claimed costs no memory.
             if self._filled == len(self._large):
                 self._large.extend(bytes(min(self._size - self._filled, max(_STEP, self._filled))))
             return memoryview(self._large)[self._filled :]
         if self._start == self._end:
             self._start = self._end = 0
+        # Little room is left behind what is not parsed yet: that moves to the front.
         elif self._end > _BUFFER - _LARGE - 1024:
             rest = self._end - self._start
             self._view[:rest] = bytes(self._view[self._start : self._end])
@@ -122,6 +194,9 @@ class LargeReader:
 
     def received(self, count: int) -> None:
         """Take note of `count` bytes put where `target` said."""
+        self.fed += count
+        if self.fed > self._in_all:
+            _check_size(self.fed - _BUFFER, self._in_all)
         if self._large is not None and self._filled < self._size:
             self._filled += count
         else:
@@ -134,6 +209,7 @@ class LargeReader:
             if value is MORE or type(value) is _Open:
                 if value is MORE:
                     return MORE
+                # An aggregate with elements to come. An empty one is complete at once.
                 if value.left:
                     self._open.append(value)
                     if len(self._open) > _DEEPEST:
@@ -165,7 +241,7 @@ class LargeReader:
                 return self._string(None if text == b"-1" else _count(text), after)
             self._start = after
             if kind in b"*%~>":
-                return None if text == b"-1" else _Open(kind, _count(text) * (2 if kind == 0x25 else 1))
+                return None if text == b"-1" else _Open(kind, _elements(text) * (2 if kind == 0x25 else 1))
             return _SCALARS[kind](text)
         except (KeyError, ValueError) as error:
             raise redis.exceptions.InvalidResponse(f"{bytes([kind])!r}{text[:40]!r}: {error}") from None
@@ -174,7 +250,9 @@ class LargeReader:
         if size is None:
             self._start = after
             return None
+        _check_size(size, self._largest)
         here = self._end - after
+        # All of it is in the buffer already: most strings are small.
         if here >= size + 2:
             self._start = after + size + 2
             return bytes(self._view[after : after + size])
@@ -202,6 +280,12 @@ def _count(text: bytes) -> int:
     return count
 
 
+def _elements(text: bytes) -> int:
+    count = _count(text)
+    _check_elements(count)
+    return count
+
+
 def _closed(it: _Open) -> Any:
     if it.kind == 0x25:  # a map
         pairs = iter(it.items)
@@ -211,7 +295,7 @@ def _closed(it: _Open) -> Any:
 
 _SCALARS: dict[int, Any] = {
     ord("+"): bytes,
-    ord("-"): lambda text: _error(text.decode(errors="replace")),
+    ord("-"): lambda text: error_of(text.decode(errors="replace")),
     ord(":"): int,
     ord("_"): lambda _: None,
     ord("#"): lambda text: text == b"t",

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 from ..errors import ConnectionLost, NotConnected
 from ..plan import Command, Reply
-from ..plan.staging import are_missing, is_large, looks_at, stage
+from ..plan.staging import are_missing, as_given, is_large, looks_at, stage
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, refusal
-from .route import asked_of, watched
+from .route import Route, asked_of, watched
 
 __all__ = ["Publication"]
 
@@ -28,7 +28,9 @@ class Publication:
     def __init__(self, commands: Sequence[Command]) -> None:
         multi, *body, execute = commands
         channel: str = body[-1][1]
-        moving, self._coming = stage(body, channel[: channel.index("}") + 1], secrets.token_hex(5))
+        tag = channel[: channel.index("}") + 1]
+        moving, self._coming = stage(body, tag, secrets.token_hex(5))
+        self._document = tag[1:-1].encode()
         self._given = commands
         self._commands: Sequence[Command] = [multi, *moving, execute]
         self._there: Transport | None = None
@@ -44,6 +46,7 @@ class Publication:
         except ConnectionLost as error:
             raise NotConnected(f"{error}; what was sent is not in its place, so nothing was applied") from error
         problem = refusal(replies)
+        # The slot moves away. What is large would be staged on one node, and the keys to be changed be on the other.
         if isinstance(problem, Ask) and not isinstance(problem, Moved):
             self._keep_together()
             return None, None
@@ -64,29 +67,20 @@ class Publication:
         answers[-1] = next(reply for reply in replies if isinstance(reply, Exception))
         return answers
 
-    async def publish(self, held: Held, asking: bool, bulk: bool) -> Outcome:
+    async def publish(self, held: Held, route: Route, bulk: bool) -> Outcome:
         """Do the rest over a connection to the same node."""
-        problem, looks = await watched(held, keys_in(self._commands), asking, looks_at(self._coming))
+        # Where a slot moves, its document tells where its keys may be made: see `transport.route`.
+        keys = list(dict.fromkeys([self._document, *keys_in(self._commands)]))
+        problem, looks = await watched(held, keys, route, looks_at(self._coming))
+        # Forgotten after a minute, or left behind on another node: it is sent again.
         if problem is None and are_missing(looks):
             self._there = None
             await held.roundtrip([("UNWATCH",)])
             return None, None
         if problem is not None:
             return problem, None
-        replies = await asked_of(held, self._commands, asking, bulk)
+        replies = await asked_of(held, self._commands, route.asking, bulk)
         problem = refusal(replies)
-        return problem, self._as_given(replies) if problem is None and replies[-1] is not None else None
-
-    def _as_given(self, replies: list[Reply]) -> list[Reply]:
-        """Return one reply to each of the commands that were given; a large SET became two."""
-        names = {each.name for each in self._coming}
-        extra = [
-            place for place, command in enumerate(self._commands) if command[0] == "PERSIST" and command[1] in names
-        ]
-        replies, outcome = list(replies), replies[-1]
-        if isinstance(outcome, list):
-            replies[-1] = [reply for place, reply in enumerate(outcome, 1) if place not in extra]
-        for place in extra:
-            if isinstance(replies[place], Exception):  # it is why the transaction was refused
-                replies[place + 1] = replies[place]
-        return [reply for place, reply in enumerate(replies) if place not in extra]
+        if problem is not None or replies[-1] is None:
+            return problem, None
+        return None, as_given(self._commands, self._coming, replies)

@@ -17,6 +17,7 @@ from redis.commands.core import (
 
 from ..plan import Command
 from ..ships.numpy import flat_buffer
+from .packing import as_text
 
 __all__ = ["CommandRecorder"]
 
@@ -38,10 +39,6 @@ class CommandRecorder(
 
     def execute_command(self, *words: Any, **_: Any) -> CommandRecorder:
         """Record one command; returns the recorder, as pipelines do."""
-        self.commands.append(tuple([_as_text(word) for word in words]))
+        # Arrays stay views of their memory, not copies: they are sent from there.
+        self.commands.append(tuple([flat_buffer(as_text(word)) for word in words]))
         return self
-
-
-def _as_text(word: Any) -> Any:
-    """Return a word as it is sent; numbers as text, since hiredis crashes if Ctrl-C comes while it formats one."""
-    return repr(word) if type(word) in (int, float) else flat_buffer(word)

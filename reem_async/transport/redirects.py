@@ -78,10 +78,11 @@ def publishes(commands: Sequence[Command]) -> bool:
 
 
 def keys_in(commands: Sequence[Command]) -> list[bytes]:
-    """Return all keys of a transaction, its channel left out, each once."""
+    """Return all keys of commands, channels left out, each once."""
     found: dict[bytes, None] = {}
     for command in commands:
-        if command[0] in ("UNLINK", "RENAME"):
+        # The only commands of REEM with more than one key.
+        if command[0] in ("UNLINK", "RENAME", "WATCH"):
             found.update(dict.fromkeys(word if type(word) is bytes else str(word).encode() for word in command[1:]))
         elif command[0] not in _NO_KEYS_IN_TRANSACTIONS and (key := key_of(command)) is not None:
             found[key] = None

@@ -17,12 +17,12 @@ from typing import Any, Protocol
 
 import redis.exceptions
 
+from ..concurrency.timeouts import timeout
 from ..errors import ConnectionLost, NotAllowed, NotConnected, ServerNotReady
 from ..plan import Command, Reply
 from . import Held, Transport
-from .endpoints import NewTransport
+from .addresses import NewTransport
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
-from .patience import timeout
 from .redirects import Ask, Moved, refusal, slot_of
 from .rooted import Standing
 
@@ -87,6 +87,7 @@ class ReplicaOptions(NodeOptions):
 
 def _check_standing(said: Any, connection: Any) -> None:
     words = (said.decode(errors="replace") if isinstance(said, bytes) else str(said)).split()
+    # A replica without its primary answers for as long as it lives, with data that get older and older.
     if "role:slave" not in words or "master_link_status:up" not in words:
         where = f"{connection.host}:{connection.port}"
         raise redis.exceptions.ConnectionError(f"{where} is no replica, or not in touch with its primary")
@@ -110,8 +111,11 @@ class Readers(Standing):
         self._new_transport = new_transport
         self.sharded = primaries.sharded
         self._ways: dict[Address, Transport] = {}
+        # By slot, None where there is one primary: reads that follow each other see one replica, and so never go back
+        # in time.
         self._chosen: dict[int | None, Address] = {}
         self._ranks: dict[Address, float] = {}
+        # When a replica failed last, on the monotonic clock.
         self._left: dict[Address, float] = {}
         self._asked = -_REST
 

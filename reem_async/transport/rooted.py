@@ -6,8 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import AbstractAsyncContextManager
 
-from ..state import States
 from . import Transport
+from .options import Options
+from .state import States
 
 __all__ = ["Rooted", "Standing"]
 
@@ -31,6 +32,7 @@ class Rooted(ABC):
 
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
+        # A key may have moved since: what was sent to any node counts.
         return all(each.is_settled(document) for each in self._all())
 
     async def settle(self, document: str) -> None:
@@ -49,6 +51,11 @@ class Rooted(ABC):
     def check(self) -> None:
         """Raise if this cannot be used here."""
         self._root.check()
+
+    @property
+    def options(self) -> Options:
+        """How the root's server is reached."""
+        return self._root.options
 
     @property
     def timeout(self) -> float:

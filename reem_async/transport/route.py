@@ -1,4 +1,27 @@
-"""The way of one call through a cluster: which node is next, until it is applied or time is over."""
+"""The way of one call through a cluster: which node is next, until it is applied or time is over.
+
+While a slot moves, its keys go over one by one, in any order, and a key is where it is or nowhere:
+
+    the slot              source says of keys         target says, after ASKING
+    MIGRATING/IMPORTING   all here: served            one key: served, also if it is missing
+                          some here: TRYAGAIN         several: TRYAGAIN if one is missing
+                          none here: ASK target       a transaction that publishes: served (not looked at)
+    NODE at the target    as above                    served
+    NODE at the source    MOVED to the target         as above
+
+So the source makes no key, and a key that has left it does not come back. The target must not make one that the source
+still has: such a key could not follow its slot. Servers see to that, but not in transactions that publish (Valkey
+leaves their keys out), nor in commands of one key, by which keys are watched. Therefore, in this order,
+
+    1. the keys are watched at the target, one by one: whichever arrives from now on makes the transaction fail;
+    2. the source is asked for each of them (`Route.left_behind`): one that is there keeps the call waiting;
+    3. the transaction is sent to the target.
+
+Whatever is not at the source in step 2 has been at the target since step 1, or is nowhere. At the source one WATCH of
+all keys tells as much, for it is refused unless all are there. In between a key may leave, which makes the transaction
+fail; and what is nowhere when a slot begins to move is made at the source only if the document, which every
+transaction watches, is there: then nobody makes it at the target, since the same look finds the document here.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +31,14 @@ from collections.abc import Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
+import redis.exceptions
+
 from ..errors import ConnectionLost, NotConnected, TlsRefused
-from ..plan import Command, Reply
+from ..plan import Command, Reply, blamed
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, publishes, refusal, slot_of
 
-__all__ = ["HeldAcross", "Layout", "Route", "asked_of", "places_refused", "watched"]
+__all__ = ["HeldAcross", "Layout", "Route", "asked_of", "looked_early", "places_refused", "watched"]
 
 _ASKING: Command = ("ASKING",)
 _UNWATCH: Command = ("UNWATCH",)
@@ -47,11 +72,7 @@ class Layout(Protocol):
 
 
 class Route:
-    """The way of one call: which node is next, until the call's time is over.
-
-    Attributes:
-        asking: The node does not have the slot yet, and must be told that this is known.
-    """
+    """The way of one call: which node is next, until the call's time is over."""
 
     def __init__(self, cluster: Layout, slot: int | None, asked: Transport | None = None) -> None:
         self._cluster = cluster
@@ -59,11 +80,17 @@ class Route:
         self._node = asked
         self._deadline = 0.0
         self._tries = 0
-        self.asking = False
+        self._source: Transport | None = None
+
+    @property
+    def asking(self) -> bool:
+        """Whether the node does not have the slot yet, and must be told that this is known."""
+        return self._source is not None
 
     async def node(self) -> Transport:
         """Return where to send next."""
         if self._node is None:
+            # The first try believes what is known. Each later one looks anew, since what was known has failed.
             if self._slot is not None:
                 self._node = await self._cluster.owner_of(self._slot, anew=self._tries > 0)
             else:
@@ -78,15 +105,38 @@ class Route:
         """Note why nothing was applied, and wait if need be; raise NotConnected if time is over."""
         # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.
         self._check_time(_reason(problem), TlsRefused if isinstance(problem, TlsRefused) else NotConnected)
-        asked, self._node, self.asking = self._node, None, False
+        asked, self._node, self._source = self._node, None, None
         pause = _PAUSES[min(self._tries, len(_PAUSES) - 1)]
         self._tries += 1
         if isinstance(problem, Ask) and asked is not None:
-            self._node, self.asking = self._cluster.moved(problem, asked), not isinstance(problem, Moved)
+            self._node = self._cluster.moved(problem, asked)
+            self._source = None if isinstance(problem, Moved) else asked
         else:
             pause = max(pause, 0.005)
         if pause:
             await self._cluster.pause(pause)
+
+    async def left_behind(self, keys: Sequence[bytes]) -> Exception | None:
+        """Return what keeps the call waiting if the slot is moving and any of `keys` has not gone with it; or None.
+
+        Raises:
+            NotConnected: The node that gives the slot away does not answer.
+            redis.exceptions.RedisError: This user may not.
+        """
+        if self._source is None:
+            return None
+        looks: list[Command] = [("TYPE", key) for key in keys]
+        try:
+            replies = await self._source.roundtrip(looks)
+        except ConnectionLost as error:
+            raise _looked_only(error) from error
+        for look, reply in zip(looks, replies, strict=True):
+            if isinstance(reply, Ask) and self._cluster.moved(reply, self._source) is self._node:
+                continue
+            if isinstance(reply, Exception) and refusal((reply,)) is None:
+                raise blamed(reply, look)
+            return redis.exceptions.TryAgainError(f"{look[1].decode(errors='replace')} has not followed its slot yet")
+        return None
 
     def _check_time(self, reason: str, kind: type[NotConnected]) -> None:
         now = time.monotonic()
@@ -113,7 +163,7 @@ class HeldAcross:
         self._node: Transport | None = None
         self._lent: AbstractAsyncContextManager[Held] | None = None
         self._held: Held | None = None
-        self._asking = False
+        self._route = Route(cluster, None)
         self._giving_up: Route | None = None
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
@@ -122,20 +172,22 @@ class HeldAcross:
             return await self._begin(commands, bulk)
         if commands[-1][0] == "EXEC":
             return await self._end(commands, bulk)
-        return await asked_of(self._held, commands, self._asking, bulk)
+        return await asked_of(self._held, commands, self._route.asking, bulk)
 
     async def _begin(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        route = Route(self._cluster, slot_of(commands))
+        route = self._route = Route(self._cluster, slot_of(commands))
         while True:
             problem: Exception | None
             try:
                 held = await self._on(await route.node())
-                self._asking = route.asking
-                replies = await asked_of(held, commands, route.asking, bulk)
-                problem = refusal(replies)
+                # Before they are read: what arrives in between would be read as missing.
+                problem = await route.left_behind(keys_in(commands))
                 if problem is None:
-                    return replies
-                await held.roundtrip([_UNWATCH])
+                    replies = await asked_of(held, commands, route.asking, bulk)
+                    problem = refusal(replies)
+                    if problem is None:
+                        return replies
+                    await held.roundtrip([_UNWATCH])
             except NotConnected as error:
                 problem = error
             await route.refused(problem)
@@ -143,9 +195,9 @@ class HeldAcross:
     async def _end(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         """Send a transaction. If its keys are moving it is given up, as after a change of what is watched."""
         assert self._held is not None
-        problem = (await watched(self._held, keys_in(commands), self._asking))[0] if publishes(commands) else None
+        problem = (await watched(self._held, keys_in(commands), self._route))[0] if publishes(commands) else None
         if problem is None:
-            replies = await asked_of(self._held, commands, self._asking, bulk)
+            replies = await asked_of(self._held, commands, self._route.asking, bulk)
             problem = refusal(replies)
             if problem is None:
                 return replies
@@ -175,18 +227,18 @@ class HeldAcross:
 
 
 async def asked_of(to: Held, commands: Sequence[Command], asking: bool, bulk: bool) -> list[Reply]:
-    """Send `commands`, each with the word that one knows that its slot is on its way there, if `asking`."""
+    """Send `commands`; if `asking`, with ASKING before each: the node then answers for a slot that is moving to it."""
     if not asking:
         return await to.roundtrip(commands, bulk=bulk)
-    if commands[-1][0] == "EXEC":  # the word holds for all of a transaction
+    if commands[-1][0] == "EXEC":  # one ASKING holds for the whole transaction
         return (await to.roundtrip([_ASKING, *commands], bulk=bulk))[1:]
-    # Of several keys in one command the node would want to have all; of one it does not mind.
+    # A command with several keys is refused (TRYAGAIN) unless all of them have arrived; with one key it never is.
     single = [_one_by_one(command) for command in commands]
     got = await to.roundtrip([word for each in single for command in each for word in (_ASKING, command)], bulk=bulk)
     replies, answers = iter(got[1::2]), []
     for each in single:
         parts = [next(replies) for _ in each]
-        answers.append(refusal(parts) or parts[-1])
+        answers.append(refusal(parts) or next((part for part in parts if isinstance(part, Exception)), parts[-1]))
     return answers
 
 
@@ -195,7 +247,7 @@ def _one_by_one(command: Command) -> list[Command]:
 
 
 async def watched(
-    held: Held, keys: Sequence[bytes], asking: bool, looks: Sequence[Command] = ()
+    held: Held, keys: Sequence[bytes], route: Route, looks: Sequence[Command] = ()
 ) -> tuple[Exception | None, list[Reply]]:
     """Watch all keys, so that none can leave unnoticed; return why that does not help, or None, and what `looks` see.
 
@@ -204,17 +256,38 @@ async def watched(
         redis.exceptions.RedisError: This user may not.
     """
     try:
-        reply, *seen = replies = await asked_of(held, [("WATCH", *keys), *looks], asking, bulk=False)
+        reply, *seen = replies = await asked_of(held, [("WATCH", *keys), *looks], route.asking, bulk=False)
     except ConnectionLost as error:
-        raise NotConnected(f"{error}; nothing was sent but a look at the keys, so nothing was applied") from error
-    problem = refusal(replies)
+        raise _looked_only(error) from error
+    problem: Exception | None = refusal(replies)
     if problem is None and isinstance(reply, Exception):
-        raise reply
+        raise await _unwatchable(held, keys, reply)
+    problem = problem or await route.left_behind(keys)
     if problem is not None:
         await held.roundtrip([_UNWATCH])
     return problem, seen
 
 
+async def _unwatchable(held: Held, keys: Sequence[bytes], error: Exception) -> Exception:
+    """Return the error of a WATCH headed by the key that it was about."""
+    looks: list[Command] = [("WATCH", key) for key in keys]
+    pairs = zip(await held.roundtrip(looks), looks, strict=True)
+    return next((blamed(reply, look) for reply, look in pairs if isinstance(reply, Exception)), error)
+
+
+def _looked_only(error: ConnectionLost) -> NotConnected:
+    return NotConnected(f"{error}; nothing was sent but a look at the keys, so nothing was applied")
+
+
 def places_refused(answers: Sequence[Reply]) -> list[int]:
     """Return the places of what was not applied."""
     return [place for place, reply in enumerate(answers) if refusal((reply,)) is not None]
+
+
+def looked_early(commands: Sequence[Command], left: Sequence[int]) -> set[int]:
+    """Return the places of looks at a registry that were taken before what they come after was applied.
+
+    In between another program may have added arrays, which the write then replaced without anybody knowing.
+    """
+    first = min(left, default=len(commands))
+    return {place for place in range(first, len(commands)) if place not in left and commands[place][0] == "SMEMBERS"}

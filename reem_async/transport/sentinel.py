@@ -8,28 +8,25 @@ what it takes until then is lost: so the sentinels are asked every second, on a 
 
 from __future__ import annotations
 
+import asyncio
 import os
 import threading
 import weakref
 from collections.abc import Awaitable, Callable, Collection, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-import redis
-import redis.asyncio
-import redis.asyncio.retry
-import redis.asyncio.sentinel
 import redis.exceptions
-import redis.retry
-import redis.sentinel
-from redis.backoff import NoBackoff
 
-from ..errors import BadValue, ConnectionLost, NotConnected, Refused
+from ..concurrency.aside import aside
+from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
-from .endpoints import NewTransport, address_of, listed
+from .addresses import NewTransport, address_of, listed
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .rooted import Standing
+from .state import States
 
 if TYPE_CHECKING:
     from .aio import AsyncTransport
@@ -40,8 +37,9 @@ __all__ = ["SentinelOptions", "SentinelTransport"]
 _LOOK_PAUSE = 1.0
 """Seconds between questions to the sentinels."""
 _ROLE: Command = ("ROLE",)
+_MASTERS: Command = ("SENTINEL", "MASTERS")
 _UNFIT = (b"down", b"disconnected")
-"""What the sentinels' flags of a replica hold if it cannot be used: s_down, o_down, disconnected."""
+"""What the sentinels' flags of a server hold if it cannot be used: s_down, o_down, disconnected."""
 
 _EXAMPLE = "redis+sentinel://user:password@host:26379,host2:26379/mymaster"
 
@@ -83,7 +81,6 @@ class SentinelOptions(Options):
         tls = {"ssl": True, **{name: value for name, value in self.settings.items() if name.startswith("ssl_")}}
         self._asking = {
             "socket_connect_timeout": self.handshake_timeout / 2,
-            "socket_timeout": self.handshake_timeout / 2,
             **{name: value for name, value in login.items() if value is not None},
             **(tls if self.tls else {}),
         }
@@ -109,15 +106,7 @@ class SentinelOptions(Options):
         return connecting_by(super().blocking_connection(), self._connect)
 
     async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
-        asked: Any = redis.asyncio.sentinel.Sentinel(  # type: ignore[no-untyped-call]
-            self._sentinels, sentinel_kwargs={**self._asking, "retry": redis.asyncio.retry.Retry(NoBackoff(), 0)}
-        )
-        try:
-            connection.host, connection.port = await asked.discover_master(self.service)
-        finally:
-            for each in asked.sentinels:
-                with suppress(redis.exceptions.RedisError, OSError):
-                    await each.aclose()
+        connection.host, connection.port = await self._asked()
         self._note((connection.host, connection.port))
         await connect()
         await question(connection, [_ROLE], _check_role)
@@ -135,21 +124,62 @@ class SentinelOptions(Options):
 
     def sentinels(self) -> list[Options]:
         """Return how to reach each of the sentinels."""
-        # No timeout of redis-py's own: see Options.asynchronous_connection.
-        settings = {name: value for name, value in self._asking.items() if name != "socket_timeout"}
-        return [NodeOptions(self, address, settings) for address in self._sentinels]
+        return [NodeOptions(self, address, self._asking) for address in self._sentinels]
+
+    async def _asked(self) -> Address:
+        """Ask the sentinels where the primary is; raises what `primary` raises."""
+        problems: list[Exception] = []
+        for sentinel in self.sentinels():
+            connection = sentinel.asynchronous_connection()
+            try:
+                # So that a second sentinel still has time within the limit for connecting.
+                async with asyncio.timeout(self.handshake_timeout / 2):
+                    await connection.connect()
+                    await connection.send_command(*_MASTERS)
+                    return self._named(await connection.read_response())
+            except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
+                problems.append(sentinel.refused(error))
+            finally:
+                await connection.disconnect(nowait=True)
+        raise self._nowhere(problems)
 
     def primary(self) -> Address:
-        """Ask the sentinels where the primary is; raises redis.exceptions.RedisError."""
-        asked: Any = redis.sentinel.Sentinel(  # type: ignore[no-untyped-call]
-            self._sentinels, sentinel_kwargs={**self._asking, "retry": redis.retry.Retry(NoBackoff(), 0)}
-        )
-        try:
-            host, port = asked.discover_master(self.service)
-            return str(host), int(port)
-        finally:
-            for each in asked.sentinels:
-                each.close()
+        """Ask the sentinels where the primary is, on this thread.
+
+        Raises:
+            TlsRefused, LoginRefused, NotAllowed: No sentinel names it, and one of them gave this reason.
+            NotConnected: No sentinel names it.
+        """
+        problems: list[Exception] = []
+        for sentinel in self.sentinels():
+            connection = sentinel.blocking_connection()
+            connection.socket_timeout = self.handshake_timeout / 2
+            try:
+                connection.connect()
+                connection.send_command(*_MASTERS)
+                return self._named(connection.read_response())
+            except Exception as error:  # as above
+                problems.append(sentinel.refused(error))
+            finally:
+                connection.disconnect()
+        raise self._nowhere(problems)
+
+    def _named(self, masters: Any) -> Address:
+        """Return where a sentinel says that the primary is; raises NotConnected if it knows of none that is up."""
+        for row in masters:
+            if row[b"name"] == self.service.encode():
+                if any(word in row[b"flags"] for word in _UNFIT):
+                    raise NotConnected(f"a sentinel says that the primary of {self.service!r} is down")
+                return row[b"ip"].decode(), int(row[b"port"])
+        raise NotConnected(f"a sentinel knows no {self.service!r}; the URL ends with the name that it was given there")
+
+    def _nowhere(self, problems: Sequence[Exception]) -> Exception:
+        """Return the error to raise: the reason that most needs somebody to act, or all of them."""
+        for kind in (TlsRefused, Refused):
+            if found := [problem for problem in problems if isinstance(problem, kind)]:
+                return found[-1]
+        said = "; ".join(dict.fromkeys(str(problem).partition("; start one")[0] for problem in problems))
+        return NotConnected(f"no sentinel of {self.address} names a primary: {said}")
 
 
 def _nothing() -> None:
@@ -182,7 +212,10 @@ class SentinelTransport(Standing):
         self._new_transport = new_transport
         self._root = new_transport(options)  # for what must outlive a failover: locks and the event loop
         self._now = self._root
+        self._states = self._root.states
+        # Ways to primaries of before, closed with this: calls may still wait for replies on them.
         self._demoted: list[Transport] = []
+        # Subscription connections: a primary of before sends nothing any more, and would not be missed.
         self._listening: weakref.WeakSet[Wire] = weakref.WeakSet()
         self._lookout: _Lookout | None = None
         self._moved = False
@@ -200,7 +233,7 @@ class SentinelTransport(Standing):
     def _current(self) -> Transport:
         """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
-            self._lookout = _Lookout(self._options, self._on_moved)
+            self._lookout = aside(partial(_Lookout, self._options, self, SentinelTransport._on_moved))
             self._options.changed = self._lookout.tell
         if self._moved:
             self._moved = False
@@ -223,6 +256,7 @@ class SentinelTransport(Standing):
 
     def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:
         for reply in replies:
+            # The only sign, before the connection breaks, that the server was demoted.
             if isinstance(reply, redis.exceptions.ReadOnlyError):
                 self._leave(asked)
                 raise NotConnected(
@@ -239,8 +273,20 @@ class SentinelTransport(Standing):
 
     def _renew(self) -> None:
         self._demoted.append(self._now)
+        # The user hears of one primary. What becomes of the connections to the old one is not its state.
+        self._now.states = States()  # what becomes of its connections says nothing any more
+        self._now.states.closed()
         self._now = self._new_transport(self._options)
-        self._now.states = self.states
+        self._now.states = self._states
+
+    @property
+    def states(self) -> States:
+        """What the interface's user gets to know of the connections to the primary of the moment."""
+        return self._states
+
+    @states.setter
+    def states(self, states: States) -> None:
+        self._states = self._now.states = states
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
@@ -281,6 +327,7 @@ class SentinelTransport(Standing):
         """Close all connections."""
         if self._lookout is not None:
             self._lookout.stop()
+        self._states.closed()
         await super().close()
 
     def _all(self) -> list[Transport]:
@@ -294,26 +341,27 @@ class _Lookout:
         pid: The process it runs in.
     """
 
-    def __init__(self, options: SentinelOptions, told: Callable[[], None]) -> None:
+    def __init__(
+        self, options: SentinelOptions, owner: SentinelTransport, told: Callable[[SentinelTransport], None]
+    ) -> None:
         self.pid = os.getpid()
         self._options = options
-        self._told = weakref.WeakMethod(told)
+        self._owner, self._told = weakref.ref(owner), told  # no WeakMethod: see `pubsub.looks`
         self._stopped = threading.Event()
         threading.Thread(target=self._run, name="reem-sentinel", daemon=True).start()
 
     def _run(self) -> None:
         while not self._stopped.wait(_LOOK_PAUSE):
-            if self._told() is None:  # the transport was dropped
+            if self._owner() is None:  # the transport was dropped
                 return
-            with suppress(redis.exceptions.RedisError, OSError):
+            with suppress(ReemError):
                 if self._options.found not in (None, self._options.primary()):
                     self.tell()
 
     def tell(self) -> None:
         """Say that it is another one."""
-        told = self._told()
-        if told is not None:
-            told()
+        if (owner := self._owner()) is not None:
+            self._told(owner)
 
     def stop(self) -> None:
         """End the thread, within a second or so."""

@@ -19,25 +19,26 @@ from typing import Any
 
 import hiredis
 
-from ..courtesy import give_way
+from ..concurrency.scheduling import give_way
+from ..concurrency.timeouts import LOOKS, confirmed, moved_last, patience, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
 from .options import Options, is_this_machine
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .patience import LOOKS, confirmed, moved_last, patience, unsent
+from .text import PROBE, is_plain, lists_json, over_wire
 
 __all__ = ["BUFFER", "Wire", "open_wire"]
 
 _BUSY = 2.5
-"""Three reads within so many times the pace are much."""
+"""The connection is busy if three reads come within so many times `pace`."""
 
 _LEISURELY = 0.005
-"""A pace from which on nobody waits for what comes."""
+"""Seconds of `pace` from which on updates may be read together: no listener needs them at once."""
 
 BUFFER = 1 << 22
-"""Bytes that Linux takes at once, if its limits are as they come."""
+"""Bytes of a send buffer that Linux grants with its default limits (net.ipv4.tcp_wmem)."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -84,12 +85,16 @@ class Wire(asyncio.BufferedProtocol):
         on_push: Called with each message the server sends unasked.
         on_lost: Called once when the connection is gone, with the reason.
         pace: Seconds for which nothing more is read after something was, if much comes: it is taken together.
+        tracked: The server tells of keys that were read here and then changed (CLIENT TRACKING); None if not asked.
+        plain: The server has no JSON module; what reads documents is sent as what reads their text.
     """
 
     def __init__(self, timeout: float, reader: Reader) -> None:
         self.on_push: Callable[[list[Any]], None] | None = None
         self.on_lost: Callable[[Wire, Exception], None] | None = None
         self.pace = 0.0
+        self.tracked: bool | None = None
+        self.plain = False
         self._timeout = timeout
         self._reader = reader
         self._due: collections.deque[_Due] = collections.deque()
@@ -154,6 +159,11 @@ class Wire(asyncio.BufferedProtocol):
         return self._loop.time() - self._last_byte
 
     @property
+    def heard(self) -> float:
+        """When a byte was received last, on the clock of time.monotonic(). Any thread may ask."""
+        return self._last_byte
+
+    @property
     def leisurely(self) -> bool:
         """Whether nobody waits for what comes, so that others are given way after each message."""
         return self.pace >= _LEISURELY
@@ -163,6 +173,8 @@ class Wire(asyncio.BufferedProtocol):
         if not commands:
             done([])
             return
+        if self.plain:
+            commands, done = over_wire(commands, done)
         if self._transport is None or self._reason is not None:
             done(self._reason or ConnectionLost("the connection is closed"))
             return
@@ -309,6 +321,7 @@ class Wire(asyncio.BufferedProtocol):
         # The confirmation of a SUBSCRIBE is pushed too, but it is the only reply there is to the command.
         if type(reply) is hiredis.PushNotification and not (reply and reply[0] in _CONFIRMATIONS):
             if self.on_push is not None:
+                self._reader.fed = 0
                 self.on_push(reply)
             return
         if not self._due:
@@ -318,6 +331,7 @@ class Wire(asyncio.BufferedProtocol):
         if due.lenient and isinstance(reply, Exception):
             return
         due.replies.append(reply)
+        self._reader.fed = 0
         if len(due.replies) == due.count:
             self._due.popleft()
             if not due.over:
@@ -395,8 +409,15 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
     except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
         await connection.disconnect(nowait=True)
         raise options.refused(error) from error
-    wire = Wire(options.timeout, LargeReader() if large else SmallReader())
+    wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
     wire.take_over(connection)
+    if not lists_json(connection.handshake_metadata):
+        try:
+            (reply,) = await wire.roundtrip([PROBE])
+        except BaseException:
+            await wire.close()
+            raise
+        wire.plain = is_plain(reply)
     return wire
 
 

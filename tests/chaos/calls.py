@@ -13,7 +13,7 @@ from conftest import assert_no_orphans
 
 import reem
 import reem_async
-from reem_async.policy import Last
+from reem_async.concurrency.queues import Last
 
 from .proxy import Proxy
 from .scoreboard import Run, row, tell
@@ -256,7 +256,7 @@ async def _lost_replies(run: Run) -> None:
                 value = await reem_async.KeyValueStore(direct)[TOP].read()
                 for _ in range(3):
                     await reem_async.PublishSpace(direct)[TOP]["end"].write(1)
-                await became(lambda: log.updates.mailbox.take is not None and log.told > count // 10, 2)
+                await became(lambda: log.updates.queue.take is not None and log.told > count // 10, 2)
         run.at_least("replies lost", proxy.lost, count)
         run.at_least("calls of known outcome", sum(sum(it.values()) for it in losses.known.values()), count // 2)
         losses.judge(run, value)

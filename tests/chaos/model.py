@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import itertools
 import json
 import time
@@ -15,6 +14,7 @@ import hypothesis.strategies as st
 import numpy as np
 import test_values
 from conftest import assert_same, keys_of, placeholders
+from hunt.model import ABSENT, Place, as_read, found
 from hypothesis import HealthCheck, Phase
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
@@ -26,7 +26,6 @@ from .scoreboard import Run, row, tell
 from .servers import PrivateServer
 
 NAMES = ["a", "ab", "b.c"]
-ABSENT = object()
 
 leaves = (
     test_values.scalars
@@ -40,58 +39,6 @@ values = st.recursive(
 )
 elements = st.sampled_from([*NAMES, *NAMES, 0, 1, -1])
 paths = st.lists(elements, max_size=3).map(tuple)
-
-
-def found(tree: Any, path: tuple[Any, ...]) -> Any:
-    """What is at a path of the model, or ABSENT."""
-    for key in path:
-        named = isinstance(tree, dict) and isinstance(key, str) and key in tree
-        if not named and not (isinstance(tree, list) and isinstance(key, int) and -len(tree) <= key < len(tree)):
-            return ABSENT
-        tree = tree[key]
-    return tree
-
-
-class Place:
-    """What the model does to one place; each method returns the new model and the error REEM must raise."""
-
-    def __init__(self, model: Any, path: tuple[Any, ...]) -> None:
-        self.root = [copy.deepcopy(model)] if model is not ABSENT else []
-        self.path = (0, *path)
-        self.parent = found(self.root, self.path[:-1])
-        self.here = found(self.root, self.path)
-
-    def result(self, error: Any = None) -> tuple[Any, Any]:
-        return (self.root[0] if self.root else ABSENT), error
-
-    def write(self, value: Any) -> tuple[Any, Any]:
-        if len(self.path) == 1:
-            return value, None
-        key, parent = self.path[-1], self.parent
-        if self.here is ABSENT and not (isinstance(parent, dict) and isinstance(key, str)):
-            return self.result(reem.PathRefused)
-        parent[key] = value
-        return self.result()
-
-    def delete(self) -> tuple[Any, Any]:
-        if self.here is ABSENT:
-            return self.result(reem.MissingKey)
-        del self.parent[self.path[-1]]
-        return self.result()
-
-    def append(self, value: Any) -> tuple[Any, Any]:
-        if not isinstance(self.here, list):
-            return self.result(reem.MissingKey if self.here is ABSENT else reem.BadType)
-        self.here.append(value)
-        return self.result()
-
-    def increment(self, number: int) -> tuple[Any, Any]:
-        if type(self.here) is not int:
-            return self.result(reem.MissingKey if self.here is ABSENT else reem.BadType)
-        if not -(2**63) <= self.here + number < 2**63:
-            return self.result(reem.Overflow)
-        self.parent[self.path[-1]] += number
-        return self.result()
 
 
 def _equal(one: Any, other: Any) -> bool:
@@ -138,7 +85,7 @@ class Machine(RuleBasedStateMachine):
         it.proxy.heal()
         self.top = f"top{next(it.tops)}"
         self._begin_with(value)
-        self.model: Any = _as_read(value)
+        self.model: Any = as_read(value)
         self.mirror = reem.SilentSubscriber(self.top, it.following)
         self._listen()
 
@@ -160,7 +107,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(path=paths, value=values)
     def write(self, path: tuple[Any, ...], value: Any) -> None:
-        self._change(path, lambda at: at.write(value), lambda place: place.write(_as_read(value)))
+        self._change(path, lambda at: at.write(value), lambda place: place.write(as_read(value)))
 
     @rule(path=paths)
     def delete(self, path: tuple[Any, ...]) -> None:
@@ -168,7 +115,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(path=paths, value=values)
     def append(self, path: tuple[Any, ...], value: Any) -> None:
-        self._change(path, lambda at: at.append(value), lambda place: place.append(_as_read(value)))
+        self._change(path, lambda at: at.append(value), lambda place: place.append(as_read(value)))
 
     @rule(path=paths, number=st.integers(-5, 5) | st.sampled_from([2**63 - 1, -(2**63)]))
     def increment(self, path: tuple[Any, ...], number: int) -> None:
@@ -181,6 +128,8 @@ class Machine(RuleBasedStateMachine):
         expected = found(self.model, path)
         try:
             value = self._at(self.world.kvs, path).read()
+            if value is None and self.model is ABSENT:
+                value = ABSENT
         except reem.MissingKey:
             value = ABSENT
         except (reem.ConnectionLost, reem.NotConnected):
@@ -229,7 +178,8 @@ class Machine(RuleBasedStateMachine):
     def _change(self, path: tuple[Any, ...], call: Callable[[Any], Any], expect: Callable[[Place], Any]) -> None:
         """Make a change in both worlds. If its outcome is unknown, the server says: all of it, or nothing."""
         self.world.steps += 1
-        after, error = expect(Place(self.model, path))
+        due = expect(Place(self.model, path))
+        after, error = due.after, due.error
         try:
             call(self._at(self.world.space, path))
         except (reem.ConnectionLost, reem.NotConnected) as raised:
@@ -279,11 +229,6 @@ class Machine(RuleBasedStateMachine):
             del self.world.direct[self.top]
         assert not self._left_over(), f"left over: {self._left_over()}"
         self.world.raw.flushdb()
-
-
-def _as_read(value: Any) -> Any:
-    """A value as it comes back: containers of its own."""
-    return copy.deepcopy(value)
 
 
 def _is_unsigned(value: Any) -> bool:

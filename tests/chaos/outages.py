@@ -15,7 +15,7 @@ from redis.exceptions import RedisError
 
 import reem
 import reem_async
-from reem_async.policy import Last
+from reem_async.concurrency.queues import Last
 
 from .proxy import Proxy
 from .scoreboard import Run, row, tell

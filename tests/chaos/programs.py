@@ -25,7 +25,7 @@ from redis.exceptions import RedisError
 
 import reem
 import reem_async
-from reem_async.policy import Last
+from reem_async.concurrency.queues import Last
 
 from .tools import Log, background, became, descriptors, rss
 
@@ -318,7 +318,7 @@ class _Soak:
         self.calls = np.zeros((int(seconds * RATE) + 100, 2))  # when it began, how long it took; made here, once
         self.count = 0
         self.failed: list[float] = []
-        self.samples: list[tuple[float, float, int, int]] = []
+        self.samples: list[tuple[float, float, int, int, int]] = []
 
     def past(self) -> float:
         return time.monotonic() - self.begun
@@ -342,7 +342,8 @@ class _Soak:
     async def sample(self) -> None:
         while self.past() < self.seconds:
             gc.collect()
-            self.samples.append((self.past(), rss(), descriptors(), len(asyncio.all_tasks())))
+            others, shared = descriptors()
+            self.samples.append((self.past(), rss(), others, len(asyncio.all_tasks()), shared))
             await asyncio.sleep(0.5)
 
 
@@ -395,7 +396,7 @@ def record(url: str, path: str) -> None:
 
 
 async def _record(url: str, path: str) -> None:
-    from reem_async.recording import Recorder
+    from reem_async.tools.recording import Recorder
 
     async with reem_async.RedisInterface(url) as interface, Recorder(interface, ["run"], path):
         say(ready=True)
@@ -410,7 +411,7 @@ def record_on_full_disk(url: str, path: str, largest: str) -> None:
 
 
 async def _record_on_full_disk(url: str, path: str) -> None:
-    from reem_async.recording import Recorder, RecordingFailed
+    from reem_async.tools.recording import Recorder, RecordingFailed
 
     before: list[float] = []
     after: list[float] = []

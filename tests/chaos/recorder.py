@@ -66,7 +66,7 @@ class _Findings:
 
     def numbers(self, path: Path, what: str) -> list[int] | None:
         """The numbers of the published updates in a file, None if it is no recording; anything else is noted."""
-        from reem_async.recording import DamagedRecording, open_log
+        from reem_async.tools.recording import DamagedRecording, open_log
 
         try:
             with contextlib.closing(open_log(path)) as log:
@@ -186,7 +186,7 @@ def _full(run: Run, url: str, folder: Path, findings: _Findings) -> None:
     run.at_least("errors that say that the file could not grow", int("written any further" in found["failure"]), 1)
     slower = quantile(found["after"], 0.9) / quantile(found["before"], 0.9)
     run.at_most("x the control loop's p90 with the disk full", slower, 2.0)
-    from reem_async.recording import open_log
+    from reem_async.tools.recording import open_log
 
     try:
         with contextlib.closing(open_log(path)) as log:

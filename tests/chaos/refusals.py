@@ -229,6 +229,14 @@ def _types(desk: _Desk, name: str) -> None:
 
 
 def _no_json(desk: _Desk, name: str) -> None:
-    """A server without RedisJSON."""
-    with PrivateServer(json=False) as server:
-        desk.expect(f"{name} without JSON", reem.NoJsonSupport, lambda: _connect(name, server.url), "RedisJSON")
+    """A server without RedisJSON: documents are text there, and other programs' strings are left alone."""
+    with PrivateServer(json=False) as server, server.raw() as raw, _front(name, server.url) as front:
+        raw.set("foreign", '{"a": 1}')
+        for what, call in (
+            ("read", lambda: front.read(["foreign"])),
+            ("write", lambda: front.write(["foreign"], 1)),
+            ("array", lambda: front.write(["foreign"], np.arange(3))),
+        ):
+            desk.expect(f"{name} without JSON: {what}", reem.WrongKind, call, "foreign", "string")
+        if raw.get("foreign") not in (b'{"a": 1}', '{"a": 1}') or raw.exists("{foreign}.", "{foreign}:ships"):
+            desk.partial.append(f"{name} without JSON")

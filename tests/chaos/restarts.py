@@ -12,7 +12,7 @@ from redis.exceptions import RedisError
 
 import reem
 import reem_async
-from reem_async.policy import Last
+from reem_async.concurrency.queues import Last
 
 from .scoreboard import Run, row, tell
 from .servers import PrivateServer

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import redis
 
-from reem_async._server_process import ServerProcess, ServerProgram
-from reem_async._server_programs import find_program
+from reem_async.server.process import ServerProcess, ServerProgram
+from reem_async.server.programs import find_program
 
 # Below the ports that the kernel gives to clients: while the server is down, one of them could be given its port.
 PORTS = range(20_000, 32_000)

@@ -121,6 +121,9 @@ def _judge_costs(run: Run, samples: Any) -> None:
         run.at_most("MB/min more memory", float(np.polyfit(warm[:, 0], warm[:, 1], 1)[0] * 60), 1.0)
     else:
         run.at_most("MB more memory", float(warm[-1, 1] - warm[0, 1]), 8.0)
+    # Publisher and follower are one process: two of a segment, two of its mapping, one for each of up to four views,
+    # and as many again while a segment takes the place of another.
+    run.at_most("descriptors of shared memory", float(samples[:, 4].max()), 16.0)
     half = len(warm) // 2
     for column, what in ((2, "more descriptors"), (3, "more tasks")):
         run.at_most(what, float(np.median(warm[half:, column]) - np.median(warm[:half, column])), 1.0)

@@ -26,9 +26,16 @@ def rss() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def descriptors() -> int:
-    """How many files and sockets this process has open."""
-    return len(os.listdir("/proc/self/fd"))
+def descriptors() -> tuple[int, int]:
+    """How many files and sockets this process has open, and how many of shared memory: those come and go with views."""
+    shared = others = 0
+    for entry in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):  # the one that this listing takes, or one that another thread has closed
+            if os.readlink(f"/proc/self/fd/{entry}").startswith("/memfd:reem"):
+                shared += 1
+            else:
+                others += 1
+    return others, shared
 
 
 def quantile(values: list[float], part: float) -> float:
@@ -124,7 +131,7 @@ class Log:
         silent: Losses that were not flagged.
     """
 
-    def __init__(self, updates: reem_async.subscribe.Watch) -> None:
+    def __init__(self, updates: reem_async.pubsub.subscribers.Watch) -> None:
         self.updates = updates
         self.told = self.gaps = 0
         self.repeated: list[Any] = []

@@ -52,11 +52,11 @@ def document(data):
     """The text of a stored document: what it holds, or BadData."""
     try:
         holder = loads(data, KEYS)
-        crates = placeholders.find(holder, "foo")
+        slots = placeholders.find(holder, "foo")
     except BadData:
         return
-    suffixes = {crate.placeholder.suffix for crate in crates}
-    assert len(suffixes) == len(crates), "one array, many copies"
+    suffixes = {slot.placeholder.suffix for slot in slots}
+    assert len(suffixes) == len(slots), "one array, many copies"
 
 
 def placeholder(data):
@@ -105,11 +105,16 @@ def path(data):
             continue
         assert paths.parse_suffix(paths.suffix(parsed)) == parsed
         if parse is paths.parse:
-            quoted = paths.to_jsonpath(parsed)
+            quoted = paths.to_jsonpath(parsed[1:])  # the first is a top-level key: the name of the document
             assert quoted.startswith("$")
-            for key in parsed:  # each element stands in brackets and quotes of which nothing in it is one
-                step = f"[{key}]" if isinstance(key, int) else f'["{key}"]' if '"' not in key else f"['{key}']"
-                assert step in quoted
+            for key in parsed[1:]:  # each element stands in brackets and quotes of which nothing in it is one
+                assert _step(key) in quoted
+
+
+def _step(key):
+    if isinstance(key, int):  # an index from the end, but the last, is sent as a slice of one item
+        return f"[{key}:{key + 1}]" if key < -1 else f"[{key}]"
+    return f'["{key}"]' if '"' not in key else f"['{key}']"
 
 
 TARGETS = {each.__name__: each for each in (npy, notice, document, placeholder, replies, errors, path)}

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 import reem_async
-from reem_async.recording import Recorder
 from reem_async.server import EmbeddedServer
+from reem_async.tools.recording import Recorder
 
 HERE = Path(__file__).parent
 UPDATES = 40

@@ -1,0 +1,90 @@
+"""Mirrors of the store for plain scripts: the core's follow on the background loop."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from reem_async.errors import InterfaceClosed
+from reem_async.plan.paths import Path
+from reem_async.pubsub import mirror as core
+
+from ._twin import documented_by
+from .subscribe import Following
+
+if TYPE_CHECKING:
+    from .connection import RedisInterface
+
+__all__ = ["Mirror"]
+
+
+@documented_by(core.Mirror)
+class Mirror(Following):
+    """A local copy of a place in the store that follows every change, published or only stored, by whomever.
+
+    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is at most
+    one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
+    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
+    Use it with `with`, or `listen()` and `close()`.
+
+    Args:
+        interface: The server.
+        path: The path, top-level key first.
+        max_age: Seconds that an answer may be old, 0.005 at least; None for any, as long as the connection stands. The
+            server is asked for a sign of life three times in that time.
+        largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
+            what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
+    """
+
+    def __init__(
+        self, interface: RedisInterface, path: Path, *, max_age: float | None = None, largest: int | None = None
+    ) -> None:
+        self._interface = interface
+        session = interface._followers.session
+        self._core = core.Mirror(session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest)
+        self.channel, self.max_age = self._core.channel, max_age
+
+    @property
+    def age(self) -> float:
+        """Seconds for which the server may have had something else than the copy; infinite before `listen`."""
+        return self._core.age
+
+    def listen(self) -> None:
+        """Begin to follow. When this returns, the copy is there. Idempotent; two or three round trips."""
+        self._interface._wait(self._core.listen())
+
+    def close(self) -> None:
+        """Stop following; reading raises Stale from then on. Idempotent."""
+        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
+            self._interface._wait(self._core.close())
+
+    def value(self) -> Any:
+        """Return a copy of the value, None if nothing is there. No round trip; any thread may call."""
+        return self._core.value()
+
+    def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
+        """Wait until the value is as wanted; returns it. No round trip."""
+        end = math.inf if timeout is None else time.monotonic() + timeout
+        while not (tried := self._core._tried(predicate)).fits:
+            # States: tried on the copy as it is -> waits for the next change, at most what is left -> tried again.
+            left = end - time.monotonic()
+            if left <= 0:
+                self._core._give_up(timeout)
+            # The predicate is called here, on the caller's thread, since it may block or use REEM; the loop only waits.
+            self._interface._wait(self._core._later(tried, left))
+        return tried.value
+
+    def __getitem__(self, key: str | int) -> core.MirrorAccessor:
+        return self._core[key]
+
+    def __setitem__(self, key: str | int, value: Any) -> None:
+        self._core[key] = value
+
+    def __delitem__(self, key: str | int) -> None:
+        del self._core[key]
+
+    def __repr__(self) -> str:
+        return f"<reem.Mirror {self.channel}>"

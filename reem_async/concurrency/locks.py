@@ -1,0 +1,88 @@
+"""A lock for each key, without keeping one for every key that was ever used; and locks for plain threads."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import weakref
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+__all__ = ["Locks", "ThreadLock"]
+
+Lock = TypeVar("Lock", bound=Any)
+
+# Keys whose locks are kept though nobody uses them; making one anew costs a microsecond.
+_MOST = 1000
+
+
+class Locks(Generic[Lock]):
+    """The locks of the last thousand keys, and of all for which somebody has one or waits for it.
+
+    Args:
+        new: Makes a lock, which can be referred to weakly.
+    """
+
+    def __init__(self, new: Callable[[], Lock]) -> None:
+        self._new = new
+        self._recent: dict[str, Lock] = {}
+        self._older: weakref.WeakValueDictionary[str, Lock] = weakref.WeakValueDictionary()
+        self._trimming = threading.Lock()
+
+    def of(self, key: str) -> Lock:
+        """Return the lock of `key`; whoever uses it keeps it."""
+        lock = self._recent.get(key)
+        return lock if lock is not None else self._put(key)
+
+    def _put(self, key: str) -> Lock:
+        # Nobody waits here for another thread: Ctrl-C may break that one off while it has a lock in its hands.
+        if len(self._recent) >= _MOST and self._trimming.acquire(blocking=False):
+            try:  # first in the one, then out of the other: always to be found
+                for old, lock in list(self._recent.items()):
+                    self._older[old] = lock
+                    self._recent.pop(old, None)
+            finally:
+                self._trimming.release()
+        lock = self._recent.setdefault(key, self._older.get(key) or self._new())
+        older = self._older.get(key)
+        if older is not None and older is not lock:  # it was made and went there just between the two
+            lock = self._recent[key] = older
+        return lock
+
+    def all(self) -> list[Lock]:
+        """Return all there are."""
+        older = (reference() for reference in self._older.valuerefs())
+        return [*list(self._recent.values()), *(lock for lock in older if lock is not None)]
+
+    def clear(self) -> None:
+        """Forget them: they belong to another event loop."""
+        self._recent.clear()
+        self._older.clear()
+
+
+class ThreadLock:
+    """A thread lock with the face of an asynchronous one; waiting for it blocks the thread.
+
+    Ctrl-C may come between any two steps, also just after it was taken, or before it is given back: `let_go` is for
+    that. And a thread that has it, in a handler of signals for example, does not wait for itself.
+    """
+
+    __slots__ = ("__weakref__", "_lock")
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+
+    async def __aenter__(self) -> None:
+        self._lock.acquire()
+
+    async def __aexit__(self, *_: Any) -> None:
+        try:
+            self._lock.release()
+        except RuntimeError:  # a call in a handler of signals has let go of all
+            return
+
+    def let_go(self) -> None:
+        """Give it back if this thread still has it."""
+        with contextlib.suppress(RuntimeError):
+            while True:
+                self._lock.release()

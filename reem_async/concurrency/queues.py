@@ -1,0 +1,202 @@
+"""What a subscriber keeps when updates come faster than they are taken."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+import os
+from collections.abc import Callable
+from typing import Any
+
+from ..errors import BadValue, QueueFull
+from .wakeup import Tickets, tickets
+
+__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "Places", "Policy", "unheard"]
+
+
+class Policy:
+    """How many updates wait at most, and what happens to the next one. Use one of the subclasses.
+
+    Args:
+        bound: How many updates may wait.
+
+    Attributes:
+        fails: One more ends the iterator with QueueFull; else the oldest is dropped.
+    """
+
+    fails = False
+
+    def __init__(self, bound: int) -> None:
+        if bound < 1:
+            raise BadValue(f"{type(self).__name__}({bound}) keeps nothing; use at least 1")
+        self.bound = bound
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.bound})"
+
+
+class Newest(Policy):
+    """Keep only the newest update: a slow loop skips what is out of date."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+
+    def __repr__(self) -> str:
+        return "Newest()"
+
+
+class Last(Policy):
+    """Keep the last `bound` updates and drop older ones."""
+
+
+class Every(Policy):
+    """Keep every update, up to `bound`; one more raises QueueFull in the loop that should take them."""
+
+    fails = True
+
+
+class Ended(Exception):
+    """The queue was closed and all of it was taken."""
+
+
+EMPTY: Any = object()
+"""What `BoundedQueue.take` returns when nothing waits."""
+
+
+class BoundedQueue:
+    """The updates that wait for one loop; one thread puts them in at a time, any number of threads take them out.
+
+    Who takes may be interrupted by a handler of signals at any step, for good or to close the interface in it, which
+    the putting thread must be able to do. So there is no lock: each step that matters is one of C, which Python does
+    not divide. Updates are numbered, so that the one that makes room for another is named, and not whichever is
+    first at that moment; and what was lost before an update is noted before the update is there, so that whoever
+    takes the next one out tells it, however many were dropped in between.
+
+    Args:
+        policy: How many to keep, and what happens to the next one.
+
+    Attributes:
+        dropped: How many updates were skipped and will never be taken out.
+        wake: Called after each change, from the putting thread.
+    """
+
+    def __init__(self, policy: Policy) -> None:
+        self._policy = policy
+        self._items: collections.OrderedDict[int, Any] = collections.OrderedDict()
+        self._last = 0
+        self._gaps: dict[int, int | None] = {}  # what was lost before which update
+        self._sleepers: collections.deque[None] = collections.deque()  # one for each thread that waits for a ticket
+        self._tickets: dict[int, Tickets] = {}  # by process: a forked child must not take its parent's
+        self._end: BaseException | None = None
+        self.dropped = 0
+        self.wake: Callable[[], None] = unheard
+
+    def put(self, update: Any) -> None:
+        """Add an update, dropping or failing as the policy says."""
+        if self._end is not None:
+            return
+        if self._policy.fails and len(self._items) >= self._policy.bound:
+            self._skip()
+        else:
+            self._last += 1
+            if getattr(update, "gap", False):
+                self._gaps[self._last] = update.missed
+            self._items[self._last] = update
+            if self._items.pop(self._last - self._policy.bound, EMPTY) is not EMPTY:
+                self._skip()
+                if len(self._gaps) > 1:
+                    self._join_gaps(self._last - self._policy.bound)
+        self._tell()
+
+    def _join_gaps(self, dropped: int) -> None:
+        """Keep in one what was lost before updates that were dropped, the last of which had this number."""
+        gone = [number for number in self._gaps.copy() if number <= dropped]
+        if len(gone) > 1:
+            self._gaps[gone[-1]] = _sum([self._gaps.pop(number, 0) for number in gone])
+
+    def skip(self) -> None:
+        """Note that an update will never come: a newer one of the same path has taken its place."""
+        self._skip()
+        self._tell()
+
+    def overtaken(self, update: Any) -> None:
+        """Note that later updates changed what one wrote before it was read: what that was cannot be told.
+
+        Args:
+            update: Its path, and all that is there now; None if a later one of this path is told of.
+        """
+        self.skip()
+
+    def _skip(self) -> None:
+        """Count a skipped update, and fail if the policy says so."""
+        self.dropped += 1
+        if self._policy.fails and self._end is None:
+            self._end = QueueFull(
+                f"an update was skipped, {self._policy!r} allows none; take them faster, use a larger bound, or "
+                "Last(n), which drops the oldest (of large values, only the newest is ever fetched)"
+            )
+
+    def _tell(self) -> None:
+        """Wake all who wait; who then has nothing to take waits again."""
+        while self._sleepers:
+            with contextlib.suppress(IndexError):  # it has found something meanwhile
+                self._sleepers.pop()
+                self._ticket().put(None)
+        self.wake()
+
+    def _ticket(self) -> Tickets:
+        return self._tickets.get(os.getpid()) or self._tickets.setdefault(os.getpid(), tickets())
+
+    def take(self) -> Any:
+        """Return the oldest update that waits, or EMPTY; raises Ended after the last, or QueueFull."""
+        end = self._end  # looked at first: what was put in before it is there
+        try:
+            number, update = self._items.popitem(last=False)
+        except KeyError:
+            if end is not None:
+                raise end from None
+            return EMPTY
+        return self._with_gaps(number, update) if self._gaps else update
+
+    def _with_gaps(self, number: int, update: Any) -> Any:
+        """Return an update with all that was lost before it and not told yet."""
+        told = [self._gaps.pop(each, EMPTY) for each in self._gaps.copy() if each <= number]
+        told = [missed for missed in told if missed is not EMPTY]  # another thread tells those
+        return dataclasses.replace(update, gap=True, missed=_sum(told)) if told else update
+
+    def take_waiting(self) -> Any:
+        """As `take`, but block this thread until there is something. Any number of threads may."""
+        while (item := self.take()) is EMPTY:
+            waiting = self._ticket()
+            self._sleepers.append(None)
+            if not self._items and self._end is None:  # else it was put in before anybody was seen to sleep
+                waiting.get()
+            # Whoever leaves otherwise, also by Ctrl-C, leaves a ticket that wakes somebody in vain.
+        return item
+
+    def close(self) -> None:
+        """End the queue after what waits."""
+        if self._end is None:
+            self._end = Ended()
+        self._tell()
+
+
+class Places(BoundedQueue):
+    """A bounded queue for who wants to know which places were updated and what is there now, not what was written."""
+
+    def overtaken(self, update: Any) -> None:
+        """Tell of the place."""
+        if update is None:
+            self.skip()
+        else:
+            self.put(update)
+
+
+def unheard() -> None:
+    """Wake nobody."""
+
+
+def _sum(missed: list[int | None]) -> int | None:
+    """Return how many updates were lost in all, None if that is not known of each loss."""
+    return None if None in missed else sum(number for number in missed if number is not None)

@@ -1,0 +1,111 @@
+"""An async iterator over a bounded queue: what loops over updates have in common."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import suppress
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+from ..errors import BadType
+from .queues import EMPTY, BoundedQueue, Ended, Policy, unheard
+
+__all__ = ["Following", "Stream", "arrived"]
+
+Item = TypeVar("Item")
+
+
+class Following:
+    """What begins to follow in `listen` and ends in `close`; `async with` calls both."""
+
+    async def listen(self) -> None:
+        """Begin to follow."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Stop following."""
+        raise NotImplementedError
+
+    async def __aenter__(self) -> Self:
+        await self.listen()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+
+class Stream(Following, Generic[Item]):
+    """Yields what arrives in a bounded queue, one by one. Cancelling a waiting loop loses nothing.
+
+    Args:
+        policy: What to keep for a loop that is slower than what arrives.
+        queue: Where it arrives, if it is not to be a plain one.
+    """
+
+    def __init__(self, policy: Policy, queue: BoundedQueue | None = None) -> None:
+        self.queue = queue or BoundedQueue(policy)
+        self._closed = False
+        self._waiter: asyncio.Future[None] | None = None
+
+    @property
+    def dropped(self) -> int:
+        """How many updates were skipped since they were not taken in time."""
+        return self.queue.dropped
+
+    @property
+    def _following(self) -> bool:
+        """Whether it follows, or did until it was closed."""
+        raise NotImplementedError
+
+    async def close(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        self._closed = True
+        self.queue.close()
+
+    async def aclose(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        await self.close()
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Item:
+        if not self._following:
+            await self.listen()
+        while True:
+            try:
+                item = self.queue.take()
+            except Ended:
+                raise StopAsyncIteration from None
+            if item is not EMPTY:
+                return item  # type: ignore[no-any-return]
+            await self._changed()
+
+    async def _changed(self) -> None:
+        """Wait until something was put into the queue."""
+        if self._waiter is not None:
+            raise BadType("two tasks take updates from one subscription; make one for each")
+        self._waiter = asyncio.get_running_loop().create_future()
+        self.queue.wake = self._wake
+        try:
+            await self._waiter
+        finally:
+            self._waiter = None
+            self.queue.wake = unheard  # a reference back would keep a stream that was dropped
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            try:
+                self._waiter.set_result(None)
+            except asyncio.InvalidStateError:  # Ctrl-C cancels between any two steps of Python
+                return
+
+
+def arrived(stream: Stream[Item]) -> Iterator[Item]:
+    """Take out what has arrived by now, without waiting."""
+    with suppress(Ended):
+        while (item := stream.queue.take()) is not EMPTY:
+            yield item

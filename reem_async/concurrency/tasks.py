@@ -1,0 +1,48 @@
+"""Tasks that run beside the caller, and who owns them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from contextvars import copy_context
+from typing import Any
+
+from .timeouts import forget
+
+__all__ = ["Tasks", "started"]
+
+_LONGEST_END = 1.0
+"""Seconds to wait for cancelled tasks: a ship of a user's own may be at work in one, and not end at once."""
+
+
+def started(coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+    """Run a coroutine as a named task. Whoever starts it keeps it: asyncio alone would let it be collected."""
+    context = copy_context()
+    context.run(forget)  # a time limit given for one call is not meant for what goes on after it
+    return asyncio.get_running_loop().create_task(coroutine, name=name, context=context)
+
+
+class Tasks:
+    """The background tasks of one owner, who ends them when it is closed."""
+
+    def __init__(self) -> None:
+        self._running: set[asyncio.Task[Any]] = set()
+
+    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        """Run a coroutine as a named task until it is done or the owner is closed."""
+        task = started(coroutine, name)
+        self._running.add(task)
+        task.add_done_callback(self._running.discard)
+        return task
+
+    async def end(self) -> None:
+        """Cancel all tasks and wait until they have ended, but for the one that asks for it. Idempotent.
+
+        Tasks of another event loop are left alone: after a fork, say, they are the parent's, and end there.
+        """
+        here = asyncio.get_running_loop()
+        ending = {task for task in self._running if task.get_loop() is here} - {asyncio.current_task()}
+        for task in ending:
+            task.cancel()
+        if ending:
+            await asyncio.wait(ending, timeout=_LONGEST_END)

@@ -1,0 +1,117 @@
+"""How long a call may stand still: the interface's limit, or another one for the calls in a `with` block."""
+
+from __future__ import annotations
+
+import array
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+from ..errors import BadValue
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows: what the kernel still holds cannot be asked there
+    fcntl = termios = None  # type: ignore[assignment]
+
+__all__ = ["LONGEST", "LOOKS", "check_timeout", "confirmed", "forget", "moved_last", "patience", "timeout", "unsent"]
+
+LONGEST = 1e6
+"""Seconds that a time limit may have: eleven days, which is as good as none."""
+
+LOOKS = 160
+"""How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
+move."""
+
+_DELAYED = 0.04
+"""Seconds after which the other side's kernel confirms the last bytes, if it has nothing to send with it: TCP's delayed
+acknowledgement. Those before are confirmed at once."""
+
+_TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
+_BYTES_ACKED = 120
+"""Where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits."""
+
+_given: ContextVar[float | None] = ContextVar("reem timeout", default=None)
+
+
+@contextmanager
+def timeout(seconds: float) -> Iterator[None]:
+    """Give every call of REEM inside the block another time limit than its interface's.
+
+    A call is given up once no byte has moved for that long, in either direction, while its reply is
+    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread.
+
+    Args:
+        seconds: The limit, above 0.
+
+    Raises:
+        BadValue: Not a number above 0.
+    """
+    token = _given.set(check_timeout(seconds))
+    try:
+        yield
+    finally:
+        _given.reset(token)
+
+
+def forget() -> None:
+    """Go back to the interfaces' own limits in this context."""
+    _given.set(None)
+
+
+def check_timeout(seconds: float) -> float:
+    """Return `seconds` if it can be a time limit, else raise BadValue."""
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= LONGEST:
+        raise BadValue(f"timeout={seconds!r} is not a number of seconds above 0 (at most a million)")
+    return float(seconds)
+
+
+def patience(default: float) -> float:
+    """Return the time limit of a call made now."""
+    given = _given.get()
+    return default if given is None else given
+
+
+def moved_last(last: float, now: float, before: int, left: int, limit: float) -> float:
+    """Return when a byte of a large value on its way up moved last.
+
+    Args:
+        last: When one had moved at the last look.
+        now: The time.
+        before: How many bytes were not confirmed at the last look.
+        left: How many are not confirmed now.
+        limit: The time limit of the call, in seconds.
+    """
+    if left >= before:
+        return last
+    return now if left else max(last, now - min(_DELAYED, limit / 25))
+
+
+def unsent(connected: socket.socket | None) -> int:
+    """Return how many bytes the other side has not confirmed yet, 0 where the kernel does not say."""
+    if connected is None or fcntl is None:
+        return 0
+    count = array.array("i", [0])
+    try:
+        fcntl.ioctl(connected.fileno(), termios.TIOCOUTQ, count)
+    except (OSError, ValueError):
+        return 0
+    return count[0]
+
+
+def confirmed(connected: socket.socket | None) -> int:
+    """Return how many bytes the other side has confirmed since it was connected, 0 where the kernel does not say.
+
+    For TLS, where what waits to be sent is spread over layers that cannot be asked.
+    """
+    if connected is None or _TCP_INFO is None:
+        return 0
+    try:
+        info = connected.getsockopt(socket.IPPROTO_TCP, _TCP_INFO, _BYTES_ACKED + 8)
+    except OSError:
+        return 0
+    return int(struct.unpack_from("=Q", info, _BYTES_ACKED)[0]) if len(info) == _BYTES_ACKED + 8 else 0

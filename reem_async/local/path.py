@@ -1,0 +1,172 @@
+"""What an interface has of the local path: the segments of its publishers, and who near them listens.
+
+What shares memory is imported when first needed: not every system has it, and not every program large values.
+"""
+
+from __future__ import annotations
+
+import collections
+import os
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..concurrency.aside import ensure_imported
+from ..errors import BadValue
+from ..plan.keys import Keys
+from ..plan.slots import Slot, starts
+
+if TYPE_CHECKING:
+    from .reader import LocalReader
+    from .segment import Segment
+
+__all__ = ["LEAST", "MEMORY", "LocalPath"]
+
+LEAST = 1 << 16
+"""Bytes from which a value goes through shared memory: below, a fetch from the server takes no longer."""
+
+MEMORY = 256 << 20
+"""Bytes of shared memory of one interface, unless it is told otherwise."""
+
+_MODES = ("auto", "off", "early")
+_SEGMENTS = 64
+"""Keys of one interface that have a segment at a time; each takes two file descriptors."""
+_ASKED = 1.0
+"""Seconds for which an answer holds of how many processes near by listen to a key."""
+_REFUSED = 60.0
+"""Seconds after which a server is asked again that has refused to say."""
+_IDLE = 10.0
+"""Seconds after which a segment that was not written is given up, with the next large value of any key."""
+_GROWTH = 2
+"""Times the room of the segment before, where a value has outgrown that."""
+_KEYS = 1000
+"""Top-level keys of which is known who listens."""
+
+
+class LocalPath:
+    """The shared memory of one interface.
+
+    Args:
+        mode: "auto", "off", or "early": subscribers near by are told before the server has the update.
+        memory: Bytes that it may take in all.
+
+    Raises:
+        BadValue: Another mode, or no number of bytes.
+
+    Attributes:
+        early: Subscribers near by are told before the server has an update.
+    """
+
+    def __init__(self, mode: Any = "auto", memory: Any = MEMORY) -> None:
+        if mode not in _MODES:
+            raise BadValue(f"local={mode!r:.40} is none of {', '.join(map(repr, _MODES))}")
+        if type(memory) is not int or memory < 0:
+            raise BadValue(f"local_memory={memory!r:.40} is not a number of bytes")
+        self._reader: LocalReader | None = None
+        self.early = mode == "early"
+        self._off = mode == "off" or memory == 0
+        self._memory = memory
+        self._pid = os.getpid()
+        self._segments: dict[str, Segment] = {}
+        self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
+
+    @property
+    def reader(self) -> LocalReader:
+        """What looks into the memory of publishers near by; only where there is a `host`."""
+        if self._reader is None:
+            ensure_imported("reem_async.local.reader")
+            from .reader import LocalReader
+
+            self._reader = LocalReader()
+        return self._reader
+
+    @property
+    def host(self) -> str:
+        """What names the processes near by; empty if this is switched off, or cannot be."""
+        if self._off or not hasattr(os, "memfd_create"):
+            return ""
+        ensure_imported("reem_async.local.host")
+        from .host import host
+
+        return host()
+
+    def channel(self, keys: Keys) -> str:
+        """Return the channel that subscribers near by listen to beside that of a key's notices."""
+        return f"{keys.channel}@{self.host}"
+
+    def view(self, slot: Slot, size: int) -> memoryview | None:
+        """Return the first bytes of a slot, so many, read-only; None if they are not to be had, or not near by."""
+        return self.reader.view(slot, size) if slot.host == self.host else None
+
+    def is_to_ask(self, keys: Keys) -> bool:
+        """Return whether it is not known any more how many near by listen to a key."""
+        _, until = self._audiences.get(keys.channel, (0, 0.0))
+        return time.monotonic() > until
+
+    def answered(self, keys: Keys, count: object) -> None:
+        """Note how many near by listen; anything but a number says that it cannot be known."""
+        self._give_up(before=time.monotonic() - _IDLE)  # once a second is enough
+        holds, number = (_ASKED, count) if type(count) is int else (_REFUSED, 0)
+        self._audiences[keys.channel] = number, time.monotonic() + holds
+        while len(self._audiences) > _KEYS:
+            self._audiences.popitem(last=False)
+
+    def has_audience(self, keys: Keys) -> bool:
+        """Return whether somebody near by listened to a key when that was asked last."""
+        return self._audiences.get(keys.channel, (0, 0.0))[0] > 0
+
+    def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:
+        """Copy an update into shared memory; None if there is no room for it now, or memory is not to be had.
+
+        Args:
+            keys: Of the top-level key. Not called twice at a time for the same.
+            pieces: Flat buffers of bytes.
+            sizes: Of the parts that they make up.
+        """
+        try:
+            segment = self._segment(keys.channel, starts(sizes)[-1])
+            written = None if segment is None else segment.put(pieces, sizes)
+        except (OSError, ValueError, MemoryError):  # a limit was met, of descriptors, memory or locks
+            return None
+        if segment is None or written is None:
+            return None
+        return Slot(self.host, self._pid, segment.descriptor, segment.inode, *written)
+
+    def _segment(self, channel: str, room: int) -> Segment | None:
+        """Return the segment of a key with so many bytes in each slot, made if need be; None if that is too much.
+
+        Without a lock, which a handler of signals or a forked child might find taken: each step stands for itself. Two
+        threads that make segments of two keys at the same time may find each other's too much.
+        """
+        if self._pid != os.getpid():  # those are the parent's: a forked child has its own
+            self._pid, self._segments = os.getpid(), {}
+        ensure_imported("reem_async.local.segment")
+        from .segment import HEAD, SLOTS, Segment
+
+        now = time.monotonic()
+        segment = self._segments.get(channel)
+        if segment is None or segment.shape.room < room:
+            self._give_up(before=now - _IDLE)
+            others = [each for each in [*self._segments.values()] if each is not segment]
+            left = self._memory - sum(each.shape.size for each in others) - HEAD
+            if SLOTS * room > left or len(others) >= _SEGMENTS:
+                return None  # smaller values still have the one that is there
+            if segment is not None:  # those who read keep the old ones for a while: of a map that grows, only a few
+                room = max(room, min(_GROWTH * segment.shape.room, left // SLOTS))
+            self._segments.pop(channel, None)
+            segment = None  # its memory goes before the next one's comes
+            segment = self._segments[channel] = Segment(room)
+        segment.used = now
+        return segment
+
+    def _give_up(self, before: float) -> None:
+        for channel, segment in [*self._segments.items()]:
+            if segment.used < before:
+                self._segments.pop(channel, None)
+
+    def close(self) -> None:
+        """Give all memory back; what subscribers look into stays as long as they do."""
+        self._off = True
+        if self._reader is not None:
+            self._reader.close()
+        self._segments = {}

@@ -1,0 +1,179 @@
+"""The memory of a publisher: one file without a name for each top-level key, in slots that each hold one update.
+
+The file is sealed: nobody but the process that made it can change or shorten it, so a reader that has checked the seals
+can neither be surprised by other bytes than the publisher's nor be killed by a page that is gone. It lives as long as
+somebody has it open.
+
+    0        identity        who reads compares it
+    64       a stamp for each slot: 0 while it is written
+    4096     slot 0, slot 1, ... each of the same size
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import mmap
+import os
+import secrets
+import struct
+import weakref
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..plan.slots import starts
+from .locks import lock_for_writing, unlock
+
+__all__ = ["HEAD", "IDENTITY", "MARK", "NAME", "SEALS", "SLOTS", "STAMP", "Segment", "Shape", "stamp_at"]
+
+SLOTS = 6
+"""One that is written, three for a subscriber (see `reader.py`), two for others that are not as far."""
+
+NAME = "reem"
+"""Of the file, for who looks at the descriptors of a process."""
+
+HEAD = 4096
+"""Bytes before the first slot: a page."""
+
+IDENTITY = struct.Struct("<8sQQ")
+"""What every segment begins with: a mark, how many slots it has, and the bytes of each."""
+MARK = b"REEM\x00\x00\x00\x01"
+
+STAMP = struct.Struct("<Q")
+_STAMPS = 64
+
+_STEP = 1 << 20
+"""Bytes that are allocated at a time: older kernels begin anew when a signal comes, and timers may send many."""
+
+_FUTURE_WRITE = 0x10
+"""F_SEAL_FUTURE_WRITE of <linux/fcntl.h>, which Python does not name: no mapping to write can be made any more."""
+_POPULATE_WRITE = 23
+"""MADV_POPULATE_WRITE of <sys/mman.h>, which Python does not name: map the pages now, and not at their first touch."""
+SEALS = getattr(fcntl, "F_SEAL_SHRINK", 0) | getattr(fcntl, "F_SEAL_GROW", 0) | _FUTURE_WRITE
+
+
+class Shape(NamedTuple):
+    """How a segment is divided.
+
+    Attributes:
+        slots: How many there are.
+        room: Bytes in each.
+    """
+
+    slots: int
+    room: int
+
+    @property
+    def size(self) -> int:
+        """Bytes of the whole file."""
+        return HEAD + self.slots * self.room
+
+    def start(self, number: int) -> int:
+        """Return where a slot begins."""
+        return HEAD + number * self.room
+
+
+def stamp_at(number: int) -> int:
+    """Return where the stamp of a slot is."""
+    return _STAMPS + number * STAMP.size
+
+
+class _Writing:
+    """A slot in the hands of one call."""
+
+    __slots__ = ("__weakref__",)
+
+
+class Segment:
+    """The shared memory of one publisher and top-level key.
+
+    Args:
+        room: Bytes that a slot has to hold.
+
+    Raises:
+        OSError: There is no memory, or no descriptor, to be had.
+
+    Who drops it gives its memory back; who reads a slot keeps that.
+
+    Attributes:
+        shape: How it is divided.
+        descriptor: By which other processes reach it.
+        inode: Of the file.
+        used: When it was written last, by whatever clock the owner goes.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.shape = Shape(SLOTS, -(-room // mmap.PAGESIZE) * mmap.PAGESIZE)
+        self.used = 0.0
+        self._oldest = list(range(SLOTS))
+        self._written: dict[int, weakref.ref[_Writing]] = {}
+        self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        # Closed with the last reference: another thread may be writing when the interface is closed.
+        weakref.finalize(self, os.close, self.descriptor).atexit = False
+        os.fchmod(self.descriptor, 0o600)
+        # All of it now: where memory is short this fails, and no write later is met by SIGBUS. (A cgroup's limit may
+        # still end the program, as it may wherever a program takes memory.)
+        for start in range(0, self.shape.size, _STEP):
+            os.posix_fallocate(self.descriptor, start, min(_STEP, self.shape.size - start))
+        self._map = mmap.mmap(self.descriptor, self.shape.size)
+        # Else the first update in each slot takes several times as long as later ones. Linux before 5.14 cannot.
+        with contextlib.suppress(OSError):
+            for start in range(0, self.shape.size, _STEP):
+                self._map.madvise(_POPULATE_WRITE, start, min(_STEP, self.shape.size - start))
+        fcntl.fcntl(self.descriptor, fcntl.F_ADD_SEALS, SEALS | fcntl.F_SEAL_SEAL)
+        self.inode = os.fstat(self.descriptor).st_ino
+        IDENTITY.pack_into(self._map, 0, MARK, *self.shape)
+        self._bytes = np.frombuffer(self._map, np.uint8)
+
+    def put(self, pieces: Sequence[Any], sizes: Sequence[int]) -> tuple[int, int] | None:
+        """Copy parts into the oldest slot that nobody reads; returns its number and stamp, None if all are read.
+
+        Args:
+            pieces: Flat buffers of bytes. Several make up one part where a size spans them.
+            sizes: The bytes of each part; see `plan.slots.starts`.
+        """
+        for number in self._oldest:
+            writing = self._taken(number)
+            if writing is not None and lock_for_writing(self.descriptor, number):
+                try:
+                    stamp = self._write(number, pieces, sizes)
+                finally:
+                    unlock(self.descriptor, number)
+                    del writing
+                self._oldest = [*(other for other in self._oldest if other != number), number]
+                return number, stamp
+        return None
+
+    def _taken(self, number: int) -> _Writing | None:
+        """Return what keeps a slot from other calls of this process as long as it lives; None if one has it.
+
+        They have one description, so its lock does not keep them apart: a handler of signals may publish in the middle.
+        It ends before the call that it came into goes on, so a slot that was free here is free when it is claimed.
+        """
+        other = self._written.get(number)
+        if other is not None and other() is not None:
+            return None
+        writing = _Writing()
+        self._written[number] = weakref.ref(writing)
+        return writing
+
+    def _write(self, number: int, pieces: Sequence[Any], sizes: Sequence[int]) -> int:
+        STAMP.pack_into(self._map, stamp_at(number), 0)  # broken off in the middle, it is nobody's
+        base, waiting = self.shape.start(number), iter(pieces)
+        for start, size in zip(starts(sizes), sizes, strict=False):
+            at = base + start
+            end = at + size
+            while at < end:
+                buffer = next(waiting)
+                if not len(buffer):  # numpy refuses it
+                    continue
+                piece = np.frombuffer(buffer, np.uint8)  # numpy lets other threads run while it copies
+                if len(piece) > end - at:
+                    raise ValueError("a buffer has more bytes than its length says: the next slot begins there")
+                self._bytes[at : at + len(piece)] = piece
+                at += len(piece)
+        stamp = secrets.randbelow((1 << 53) - 1) + 1
+        STAMP.pack_into(self._map, stamp_at(number), stamp)
+        return stamp

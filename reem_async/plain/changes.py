@@ -1,0 +1,224 @@
+"""Changes below the top of a document: a look, then a transaction that stores the new text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..errors import PartialWrite
+from ..plan import Command, Reply
+from .batches import (
+    ASKING,
+    EXEC,
+    MULTI,
+    OTHER_TYPE,
+    UNWATCH,
+    Known,
+    MakeError,
+    Steps,
+    Watched,
+    asks,
+    body_of,
+    framed,
+    is_json,
+    is_whole,
+    key_of,
+    run,
+    text_told,
+)
+from .documents import Document
+
+__all__ = ["after_look"]
+
+_FRAME = frozenset(["ASKING", "MULTI", "EXEC"])
+_STORING = frozenset(["SET", "UNLINK"])
+_SEEING = frozenset(["GET", "TYPE", "GETRANGE"])
+
+
+def after_look(
+    commands: Sequence[Command], keys: Sequence[bytes], known: Known, error: MakeError, watched: Watched | None
+) -> Steps:
+    """Return the translation of a batch that changes documents which have to be looked at before; see `translation`.
+
+    Args:
+        commands: The batch.
+        keys: Of the documents.
+        known: What was seen of keys.
+        error: Makes error replies.
+        watched: What the connection watches besides; then somebody else decides whether to try again.
+    """
+    # States: look (WATCH and read) -> nothing sent, if the look failed -> transaction -> answers, or given up, where
+    # somebody wrote in between. Whoever steps this tries again from the look, unless the plan itself holds the watch.
+    look = _Look(commands, keys, watched or Watched(), known, error)
+    replies = (yield look.commands) if look.commands else []
+    failed = look.failed(replies)
+    if failed is not None:
+        if watched is None:
+            yield [UNWATCH]
+        return _not_looked(commands, failed)
+    change = _Change(commands, look.documents(replies), error)
+    sent = change.commands(watched is not None)
+    outcome = (yield sent) if sent else []
+    # EXEC has ended the watch, whatever came of it.
+    if watched is not None and sent:
+        watched.clear()
+    if change.was_given_up(outcome):
+        return None if watched is None or not change.is_whole else [b"QUEUED"] * (len(commands) - 1) + [None]
+    return change.answers(outcome, known)
+
+
+def _not_looked(commands: Sequence[Command], failed: Exception) -> list[Reply]:
+    """Return the answers to a batch of which nothing was sent: the error is that of its JSON commands, and of EXEC."""
+    if commands[-1][0] != "EXEC":
+        return [failed] * len(commands)
+    return [failed if is_json(command) or command[0] == "EXEC" else b"QUEUED" for command in commands]
+
+
+class _Look:
+    """What has to be known of documents before they are changed."""
+
+    def __init__(
+        self, commands: Sequence[Command], keys: Sequence[bytes], watched: Watched, known: Known, error: MakeError
+    ) -> None:
+        self._keys, self._watched, self._known, self._error = keys, watched, known, error
+        # Texts are fetched only of documents that are changed inside: one that is replaced may be large.
+        self._read = {key_of(each) for each in commands if is_json(each) and not is_whole(each)}
+        looks: list[Command] = [("WATCH", key) for key in keys if key not in watched.keys]
+        for key in keys:
+            if key not in watched.texts:
+                # Of what is replaced as a whole, only whether it is a document.
+                looks += [("GET", key)] if key in self._read else [("TYPE", key), ("GETRANGE", key, "0", "0")]
+        self.commands = [word for look in looks for word in (ASKING, look)] if asks(commands) else looks
+
+    def failed(self, replies: Sequence[Reply]) -> Exception | None:
+        """Return the error that keeps it from knowing, None if there is none."""
+        for reply in replies:
+            if isinstance(reply, Exception) and not str(reply).startswith(OTHER_TYPE):
+                return reply
+        return None
+
+    def documents(self, replies: Sequence[Reply]) -> dict[bytes, Document | Exception]:
+        """Return the document under each key, or the error of the module about what is there."""
+        found: dict[bytes, Document | Exception] = {}
+        answers = iter([reply for reply, look in zip(replies, self.commands, strict=True) if look[0] in _SEEING])
+        for key in self._keys:
+            if key in self._watched.texts:
+                text: Reply = self._watched.texts[key]
+            else:
+                text = next(answers)
+                if key not in self._read:
+                    begins = next(answers)
+                    text = None if text == b"none" else begins
+            text = text_told(text, key, self._known, self._error)
+            found[key] = text if isinstance(text, Exception) else Document(text)
+        return found
+
+
+class _Change:
+    """A batch that was carried out on the texts of its documents, and what makes the server's the same.
+
+    Attributes:
+        is_whole: The batch is a transaction.
+    """
+
+    def __init__(
+        self, commands: Sequence[Command], documents: dict[bytes, Document | Exception], error: MakeError
+    ) -> None:
+        self._commands, self._documents = commands, documents
+        self._answers: list[Reply] = [b"OK"] * len(commands)
+        self._others: list[int] = []
+        last: dict[bytes, int] = {}
+        for place, command in enumerate(commands):
+            if is_json(command):
+                key = key_of(command)
+                last[key], document = place, documents[key]
+                self._answers[place] = document if isinstance(document, Exception) else run(document, command, error)
+            elif command[0] not in _FRAME:
+                self._others.append(place)
+        # Several changes of one document become one SET of its last text, in the place of the last of them.
+        self._last = {place: key for key, place in last.items() if _is_changed(documents[key])}
+        self._places: dict[int, int] = {}
+        self._sent: list[Command] = []
+        self._end = 0  # where EXEC is sent
+        self.is_whole = bool(commands[-1][0] == "EXEC")
+
+    def commands(self, held: bool) -> list[Command]:
+        """Return what to send: a transaction, and behind it what was not to be in one."""
+        inside = sorted([*self._last, *self._others]) if self.is_whole else list(self._last)
+        asking = [ASKING] if asks(self._commands) else []
+        if inside:
+            self._sent = [*asking, MULTI]
+            for place in inside:
+                self._add(place)
+            self._end = len(self._sent)
+            self._sent.append(EXEC)
+        # Nothing is changed after all (NX, or nothing to delete), but the look has watched.
+        elif not held or self.is_whole:
+            self._sent = [UNWATCH]
+        if not self.is_whole:
+            for place in self._others:
+                self._sent += asking
+                self._add(place)
+        return self._sent
+
+    def _add(self, place: int) -> None:
+        self._places[place] = len(self._sent)
+        key = self._last.get(place)
+        self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
+
+    def was_given_up(self, replies: Sequence[Reply]) -> bool:
+        """Return whether somebody else was first."""
+        return self._end > 0 and replies[self._end] is None
+
+    def answers(self, replies: Sequence[Reply], known: Known) -> list[Reply]:
+        """Return the answers to all commands of the batch."""
+        replies, answers = list(replies), self._answers
+        if self._end:
+            outcome = replies[self._end]
+            if not isinstance(outcome, list):
+                return self._refused(replies, outcome)
+            # Now each reply stands where its command was sent, as without a transaction.
+            replies[body_of(self._sent).start : self._end] = outcome
+        for place, at in self._places.items():
+            key = self._last.get(place)
+            if key is None or isinstance(replies[at], Exception):
+                answers[place] = replies[at]
+            else:
+                known.saw(key, _is_there(self._documents[key]))
+        return framed(self._commands, answers)
+
+    def _refused(self, replies: list[Reply], outcome: Reply) -> list[Reply]:
+        """Return the answers if the server did not take the transaction: errors where they were, and at its end."""
+        answers: list[Reply] = [b"QUEUED"] * len(self._commands)
+        for place, at in self._places.items():
+            answers[place] = replies[at]
+        if self.is_whole:
+            answers[0], answers[-1] = replies[0], outcome
+            return answers
+        # The batch was no transaction, the plan knows of none: what kept ours from being taken is the answer to its
+        # commands.
+        reason = next((reply for reply in replies if isinstance(reply, Exception)), outcome)
+        stored = [
+            reply for place, reply in enumerate(replies) if place < self._end and self._sent[place][0] in _STORING
+        ]
+        if reason is replies[self._sent.index(MULTI)] and not any(isinstance(reply, Exception) for reply in stored):
+            reason = PartialWrite(
+                f"{reason}; so it was done apart from the look before it: what others did may be lost"
+            )
+        for place, command in enumerate(self._commands):
+            if is_json(command):
+                answers[place] = reason
+        return answers
+
+
+def _is_changed(document: Document | Exception) -> bool:
+    return isinstance(document, Document) and document.changed
+
+
+def _is_there(document: Document | Exception) -> bool:
+    return isinstance(document, Document) and document.exists
+
+
+def _storing(key: bytes, document: Document | Exception) -> Command:
+    """Return what makes the string under a key that of a document."""
+    assert isinstance(document, Document)
+    return ("SET", key, document.string(), "KEEPTTL") if document.exists else ("UNLINK", key)

@@ -1,0 +1,1 @@
+"""Following updates: subscription connections, local copies, and the subscribers that users hold."""

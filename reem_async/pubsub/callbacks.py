@@ -1,0 +1,210 @@
+"""The calls of callback subscribers."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import sys
+from collections.abc import Awaitable, Callable, Mapping
+from contextvars import copy_context
+from typing import TYPE_CHECKING, Any
+
+from ..concurrency.queues import EMPTY, Ended
+from ..concurrency.streams import Stream
+from ..concurrency.tasks import started
+from ..concurrency.timeouts import forget
+from ..errors import BadType, QueueFull
+
+if TYPE_CHECKING:
+    from .updates import Update
+
+__all__ = ["Caller", "Calls", "arranged"]
+
+logger = logging.getLogger("reem.subscribe")
+
+
+_TOLD = frozenset(10**power for power in range(1, 12))
+"""Numbers of equal exceptions of a callback that are worth a line: at 200 Hz each would fill the log."""
+
+_GIVEN = "data", "updated_path"
+
+
+def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callable[..., Any]:
+    """Return what calls `function` with data and path by name, where its signature has these names, else in this order.
+
+    REEM 0.1 gave both by name, the manual says that they come first: so a function may name them in any order, take
+    them as `**kwargs`, or call them what it likes.
+
+    Args:
+        function: The callback.
+        kwargs: What each call gives besides.
+
+    Raises:
+        BadType: It cannot be called in any of these ways.
+    """
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # of some functions written in C
+        return function
+    parameters = signature.parameters.values()
+    first = [each.name for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)][:2]
+    named = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
+
+    def takes(*values: Any, **names: Any) -> bool:
+        try:
+            signature.bind(*values, **names, **kwargs)
+        except TypeError:
+            return False
+        return True
+
+    # The order of these questions decides for functions that can be called in several ways: first as the manual says,
+    # then by name as REEM 0.1 did, then with the two turned round.
+    in_order, by_name = takes(None, None), takes(data=None, updated_path=None)
+    if in_order and (first == [*_GIVEN] or not named.intersection(_GIVEN)):
+        return function
+    if by_name:
+        return lambda data, path, **others: function(data=data, updated_path=path, **others)
+    if in_order and ("data" in first[1:] or "updated_path" in first[:1]):
+        return lambda data, path, **others: function(path, data, **others)
+    if in_order:
+        return function
+    raise BadType(
+        f"callback_function cannot be called as callback(data, updated_path{', ' * bool(kwargs)}{', '.join(kwargs)}): "
+        f"it is {getattr(function, '__name__', type(function).__name__)}{signature}"
+    )
+
+
+class Caller:
+    """Calls one callback; both fronts use it, each on a thread of its own choice."""
+
+    def __init__(self, channel: str, function: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
+        self._channel = channel
+        self._function = function
+        self._kwargs = kwargs
+        self._raised: dict[object, int] = {}  # by kind and place
+        self._dropped = 0
+
+    def call(self, update: Update, dropped: int) -> Any:
+        """Call the function, unless the update is only the value that was there already; what it raises is logged.
+
+        Args:
+            update: What to tell.
+            dropped: How many updates were skipped until now; if they are more than at the last call, that is logged.
+        """
+        # Before the call, so that the log has the loss ahead of what it may cause.
+        if dropped > self._dropped:
+            self._dropped = dropped
+            logger.warning(
+                "%s: %d updates were skipped so far; newer ones came before the callback was done",
+                self._channel,
+                dropped,
+            )
+        if update.initial:
+            return None
+        try:
+            return self._function(update.data, update.path, **self._kwargs)
+        except (Exception, asyncio.CancelledError):  # of something that was cancelled, and whose result it asked for
+            self.failed(update)
+            return None
+
+    def failed(self, update: Update) -> None:
+        """Log the exception that is being handled: of each kind the first, then only how many there were by now."""
+        error, trace = sys.exc_info()[1:]
+        while trace is not None and trace.tb_next is not None:
+            trace = trace.tb_next
+        # The innermost place: two mistakes in one callback are told apart, and each has its first traceback in the log.
+        kind = type(error), trace and (trace.tb_frame.f_code, trace.tb_lineno)
+        count = self._raised[kind] = self._raised.get(kind, 0) + 1
+        if count == 1:
+            logger.exception("the callback for %s raised at %s; the subscription goes on", self._channel, update.path)
+        elif count in _TOLD:
+            logger.error("the callback for %s has raised %s %d times by now", self._channel, kind[0].__name__, count)
+
+    def ended(self, reason: Ended | QueueFull) -> None:
+        """Log the end of the calls if it is not by closing: the policy allowed no skipped update."""
+        if isinstance(reason, QueueFull):
+            logger.error("the callback for %s is not called any more: %s", self._channel, reason)
+
+
+class Calls:
+    """The calls of one subscriber on the event loop, one after the other, until its queue is closed.
+
+    They are made in the loop's next turn, when all that arrived in this one has been told to everybody. A task of
+    their own would do the same at a higher price; only what must be awaited gets one.
+
+    Args:
+        caller: Makes a call.
+        updates: Where the updates come from.
+        kept: Where to be as long as there may be calls.
+
+    Attributes:
+        loop: The event loop.
+    """
+
+    def __init__(self, caller: Caller, updates: Stream[Update], kept: set[Any]) -> None:
+        self.loop = asyncio.get_running_loop()
+        self._caller = caller
+        self._updates = updates
+        self._kept = kept
+        self._busy = False
+        self._awaited: asyncio.Task[Any] | None = None
+        self._over = self.loop.create_future()
+        self._context = copy_context()
+        self._context.run(forget)  # a time limit given for listen() is not meant for what callbacks do
+        kept.add(self)
+        # What was put into the queue before this has woken nobody.
+        updates.queue.wake = self._go_on
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Have the calls made that are due, unless that is under way."""
+        if not self._busy:
+            self._busy = True
+            self.loop.call_soon(self._call_waiting, context=self._context)
+
+    def _call_waiting(self) -> None:
+        queue = self._updates.queue
+        try:
+            # All that waits, in one turn of the loop: a task or a timer for each would cost more than the calls.
+            while (update := queue.take()) is not EMPTY:
+                result = self._caller.call(update, queue.dropped)
+                if result is not None and inspect.isawaitable(result):
+                    self._awaited = started(self._wait(update, result), "reem callback")
+                    return
+            self._busy = False
+        except (Ended, QueueFull) as reason:
+            self._caller.ended(reason)
+            self._end()
+        except BaseException:
+            self._end()
+            raise
+
+    async def _wait(self, update: Update, result: Awaitable[Any]) -> None:
+        try:
+            await result
+        except (Exception, asyncio.CancelledError):
+            if _is_being_cancelled():
+                self._end()
+                raise
+            self._caller.failed(update)
+        # Calls go on where an awaited one has left off; what came meanwhile waits in the queue.
+        self._busy = False
+        self._go_on()
+
+    def _end(self) -> None:
+        self._kept.discard(self)
+        self._updates.queue.wake = lambda: None
+        if not self._over.done():
+            self._over.set_result(None)
+
+    async def done(self) -> None:
+        """Wait until the queue, which is closed, is empty and all calls were made, unless one of them asks for it."""
+        if self._awaited is not asyncio.current_task():
+            await asyncio.wait([self._over])
+
+
+def _is_being_cancelled() -> bool:
+    """Return whether this task is, and not only what it awaits."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0

@@ -1,0 +1,353 @@
+"""Who follows a path: listens to the manager, drives a `Replica`, and hands what it tells to bounded queues.
+
+Notices and replies share the subscription connection (RESP3), so all a replica learns is in one order.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any
+
+from ..concurrency.queues import BoundedQueue, unheard
+from ..concurrency.tasks import Tasks
+from ..errors import ClusterNode
+from ..plan import Reply, wire_commands
+from ..plan.keys import Keys
+from ..plan.notices import Notice
+from ..plan.paths import Path, show
+from ..plan.reads import interpret
+from ..plan.shapes import ShapeCache
+from ..plan.trees import MISSING, copied
+from ..ships.registry import Ships
+from ..transport import Transport
+from ..transport.wire import Wire
+from .listeners import Beginning
+from .looks import Looks
+from .manager import Topic
+from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
+from .updates import Origin, Update
+
+__all__ = ["Follower", "Origin", "Update"]
+
+logger = logging.getLogger("reem.subscribe")
+
+_QUICKEST, _SLOWEST = 0.001, 0.02
+"""Seconds between looks at what was changed: a key that is stored at any rate is read 1,000 times a second at most."""
+
+
+class Follower:
+    """Keeps a local copy of one path equal to the server's, and hands out each update.
+
+    All methods but `value` and `at` are called on the event loop.
+
+    Attributes:
+        keys: The top-level key's names.
+        topic: What it subscribes to.
+        note: Where the server keeps a note of the last update.
+        queues: Where each update goes.
+        ready: Done when the first snapshot is there.
+        patience: Seconds that updates may wait for each other: none.
+        stored: It is told of what is only stored, too.
+        local: It takes large values from the memory of publishers of the same host.
+        heartbeat: Seconds between signs of life of the server, if it needs more of them than others.
+        born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
+        down: There is no connection, or it is new and what is there was not read yet.
+        told: Called after each step that may have changed the copy.
+    """
+
+    def __init__(
+        self,
+        keys: Keys,
+        path: Path,
+        ships: Ships,
+        cache: ShapeCache,
+        transport: Transport,
+        tasks: Tasks,
+        *,
+        stored: bool = False,
+        largest: float = math.inf,
+        heartbeat: float = math.inf,
+    ) -> None:
+        self.keys = keys
+        self.topic = Topic(keys.channel.encode())
+        self.note: str | None = keys.last
+        self.queues: list[BoundedQueue] = []
+        self.ready: asyncio.Future[None] | None = None
+        self.patience = 0.0
+        self.stored = stored
+        self.local = largest == math.inf  # else it wants no large values
+        self.heartbeat = heartbeat
+        self._transport = transport
+        self._tasks = tasks  # of the manager: its close ends them
+        self._replica = Replica(keys, path, ships, cache, largest)
+        self._wire: Wire | None = None
+        self._loop = asyncio.get_running_loop()
+        self._looks = Looks(self, Follower._look, _QUICKEST, _SLOWEST)
+        self._asked = 0.0  # when a read was sent last
+        self.born: list[Notice] | None = None
+        self.down = True
+        self._since: float | None = 0.0  # from when on the copy may lack something; None if it is not known to
+        self.told: Callable[[], None] = unheard
+
+    def start(self, wire: Wire, beginning: Beginning) -> None:
+        """Take a snapshot over `wire`."""
+        self._wire = wire
+        born, first, tracked = self.born, beginning is Beginning.FIRST, self.stored and bool(wire.tracked)
+        self.born = None
+        self._replica.begin(initial=first and born is None, tracked=tracked, born=first and born is not None)
+        for notice in born or ():  # what is read now has it
+            self._replica.on_notice(notice)
+        self._perform()
+        # In order behind it, so what it names has been heard of by then, or was there before.
+        wire.send([("GET", self.keys.last)], self._begin_with)
+
+    def _begin_with(self, outcome: list[Reply] | Exception) -> None:
+        if isinstance(outcome, list) and isinstance(outcome[0], bytes | None):
+            self._replica.begin_with(outcome[0])
+
+    def lost(self, reason: Exception) -> None:
+        """Stop applying: the connection is gone. Whoever waits for the first snapshot gets `reason`."""
+        if self._wire is not None and self._since is None:
+            self._since = self._wire.heard
+        self._wire, self.down = None, True
+        self._replica.lost()
+        self._looks.cancel()
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_exception(reason)
+        self.told()
+
+    def doubt(self, channel: bytes) -> None:
+        """Take a snapshot: something was published that could not be read."""
+        self._replica.unreadable()
+        self._perform()
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Take one update."""
+        self._looks.heard += 1
+        self._replica.on_notice(notice)
+        if self._replica.outputs:
+            self._perform()
+
+    def on_early(self, notice: Notice) -> None:
+        """Take one update that the server may not have yet."""
+        if not self.stored:  # who follows the store is never ahead of it, whether or not its server tells of changes
+            self._replica.on_early(notice)
+            self._perform()
+
+    def changed(self, key: str | None) -> None:
+        """Take the server's word that a key was changed."""
+        self._replica.changed(key)
+        self._perform()
+
+    def on_note(self, note: bytes | None) -> None:
+        """Compare with the server's note of the last update, asked for in order with notices."""
+        self._replica.on_note(note)
+        self._perform()
+
+    def value(self) -> Any:
+        """Return a copy of what is followed, None if nothing is there. Any thread may."""
+        return _own(self._replica.at())
+
+    def age(self) -> float:
+        """Return the seconds for which the server may have had something else than the copy. Any thread may.
+
+        Whatever was received says that the copy was the server's when that was sent, unless it says that it is not.
+        """
+        since, wire = self._since, self._wire
+        return time.monotonic() - (since if since is not None or wire is None else wire.heard)  # type: ignore[operator]
+
+    @property
+    def gone(self) -> bool:
+        """Whether the server has nothing at what is followed, as far as is known."""
+        return self._replica.is_current and self._replica.at() is MISSING
+
+    def at(self, inner: Path = ()) -> Any:
+        """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
+        return self._replica.at(inner)
+
+    # --- what the replica asks for
+
+    def _perform(self) -> None:
+        """Do and tell what the replica has put out; what is brought to it meanwhile may add to that."""
+        outputs = self._replica.outputs
+        while outputs:
+            output = outputs.popleft()
+            if isinstance(output, Updated):
+                self._tell(output)
+            else:
+                self._do(output)
+        if self.stored:
+            self._note_age()
+
+    def _note_age(self) -> None:
+        if self._replica.is_current:
+            self._since = None
+        elif self._since is None:
+            self._since = time.monotonic()
+        self.told()
+
+    def _do(self, output: Output) -> None:
+        if isinstance(output, Read):
+            self._read(output)
+        elif isinstance(output, Fence):
+            self._fence(output.number)
+        elif isinstance(output, Look):
+            self._looks.ask()
+        elif isinstance(output, Arm):
+            self._arm(output)
+        elif isinstance(output, Stored):
+            self._looks.found()
+            self._tell_stored(output)
+        elif isinstance(output, Open):
+            self._open(output)
+        elif isinstance(output, Skipped):
+            self._skip(output)
+        elif isinstance(output, Snapshot):
+            self._tell_snapshot(output)
+        elif isinstance(output, Ready):
+            self.down = False
+            if self.ready is not None and not self.ready.done():
+                self.ready.set_result(None)
+        elif isinstance(output, Failed):
+            self._report(output)
+
+    def _look(self) -> None:
+        self._replica.look()
+        self._perform()
+
+    def _arm(self, command: Arm) -> None:
+        if self._wire is not None:
+            self._wire.send([("TYPE", key) for key in command.keys], partial(self._armed, command.number))
+
+    def _armed(self, number: int, _: list[Reply] | Exception) -> None:
+        self._replica.armed(number)  # a refusal meets the read too
+        self._perform()
+
+    def _read(self, command: Read) -> None:
+        wire = self._wire
+        if wire is None:
+            return
+        self._asked = self._loop.time()
+        if command.plan.bulk:
+            self._tasks.start(self._read_large(command), f"reem fetch {self.keys.name}")
+        else:
+            wire.send(wire_commands(command.plan), partial(self._bring, command.number))
+
+    async def _read_large(self, command: Read) -> None:
+        """Read over the connection for large values."""
+        outcome: list[Reply] | Exception
+        try:
+            outcome = await self._transport.roundtrip(wire_commands(command.plan), bulk=True)
+        except Exception as error:
+            outcome = error
+        self._bring(command.number, outcome)
+
+    def _bring(self, number: int, outcome: list[Reply] | Exception) -> None:
+        now = self._loop.time()
+        self._looks.earliest = now + max(_QUICKEST, now - self._asked)  # large values leave time for others
+        self._replica.replies(number, outcome)
+        self._perform()
+
+    def _fence(self, number: int) -> None:
+        def fenced(outcome: list[Reply] | Exception) -> None:
+            self._replica.fenced(number, outcome if isinstance(outcome, Exception) else None)
+            self._perform()
+
+        if self._wire is not None:
+            self._wire.send([("PING",)], fenced)
+
+    def _open(self, command: Open) -> None:
+        """Have the ships make values of their replies; those that must be awaited get a task."""
+        raw_read, waiting = command.raw_read, []
+        try:
+            for slot, ship, reply in raw_read.slots:
+                value = interpret(raw_read.name, slot, ship, reply)
+                if inspect.isawaitable(value):
+                    waiting.append((slot.container, slot.key, value))
+                else:
+                    slot.container[slot.key] = value
+        except Exception as error:
+            self._replica.failed(command.number, error)
+            return
+        if waiting:
+            self._tasks.start(self._await_ships(command, waiting), f"reem ships {self.keys.name}")
+        else:
+            self._replica.opened(command.number, raw_read.holder[0])
+
+    async def _await_ships(self, command: Open, waiting: list[tuple[Any, Any, Awaitable[Any]]]) -> None:
+        try:
+            for container, key, value in waiting:
+                container[key] = await value
+        except Exception as error:
+            self._replica.failed(command.number, error)
+        else:
+            self._replica.opened(command.number, command.raw_read.holder[0])
+        self._perform()
+
+    # --- what the replica tells
+
+    def _tell(self, event: Updated) -> None:
+        notice, tree, written, missed = event
+        publisher, sequence, time, inner = notice[:4]
+        path = show((self.keys.name, *inner))
+        for queue in self.queues:
+            data = _own(tree)
+            value = data if written is tree else _own(written)
+            gone = notice.deleted or tree is MISSING
+            how = Origin.PUBLISHED, gone, notice.early
+            queue.put(Update(path, data, value, False, time, publisher, sequence, missed != 0, missed, *how))
+
+    def _tell_stored(self, event: Stored) -> None:
+        path = self._path(event.path)
+        for queue in self.queues:
+            data = _own(event.data)
+            value = data if event.value is event.data else _own(event.value)
+            queue.put(Update(path, data, value, origin=Origin.STORED, deleted=event.value is MISSING))
+
+    def _tell_snapshot(self, event: Snapshot) -> None:
+        path, gone = self._path(()), event.data is MISSING
+        for queue in self.queues:
+            data = _own(event.data)
+            queue.put(
+                Update(
+                    path,
+                    data,
+                    data,
+                    initial=event.initial,
+                    gap=not event.initial,
+                    missed=event.missed,
+                    origin=Origin.FOUND,
+                    deleted=gone,
+                )
+            )
+
+    def _path(self, inner: Path) -> str:
+        """Return a path below what is followed, as people write it."""
+        return show((self.keys.name, *self._replica.path, *self._replica.rest, *inner))
+
+    def _skip(self, event: Skipped) -> None:
+        notice = event.notice
+        path, stamp = show((self.keys.name, *notice.path)), (notice.time, notice.publisher, notice.sequence)
+        for queue in self.queues:
+            queue.overtaken(Update(path, _own(event.data), None, False, *stamp) if event.newest else None)
+
+    def _report(self, event: Failed) -> None:
+        """Say that a snapshot could not be taken."""
+        error = event.error
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_exception(error)
+        elif self._wire is not None and self._wire.alive:
+            where = show((self.keys.name, *self._replica.path))
+            fact = error.fact if isinstance(error, ClusterNode) and self._transport.sharded else error
+            logger.warning("%s: an update could not be read and is skipped: %s", where, fact)
+
+
+def _own(tree: Any) -> Any:
+    """Return a tree for a user to keep: its containers are his, and None stands for what is not there."""
+    return None if tree is MISSING else copied(tree)

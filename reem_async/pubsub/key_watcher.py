@@ -1,0 +1,301 @@
+"""Patterns of channels in a cluster, where servers have none: the keys are looked for, and each is followed.
+
+A key that is found a moment after it was made would have been published to already. So publishers
+tell all nodes what they publish in their first seconds with a key, by a channel of the old kind, for
+which there are patterns; whoever hears of a key this way follows it from then on. A `ReorderBuffer` for each key
+puts in one order what is heard in both ways.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import weakref
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from ..concurrency.tasks import Tasks
+from ..errors import InterfaceClosed, RedisError
+from ..plan.keys import keys_of
+from ..plan.notices import Notice
+from ..plan.scan import DOCUMENT
+from ..transport import Transport
+from ..transport.scan import scanned
+from ..transport.wire import Wire
+from .listeners import Beginning, ForwardingListener, Listener, Topic
+from .reorder import ReorderBuffer
+
+__all__ = ["KeyWatcher"]
+
+logger = logging.getLogger("reem.subscribe")
+
+_PAUSE = 1.0
+"""Seconds between looks for new keys."""
+# Seconds between looks whether something still waits, and how often: a second in all, twice what a buffer waits.
+_MOMENT, _MOMENTS = 0.005, 200
+
+_MOST = 10_000
+"""Keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes."""
+
+_TAIL = "}:notices"
+_ESCAPED = re.compile(r"\\(.)", re.DOTALL)
+
+
+class Subscriptions(Protocol):
+    """Who follows what the servers themselves know as a topic: the subscription manager."""
+
+    transport: Transport
+    tasks: Tasks
+
+    async def follow_here(self, listener: Listener) -> None:
+        """Follow one topic."""
+
+    async def follow_all(self, listeners: Sequence[Listener]) -> None:
+        """Follow many topics."""
+
+    async def unfollow(self, listener: Listener) -> None:
+        """Stop following a topic, or what was found for a pattern."""
+
+    async def unfollow_here(self, listener: Listener) -> None:
+        """Stop following one topic."""
+
+
+class KeyWatcher:
+    """Follows, for each listener to a pattern, all keys that there are, and those that come to be.
+
+    Args:
+        manager: Who follows a key.
+    """
+
+    def __init__(self, manager: Subscriptions) -> None:
+        self._manager = manager
+        self._branches: weakref.WeakKeyDictionary[Listener, dict[bytes, _KeyListener]] = weakref.WeakKeyDictionary()
+        self._births: weakref.WeakKeyDictionary[Listener, _NewKeysListener] = weakref.WeakKeyDictionary()
+        self._looking: asyncio.Task[Any] | None = None
+
+    async def follow(self, listener: Listener) -> None:
+        """Follow all keys that there are now; those that come to be are found within a second."""
+        self._branches[listener] = {}
+        try:
+            name = literal(_glob(listener))
+            # A pattern that is a name: nothing has to be looked for.
+            if name is not None:  # it need not be there yet
+                await self._found(listener, [name.encode()], late=False)
+                return
+            births = self._births[listener] = _NewKeysListener(self, listener)
+            # First the channel to all nodes, then the look: a key that is made in between is heard of.
+            await self._manager.follow_here(births)
+            await self._look(listener, late=False)
+        except BaseException:
+            await self.unfollow(listener)
+            raise
+        if self._looking is None or self._looking.done():
+            self._looking = self._manager.tasks.start(self._go_on_looking(), "reem discovery")
+
+    def listeners(self) -> list[Listener]:
+        """Return who listens to patterns: the manager itself only knows of their keys."""
+        return list(self._branches)
+
+    async def unfollow(self, listener: Listener) -> None:
+        """Stop following. Idempotent."""
+        for branch in self._branches.pop(listener, {}).values():
+            await self._manager.unfollow(branch)
+        births = self._births.pop(listener, None)
+        if births is not None:
+            await self._manager.unfollow_here(births)
+
+    def heard(self, listener: Listener, document: bytes) -> None:
+        """Follow a key that was just heard of."""
+        births = self._births.get(listener)
+        if births is None or document in self._branches.get(listener, {document: None}):
+            return
+        # Collected while others are being followed: many keys are made at once, and each subscription is a round trip.
+        births.fresh[document] = None
+        if not births.following:
+            births.following = True
+            self._manager.tasks.start(self._follow_fresh(listener, births), "reem discovery of new keys")
+
+    async def _follow_fresh(self, listener: Listener, births: _NewKeysListener) -> None:
+        """Follow what was heard of, and all that is heard of meanwhile at once."""
+        try:
+            while births.fresh:
+                found, births.fresh = list(births.fresh), {}
+                await self._found(listener, found, late=True)
+        except (RedisError, OSError, InterfaceClosed) as error:
+            logger.debug("new keys are not followed yet: %s", error)
+        finally:
+            births.following = False
+
+    async def settled(self) -> None:
+        """Return when nothing that has arrived waits for something older, or after a second."""
+        for _ in range(_MOMENTS):
+            if not any(births.waits for births in list(self._births.values())):
+                return
+            await asyncio.sleep(_MOMENT)
+
+    async def _go_on_looking(self) -> None:
+        while True:
+            await asyncio.sleep(_PAUSE)
+            await self._look_for_all()
+            # Nobody listens to a pattern any more; the next one starts this anew.
+            if not self._branches:
+                return
+
+    async def _look_for_all(self) -> None:
+        for listener in list(self._births):
+            try:
+                await self._look(listener, late=True)
+            except (RedisError, OSError) as error:
+                logger.debug("new keys could not be looked for: %s", error)
+
+    async def _look(self, listener: Listener, *, late: bool) -> None:
+        """Follow the keys that are not followed yet."""
+        async for page in scanned(self._manager.transport, _glob(listener), DOCUMENT):
+            await self._found(listener, page, late=late)
+
+    async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
+        """Follow those that are not followed yet."""
+        branches, births = self._branches.get(listener), self._births.get(listener)
+        if branches is None:
+            return
+        found = {
+            name: _KeyListener(listener, name, births)
+            for name in documents
+            if name not in branches and b"{" not in name
+        }
+        branches.update(found)
+        for branch in found.values():
+            if late and births is not None:
+                # Its first updates may have been published before it was found.
+                births.buffer(branch.topic.name).late = True
+        try:
+            await self._manager.follow_all(list(found.values()))
+        except BaseException:
+            for name, branch in found.items():
+                if not branch.begun:
+                    branches.pop(name, None)
+            raise
+
+
+def _glob(listener: Listener) -> str:
+    """Return the pattern of the documents whose channels a listener's pattern names."""
+    return listener.topic.name.decode().removeprefix("{").removesuffix(_TAIL)
+
+
+def literal(glob: str) -> str | None:
+    """Return the only name that a pattern of the server names, None if there may be others."""
+    plain = _ESCAPED.sub("", glob)
+    return None if any(sign in plain for sign in "*?[") else _ESCAPED.sub(r"\1", glob)
+
+
+class _Part(ForwardingListener):
+    """A part of what somebody follows who listens to a pattern: a listener of the subscription manager.
+
+    Args:
+        listener: Who listens to the pattern; held weakly, so that who is dropped is not followed for any more.
+        topic: What it subscribes to.
+    """
+
+    def __init__(self, listener: Listener, topic: Topic) -> None:
+        super().__init__(topic, listener.patience)
+        self._listener = weakref.ref(listener)
+
+    def lost(self, reason: Exception) -> None:
+        """Hand it on, if this had begun."""
+        if self.ready is not None:
+            super().lost(reason)
+        elif (listener := self._listener()) is not None:
+            listener.lost(reason)
+
+    def doubt(self, channel: bytes) -> None:
+        """Hand it on."""
+        if (listener := self._listener()) is not None:
+            listener.doubt(channel)
+
+
+class _KeyListener(_Part):
+    """One key of a pattern: a listener of the subscription manager that hands everything on.
+
+    Attributes:
+        begun: It is followed.
+    """
+
+    def __init__(self, listener: Listener, document: bytes, births: _NewKeysListener | None) -> None:
+        channel = keys_of(document.decode(errors="surrogateescape")).channel
+        super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
+        self._births = births  # where its first notices came from, or None if only this key is meant
+        self.begun = False
+
+    def start(self, wire: Wire, beginning: Beginning) -> None:
+        """Begin, and let the listener begin."""
+        self.begun = True
+        if self._births is not None:
+            self._births.begin(wire, beginning)
+        elif (listener := self._listener()) is not None:
+            listener.start(wire, beginning)
+        super().start(wire, beginning)
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Hand it on, behind what all nodes were told before."""
+        if self._births is not None:
+            self._births.buffer(channel).told_here(notice)
+        elif (listener := self._listener()) is not None:
+            listener.on_notice(notice, channel)
+
+
+class _NewKeysListener(_Part):
+    """What publishers tell all nodes: a listener of the subscription manager.
+
+    Attributes:
+        fresh: The keys that were just heard of, in their order, and
+        following: whether they are about to be followed.
+    """
+
+    def __init__(self, key_watcher: KeyWatcher, listener: Listener) -> None:
+        super().__init__(listener, listener.topic)
+        self._key_watcher = key_watcher
+        self.fresh: dict[bytes, None] = {}
+        self.following = False
+        self._telling = False  # of a gap, in this turn of the event loop
+        self._buffers: dict[bytes, ReorderBuffer] = {}
+
+    @property
+    def waits(self) -> bool:
+        """Whether something has come and is not handed on yet."""
+        return any(each.waits for each in self._buffers.values())
+
+    def buffer(self, channel: bytes) -> ReorderBuffer:
+        """Return what puts in order what is heard of a key."""
+        found = self._buffers.get(channel)
+        if found is None:
+            if len(self._buffers) >= _MOST:  # of a key that is forgotten, all is taken as it comes
+                del self._buffers[next(iter(self._buffers))]
+            found = self._buffers[channel] = ReorderBuffer(self._listener, channel)
+        return found
+
+    def start(self, wire: Wire, beginning: Beginning) -> None:
+        """Begin, and let the listener begin."""
+        self.begin(wire, beginning)
+        super().start(wire, beginning)
+
+    def begin(self, wire: Wire, beginning: Beginning) -> None:
+        """Let the listener begin. One broken connection is one gap, however many keys begin anew over the next."""
+        if beginning is Beginning.AFTER_LOSS:
+            if self._telling:
+                beginning = Beginning.FIRST
+            else:
+                self._telling = True
+                asyncio.get_running_loop().call_soon(self._told)
+        if (listener := self._listener()) is not None:
+            listener.start(wire, beginning)
+
+    def _told(self) -> None:
+        self._telling = False
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Hand it on, and see to it that the key is followed."""
+        if (listener := self._listener()) is None:
+            return
+        self.buffer(channel).told_to_all(notice)
+        self._key_watcher.heard(listener, channel.removeprefix(b"{").removesuffix(_TAIL.encode()))

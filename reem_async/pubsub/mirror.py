@@ -1,0 +1,233 @@
+"""A mirror of a place in the store: read at memory speed, with the age of what it says."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import weakref
+from collections.abc import Callable
+from typing import Any, NamedTuple, NoReturn
+
+from ..concurrency.streams import Following
+from ..errors import BadValue, InterfaceClosed, Stale
+from ..plan.keys import Keys
+from ..plan.paths import Path, check_element, show
+from ..session import Session
+from .follower import Follower
+from .subscribers import Link, LocalAccessor
+
+__all__ = ["Mirror", "MirrorAccessor", "Tried"]
+
+_LOOKS = 3
+"""Heartbeats in the time of `max_age`."""
+_SHORTEST = 0.005
+"""Seconds that `max_age` has at least: heartbeats are a load too."""
+_RETRY = 0.02
+"""Seconds after which a waiting caller looks again at a copy that was too old."""
+
+
+class Tried(NamedTuple):
+    """What came of asking whether a copy is as somebody wants it.
+
+    Attributes:
+        fits: It is.
+        value: The value that was looked at.
+        seen: How many steps may have changed the copy until then.
+        again: Seconds after which to ask again even if nothing changes.
+    """
+
+    fits: bool
+    value: Any
+    seen: int
+    again: float
+
+
+class Mirror(Following):
+    """A local copy of a place in the store that follows every change, published or only stored, by whomever.
+
+    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is at most
+    one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
+    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
+    Use it with `async with`, or `listen()` and `close()`.
+
+    Args:
+        session: The server.
+        keys: The top-level key's names.
+        path: The path below it.
+        max_age: Seconds that an answer may be old, 0.005 at least; None for any, as long as the connection stands. The
+            server is asked for a sign of life three times in that time.
+        largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
+            what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
+    """
+
+    def __init__(
+        self, session: Session, keys: Keys, path: Path, *, max_age: float | None = None, largest: int | None = None
+    ) -> None:
+        if max_age is not None and not max_age >= _SHORTEST:
+            raise BadValue(f"max_age={max_age!r}: use {_SHORTEST} seconds or more, or None")
+        self.channel = show((keys.name, *path))
+        self.max_age = max_age
+        self._seen = 0
+        self._full_path: Path = (keys.name, *path)
+        self._link = Link(
+            session,
+            keys,
+            path,
+            [],
+            stored=True,
+            largest=math.inf if largest is None else largest,
+            heartbeat=math.inf if max_age is None else max_age / _LOOKS,
+        )
+        self._link.told = _waking(self)
+        self._waiting: set[asyncio.Future[None]] = set()
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, the copy is there. Idempotent; two or three round trips.
+
+        Raises:
+            NotConnected: Nobody listens there.
+            InterfaceClosed: It was closed before.
+        """
+        await self._link.follow()
+
+    async def close(self) -> None:
+        """Stop following; reading raises Stale from then on. Idempotent."""
+        await self._link.unfollow()
+
+    @property
+    def age(self) -> float:
+        """Seconds for which the server may have had something else than the copy; infinite before `listen`.
+
+        While nothing changes it goes up to the time between two signs of life: a second, or a third of `max_age`.
+        """
+        follower = self._link.follower
+        return math.inf if follower is None else follower.age()
+
+    def value(self) -> Any:
+        """Return a copy of the value, None if nothing is there. No round trip; any thread may call.
+
+        Raises:
+            Stale: The connection is down, or the copy is older than `max_age`.
+        """
+        self._check()
+        follower = self._link.follower
+        return None if follower is None else follower.value()
+
+    def _check_begun(self) -> Follower:
+        """Return who follows; raise Stale if nobody does."""
+        follower = self._link.follower
+        if follower is None:
+            raise Stale(f"{self.channel}: this mirror does not follow yet; use it in a `with`, or call listen() first")
+        return follower
+
+    def _check(self) -> None:
+        """Raise Stale if the copy must not be relied on."""
+        follower = self._check_begun()
+        if self._link.closed:
+            raise Stale(f"{self.channel}: this mirror is closed; make a new one")
+        age = follower.age()
+        # Before the age: it says more than that the copy is old.
+        if follower.down:
+            raise Stale(f"{self.channel}: the connection is down, and the copy {age:.3f} s old; it is being made again")
+        if self.max_age is not None and age > self.max_age:
+            raise Stale(f"{self.channel}: the copy is {age:.3f} s old, and max_age={self.max_age:g}")
+
+    async def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:  # noqa: ASYNC109
+        """Wait until the value is as wanted; returns it. No round trip.
+
+        Args:
+            predicate: Called with a copy of the value at once, and again after each change; returns whether it is so.
+            timeout: Seconds after which to give up.
+
+        Raises:
+            TimeoutError: It did not come true in time.
+            Stale: The mirror does not follow yet.
+            InterfaceClosed: The mirror was closed.
+        """
+        # Kept, to tell its end from a TimeoutError that the predicate raises.
+        limit = asyncio.timeout(timeout)
+        try:
+            async with limit:
+                while not (tried := self._tried(predicate)).fits:
+                    await self._later(tried)
+        except TimeoutError:
+            if not limit.expired():  # the predicate's own
+                raise
+            self._give_up(timeout)
+        return tried.value
+
+    def _tried(self, predicate: Callable[[Any], Any]) -> Tried:
+        """Return whether the value is as wanted now; not where the copy must not be relied on."""
+        if self._link.closed:
+            raise InterfaceClosed(f"{self.channel}: this mirror was closed")
+        self._check_begun()
+        # Before the copy is looked at: a change in between is then no reason to wait.
+        seen = self._seen
+        try:
+            value = self.value()
+        except Stale:
+            return Tried(False, None, seen, _RETRY)
+        return Tried(bool(predicate(value)), value, seen, math.inf)
+
+    async def _later(self, tried: Tried, most: float = math.inf) -> None:
+        """Return when the copy may have changed since it was looked at, or it is time to look again."""
+        if self._seen != tried.seen:
+            return
+        waiter = asyncio.get_running_loop().create_future()
+        self._waiting.add(waiter)
+        seconds = min(most, tried.again)
+        try:
+            await asyncio.wait([waiter], timeout=None if seconds == math.inf else seconds)
+        finally:
+            self._waiting.discard(waiter)
+
+    def _give_up(self, timeout: float | None) -> NoReturn:
+        """Raise TimeoutError."""
+        follower = self._link.follower
+        why = "; its connection is down" if follower is None or follower.down else ""
+        raise TimeoutError(f"{self.channel}: did not come true within {timeout:g} s{why}") from None
+
+    def _wake(self) -> None:
+        self._seen += 1
+        for waiter in self._waiting:
+            if not waiter.done():
+                waiter.set_result(None)
+
+    def __getitem__(self, key: str | int) -> MirrorAccessor:
+        return MirrorAccessor(self, (check_element(key, self._full_path),))
+
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        self[key].write(value)
+
+    def __delitem__(self, key: str | int) -> NoReturn:
+        self[key].write()
+
+    def __repr__(self) -> str:
+        return f"<reem_async.Mirror {self.channel}>"
+
+
+def _waking(mirror: Mirror) -> Callable[[], None]:
+    """Return what wakes those who wait for a mirror; a reference back would keep a mirror that was dropped."""
+    reference = weakref.ref(mirror)
+
+    def told() -> None:
+        if (there := reference()) is not None:
+            there._wake()
+
+    return told
+
+
+class MirrorAccessor(LocalAccessor):
+    """One place in a mirror's copy."""
+
+    __slots__ = ()
+
+    def read(self) -> Any:
+        """Return a copy of the value here as of now. No round trip.
+
+        Raises:
+            MissingKey: Nothing is here.
+            Stale: The connection is down, or the copy is older than `max_age`.
+        """
+        self._subscriber._check()
+        return super().read()

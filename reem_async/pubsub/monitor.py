@@ -1,0 +1,250 @@
+"""Monitor: what is published under any number of keys, without fetching what is only announced."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ..concurrency.queues import Every, Policy
+from ..concurrency.streams import Stream
+from ..connection import RedisInterface
+from ..errors import BadType, InterfaceClosed
+from ..plan.notices import ANNOUNCED, Notice
+from ..plan.paths import Path, is_namespace, show
+from ..plan.patterns import Pattern, channel_pattern, fits, name_of, parse_pattern
+from .gaps import Numbers
+from .listeners import ForwardingListener
+from .manager import SubscriptionManager, Topic, manager_of
+
+__all__ = ["ANNOUNCED", "Event", "Monitor"]
+
+# Keys. Beyond that every key is taken to have a gap, once.
+_MOST_DOUBTS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One update, as its publisher announced it.
+
+    Attributes:
+        path: What was updated, top-level key first.
+        value: What was written, if it travelled with the announcement; else ANNOUNCED. None if deleted.
+        deleted: What was at `path` is gone.
+        size: Bytes of the value; 0 where only the server knows (arithmetic, appending).
+        time: When it was published, in seconds since 1970 on the publisher's clock.
+        received: When it was received here, in seconds since 1970 on this machine's clock.
+        publisher: The id of the interface that published it.
+        sequence: Its number among this publisher's updates of the top-level key.
+        missed: How many updates of this publisher and key were lost directly before.
+        gap: Something was lost before: `missed` are known, or the connection broke, or a message was unreadable.
+        namespace: Where the top-level key is: the interface's namespace, or the one of many that it was found in.
+        stored: Nobody published it: it was found to be stored, at `time`, which is that of `received`. A `Monitor`
+            tells of no such changes; commands that also follow the store do.
+        local: Programs of the publisher's user and host can take the value from its memory.
+    """
+
+    path: Path
+    value: Any
+    deleted: bool
+    size: int
+    time: float
+    received: float
+    publisher: str
+    sequence: int
+    missed: int = 0
+    gap: bool = False
+    namespace: str = ""
+    stored: bool = False
+    local: bool = False
+
+    @property
+    def name(self) -> str:
+        """The top-level key."""
+        return str(self.path[0])
+
+    @property
+    def shown(self) -> str:
+        """The path as people write it."""
+        return show(self.path)
+
+
+class Monitor(Stream[Event]):
+    """Yields an `Event` for every update published under some patterns of paths: an async iterator.
+
+    Sees what is published with a PublishSpace, not what a KeyValueStore writes. Nothing is fetched:
+    small values come with the event, large ones only with their size. Reconnects for ever; what was
+    lost shows as `gap`.
+
+    Args:
+        interface: The server.
+        patterns: Globs such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
+        policy: What to keep for a loop that is slower than the updates; `Every(10_000)` if not given.
+        namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
+            `event.namespace` says which it was: the shortest that fits.
+        patience: Seconds that updates may wait here for each other while many come, unless somebody who follows
+            something through this interface is in a hurry. Who only notes what happens costs publishers less so:
+            he is woken less often.
+
+    Attributes:
+        doubted: Called with a top-level key of which a message could not be read.
+
+    A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
+    other: they come from different nodes. There, whose servers have no patterns for what only one node is told,
+    the keys are looked for, and publishers tell all nodes for the first seconds of a key.
+
+    Raises:
+        BadKey: Not a pattern.
+        BadType: Not a glob of namespaces.
+    """
+
+    def __init__(
+        self,
+        interface: RedisInterface,
+        patterns: Sequence[str] = ("*",),
+        policy: Policy | None = None,
+        *,
+        namespaces: str | None = None,
+        patience: float = 0.0,
+    ) -> None:
+        super().__init__(policy or Every(10_000))
+        self._session = interface.session
+        if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
+            raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
+        self._namespaces = None if namespaces is None else Pattern(namespaces)
+        self.patience = patience
+        self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
+        self._ears: list[_PatternListener] = []
+        self._manager: SubscriptionManager | None = None
+        self._numbers = Numbers()
+        self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
+        self._doubts: set[str] = set()  # keys of which a message could not be read: the next one has a gap
+        self.doubted: Callable[[str], None] = lambda name: None
+
+    @property
+    def _following(self) -> bool:
+        return self._manager is not None or self._closed
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later update is missed. Idempotent; one round trip a pattern."""
+        if self._closed:
+            raise InterfaceClosed("this monitor is closed; make a new one")
+        if self._manager is not None:
+            return
+        manager = self._manager = manager_of(self._session)
+        try:
+            for top in dict.fromkeys(pattern.top for pattern in self.patterns):
+                topic = self._topic(Pattern(top))
+                ear = _PatternListener(self, Topic(topic, pattern=True))
+                self._ears.append(ear)
+                await manager.follow(ear)
+        except BaseException:
+            self._manager, self._ears = None, []
+            raise
+
+    async def close(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        await super().close()
+        for ear in self._ears:
+            if self._manager is not None:
+                await self._manager.unfollow(ear)
+
+    def _topic(self, pattern: Pattern) -> bytes:
+        """Return the pattern of the channels of the keys that `pattern` names."""
+        namespace, database = self._session.namespace, self._session.options.database
+        if self._namespaces is None:
+            return channel_pattern(pattern, namespace, database)
+        return channel_pattern(Pattern(self._namespaces.top + pattern.top), "", database)
+
+    def _split(self, channel: bytes) -> tuple[str, str] | None:
+        """Return the namespace and the top-level key that a channel belongs to, None if it is not meant."""
+        if self._namespaces is None:
+            name = name_of(channel, self._session.namespace)
+            return (self._session.namespace, name) if name else None
+        whole = name_of(channel, "")
+        # Nothing in the name tells where the namespace ends: the shortest that fits is taken.
+        for end in range(len(whole)):
+            if (
+                is_namespace(whole[:end])
+                and self._namespaces.concerns((whole[:end],))
+                and any(each.concerns((whole[end:],)) for each in self.patterns)
+            ):
+                return whole[:end], whole[end:]
+        return None
+
+    def _lost(self) -> None:
+        self._gaps = set()
+
+    def _doubt(self, channel: bytes) -> None:
+        place = self._split(channel)
+        if place is None:
+            return
+        if len(self._doubts) >= _MOST_DOUBTS:
+            self._doubts.clear()
+            self._lost()
+        self._doubts.add("".join(place))
+        self.doubted(place[1])
+
+    def _heard(self, notice: Notice, channel: bytes) -> None:
+        place = self._split(channel)
+        if place is None:
+            return
+        namespace, name = place
+        whole = namespace + name
+        # By publisher and key, since a publisher numbers each key's updates by themselves.
+        missed, path = self._numbers.take((notice.publisher, whole), notice.sequence), (name, *notice.path)
+        gap = missed != 0 or whole in self._doubts or (self._gaps is not None and whole not in self._gaps)
+        self._doubts.discard(whole)
+        if self._gaps is not None:
+            self._gaps.add(whole)
+        if not any(pattern.concerns(path) for pattern in self.patterns):
+            return
+        self.queue.put(
+            Event(
+                path,
+                None if notice.deleted else notice.value,
+                notice.deleted,
+                notice.size,
+                notice.time,
+                time.time(),
+                notice.publisher,
+                notice.sequence,
+                max(missed, 0),
+                gap,
+                namespace,
+                local=notice.slot is not None,
+            )
+        )
+
+
+class _PatternListener(ForwardingListener):
+    """One subscription of a monitor: a listener of the subscription manager, which holds it weakly."""
+
+    def __init__(self, monitor: Monitor, topic: Topic) -> None:
+        super().__init__(topic, monitor.patience, [monitor.queue])
+        self._monitor = monitor
+
+    def lost(self, reason: Exception) -> None:
+        """Remember that updates may be lost. Whoever waits for the beginning gets `reason`."""
+        self._monitor._lost()
+        super().lost(reason)
+
+    def doubt(self, channel: bytes) -> None:
+        """Remember that an update of a key was lost."""
+        if not self._is_others(channel):
+            self._monitor._doubt(channel)
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Hand the update on, if it is not another subscription's, which brings it too."""
+        if not self._is_others(channel):
+            self._monitor._heard(notice, channel)
+
+    def _is_others(self, channel: bytes) -> bool:
+        """Return whether the pattern of an earlier subscription fits a channel too."""
+        for ear in self._monitor._ears:
+            if ear is self:
+                return False
+            if fits(ear.topic.name, channel):
+                return True
+        return True

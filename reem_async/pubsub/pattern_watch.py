@@ -1,0 +1,279 @@
+"""Following every change of all keys that some patterns name: those there are, and those that come to be.
+
+Each key has a `Follower`. Publishers are heard through the patterns too: of a key that nobody follows yet that is the
+first word, and what is heard until it is followed is handed on. Keys that are only stored are looked for every second.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import weakref
+from collections.abc import Iterable, Sequence
+
+from ..concurrency.queues import BoundedQueue, Last, Policy
+from ..concurrency.streams import Stream
+from ..errors import InterfaceClosed, RedisError, ReemError
+from ..plan.notices import Notice
+from ..plan.paths import Path, parse
+from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
+from ..session import Session
+from .follower import Follower
+from .listeners import ForwardingListener, Listener
+from .manager import SubscriptionManager, Topic, manager_of
+from .updates import Update
+
+__all__ = ["PatternWatch"]
+
+logger = logging.getLogger("reem.subscribe")
+
+_PAUSE = 1.0
+"""Seconds between looks for keys that somebody has stored."""
+_MOST_WAITING = 1000
+"""Updates that wait for a loop that is slower, if no policy is given."""
+_MOST_BORN = 1000
+"""Notices of a key that is about to be followed; more are read with it."""
+
+
+class PatternWatch(Stream[Update]):
+    """Follows all keys that some patterns name and yields their changes: an async iterator.
+
+    What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
+    only stored, by whomever; keys that come to be, and those that go (`deleted`). A key that is only stored is found
+    within a second of its making. `update.data` is all that is at the key, or at the path below it that the pattern
+    spells out: of `imu.temp` what is at `imu.temp`, of `robot1.*` all of `robot1`.
+
+    In a cluster what is published in the first moment of a key may be told as what it led to, and, if the key is
+    deleted in that moment, once more.
+
+    Args:
+        session: The server.
+        patterns: Globs of paths such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
+        policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
+        largest: Bytes of an array up to which it is fetched; None for no limit. See `Mirror`.
+
+    Raises:
+        BadKey: Not a pattern.
+    """
+
+    def __init__(
+        self, session: Session, patterns: Sequence[str], policy: Policy | None = None, *, largest: int | None = None
+    ) -> None:
+        super().__init__(policy or Last(_MOST_WAITING))
+        self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
+        self._session = session
+        self._largest = math.inf if largest is None else largest
+        self._listeners: list[_Publishers] = []
+        self._manager: SubscriptionManager | None = None
+        self._followed: dict[str, list[Follower]] = {}
+        self._born: dict[str, list[Notice]] = {}  # about to be followed
+        self._failed: set[str] = set()  # could not be followed: what is there later was not made just then
+
+    @property
+    def _following(self) -> bool:
+        return self._manager is not None or self._closed
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later change is missed. Idempotent; a few round trips for each key."""
+        if self._closed:
+            raise InterfaceClosed("this watch is closed; make a new one")
+        if self._manager is not None:
+            return
+        manager = self._manager = manager_of(self._session)
+        try:
+            for top in dict.fromkeys(pattern.top for pattern in self.patterns):
+                session = self._session
+                topic = channel_pattern(Pattern(top), session.namespace, session.options.database)
+                listener = _Publishers(self, Topic(topic, pattern=True))
+                self._listeners.append(listener)
+                await manager.follow(listener)
+            # The patterns are subscribed to by now: a key that is made during the look is heard of.
+            await self._follow(self._new(await self._there()), late=False)
+        except BaseException:
+            await self._leave()
+            self._manager = None
+            raise
+        manager.tasks.start(_go_on_looking(weakref.ref(self)), "reem discovery")
+
+    async def close(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        await super().close()
+        await self._leave()
+
+    async def _leave(self) -> None:
+        leaving: list[Listener] = [*self._listeners, *(each for there in self._followed.values() for each in there)]
+        self._listeners, self._followed = [], {}
+        self._born.clear()
+        self._failed.clear()
+        for listener in leaving:
+            if self._manager is not None:
+                await self._manager.unfollow(listener)
+
+    async def _there(self) -> set[str]:
+        """Return the keys that there are now and that the patterns may name."""
+        found: set[str] = set()
+        for top in dict.fromkeys(pattern.top for pattern in self.patterns):
+            found |= {name async for name in self._session.names(Pattern(top))}
+        return found
+
+    def _new(self, found: set[str]) -> list[str]:
+        """Return those that are to be followed and are not."""
+        return sorted(name for name in found if name not in self._followed and self._paths(name))
+
+    def _paths(self, name: str) -> list[Path]:
+        """Return the places to follow in a key: what the patterns spell out, but not what is below another of these."""
+        paths = {spelled_out(pattern.rest) for pattern in self.patterns if pattern.concerns((name,))}
+        return [path for path in paths if not any(path[: len(other)] == other for other in paths - {path})]
+
+    async def _follow(self, names: Iterable[str], *, late: bool) -> None:
+        """Follow some keys; what cannot be read is told in a warning, and followed nevertheless."""
+        manager, session = self._manager, self._session
+        assert manager is not None
+        followers: dict[str, list[Follower]] = {}
+        for name in names:
+            if name in self._followed:  # meanwhile
+                continue
+            keys, born = session.keys(name), self._born.setdefault(name, [])
+            is_new = late and name not in self._failed
+            self._failed.discard(name)
+            self._followed[name] = there = followers[name] = []
+            for path in self._paths(name):
+                follower = Follower(
+                    keys,
+                    path,
+                    session.ships,
+                    session.cache,
+                    session.transport,
+                    manager.tasks,
+                    stored=True,
+                    largest=self._largest,
+                )
+                follower.queues = [_Fitting(self, name, path)]
+                follower.born = born if is_new else None
+                there.append(follower)
+        begun: set[str] = set()
+        try:
+            await manager.subscribe_all([each for there in followers.values() for each in there])
+            for name, there in followers.items():
+                await self._begin(there, manager)
+                self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
+                begun.add(name)
+        finally:
+            for name in followers.keys() - begun:  # they are found again; the others have told what is there
+                self._born.pop(name, None)
+                self._failed.add(name)
+                self._drop(name)
+
+    async def _begin(self, followers: Iterable[Follower], manager: SubscriptionManager) -> None:
+        for follower in followers:
+            try:
+                await manager.follow_here(follower)
+            except RedisError:
+                raise
+            except ReemError as error:
+                logger.warning("%s cannot be watched: %s", follower.keys.name, error)
+
+    def heard(self, notice: Notice, channel: bytes) -> None:
+        """Follow the key of which somebody has published something, unless it is followed."""
+        name = name_of(channel, self._session.namespace)
+        born = self._born.get(name)
+        if born is not None:
+            if len(born) < _MOST_BORN:
+                born.append(notice)
+        elif notice.deleted and not notice.path:  # who followed the key has told that it is gone
+            return
+        elif name and name not in self._followed and self._manager is not None and self._paths(name):
+            self._born[name] = [notice]
+            self._manager.tasks.start(self._follow_late([name]), "reem discovery of new keys")
+
+    async def _follow_late(self, names: Iterable[str]) -> None:
+        try:
+            await self._follow(names, late=True)
+        except (RedisError, OSError, InterfaceClosed) as error:
+            logger.debug("new keys are not followed yet: %s", error)
+
+    def gone(self, name: str) -> None:
+        """Stop following a key that is gone; if it comes to be again, it is found like any other.
+
+        Not at once: its follower may be about to tell that it has come to be again, and would be the only one that
+        knows.
+        """
+        asyncio.get_running_loop().call_soon(self._drop_if_gone, name)
+
+    def _drop_if_gone(self, name: str) -> None:
+        if all(follower.gone for follower in self._followed.get(name, [])):
+            self._drop(name)
+
+    def _drop(self, name: str) -> None:
+        for follower in self._followed.pop(name, []):
+            follower.queues = []  # it tells nothing more: whoever follows the key next does
+            if self._manager is not None:
+                self._manager.tasks.start(self._manager.unfollow_here(follower), "reem unfollow")
+
+    async def look(self) -> None:
+        """Follow keys that have come to be, and let go of those that are gone."""
+        followed = list(self._followed)
+        try:
+            found = await self._there()
+            for name in followed:  # of a place in a key, no update says that all of the key is gone
+                if name not in found:
+                    self._drop_if_gone(name)
+            await self._follow_late(self._new(found))
+        except (ReemError, RedisError, OSError) as error:
+            logger.debug("keys could not be listed: %s", error)
+
+
+async def _go_on_looking(reference: weakref.ref[PatternWatch]) -> None:
+    while True:
+        await asyncio.sleep(_PAUSE)
+        watch = reference()
+        if watch is None or watch._closed:
+            return
+        await watch.look()
+        del watch
+
+
+class _Fitting(BoundedQueue):
+    """Where the updates of one key go: those that a pattern names on to the watch's queue."""
+
+    def __init__(self, watch: PatternWatch, name: str, path: Path) -> None:
+        super().__init__(Last(1))
+        self._watch = weakref.ref(watch)
+        self._name = name
+        self._path = path
+
+    def put(self, update: Update) -> None:
+        """Hand an update on."""
+        watch = self._watch()
+        if watch is None:
+            return
+        where = parse(update.path)
+        if any(pattern.concerns(where) for pattern in watch.patterns):
+            watch.queue.put(update)
+        if update.deleted and not self._path and update.data is None:
+            watch.gone(self._name)
+
+    def overtaken(self, update: Update | None) -> None:
+        """Count an update that can no more be told."""
+        if (watch := self._watch()) is not None:
+            watch.queue.skip()
+
+    def close(self) -> None:
+        """Do nothing: the watch's queue goes on."""
+
+
+class _Publishers(ForwardingListener):
+    """What is published under a pattern: a listener of the subscription manager, which holds it weakly."""
+
+    def __init__(self, watch: PatternWatch, topic: Topic) -> None:
+        super().__init__(topic, queues=[watch.queue])
+        self._watch = weakref.ref(watch)
+
+    def doubt(self, channel: bytes) -> None:
+        """Do nothing: who follows the key has it too."""
+
+    def on_notice(self, notice: Notice, channel: bytes) -> None:
+        """Take the word that there is such a key."""
+        if (watch := self._watch()) is not None:
+            watch.heard(notice, channel)

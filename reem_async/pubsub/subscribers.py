@@ -1,0 +1,347 @@
+"""Subscribers: a variable that follows, a function that is called, a loop."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import weakref
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, unheard
+from ..concurrency.streams import Following, Stream
+from ..connection import RedisInterface
+from ..errors import BadType, InterfaceClosed, MissingKey, ReadOnly
+from ..plan.handles import Handle
+from ..plan.keys import Keys
+from ..plan.paths import Path, check_element, parse, show
+from ..plan.trees import MISSING, copied
+from ..session import Session
+from .callbacks import Caller, Calls, arranged
+from .follower import Follower
+from .manager import SubscriptionManager, manager_of
+from .updates import Update
+
+__all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
+
+
+class Link:
+    """A follower and the manager it is at: made by the first `follow`, anew after a fork or in another loop."""
+
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        path: Path,
+        queues: list[BoundedQueue],
+        *,
+        stored: bool,
+        largest: float = math.inf,
+        heartbeat: float = math.inf,
+    ) -> None:
+        self._session = session
+        self._keys = keys
+        self._path = path
+        self._queues = queues
+        self._stored = stored
+        self._largest = largest
+        self._heartbeat = heartbeat
+        self.told: Callable[[], None] = unheard
+        self._manager: SubscriptionManager | None = None
+        self._following: asyncio.Lock | None = None
+        self.closed = False
+        self.follower: Follower | None = None
+
+    async def follow(self) -> None:
+        """Begin to follow, if it has not begun; several callers wait for the same beginning."""
+        if self.closed:
+            raise InterfaceClosed("this subscription is closed; make a new one")
+        manager = manager_of(self._session)
+        if manager is not self._manager:
+            # The manager of another loop, or of the process before a fork, has taken its followers with it.
+            self._manager, self.follower, self._following = manager, None, asyncio.Lock()
+        assert self._following is not None
+        # Two callers that begin at once share one follower.
+        async with self._following:
+            if self.follower is None:
+                session = self._session
+                self.follower = Follower(
+                    self._keys,
+                    self._path,
+                    session.ships,
+                    session.cache,
+                    session.transport,
+                    manager.tasks,
+                    stored=self._stored,
+                    largest=self._largest,
+                    heartbeat=self._heartbeat,
+                )
+                self.follower.told = self.told
+                self.follower.queues = self._queues
+                try:
+                    await manager.follow(self.follower)
+                except BaseException:
+                    self.follower = None
+                    raise
+
+    async def unfollow(self) -> None:
+        """Stop following, for good. Idempotent; also after the interface was closed."""
+        self.closed = True
+        if self._manager is not None and self.follower is not None:
+            await self._manager.unfollow(self.follower)
+
+
+class Watch(Stream[Update]):
+    """Follows one path and yields its updates, one by one: an async iterator.
+
+    Follows from the first `async for` or `async with` on. The first update is the value that is
+    already there, if any (`initial`). Cancelling a waiting loop loses no update. Leaving a loop
+    with `break` keeps following until the watch is closed or dropped.
+
+    Args:
+        session: The server.
+        keys: The top-level key's names.
+        path: The path below it.
+        policy: What to keep for a loop that is slower than the updates.
+        queue: Where they go, if it is not to be a plain one.
+        stored: Yield what is only stored, too.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        path: Path,
+        policy: Policy,
+        queue: BoundedQueue | None = None,
+        *,
+        stored: bool = True,
+    ) -> None:
+        super().__init__(policy, queue)
+        self._link = Link(session, keys, path, [self.queue], stored=stored)
+
+    @property
+    def _following(self) -> bool:
+        return self._link.follower is not None or self._closed
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later update is missed. Idempotent; two or three round trips."""
+        await self._link.follow()
+
+    async def close(self) -> None:
+        """Stop following and end the loop. Idempotent."""
+        await super().close()
+        await self._link.unfollow()
+
+
+class SilentSubscriber(Following):
+    """A local variable that follows what is published at a path.
+
+    `value()` and `subscriber["number"].read()` answer from memory, without a trip to the server.
+    It starts with the value that is already there. It can also be iterated: `async for update in
+    subscriber`.
+
+    Args:
+        channel: The path to follow, such as "foo" or "foo.bar".
+        interface: The server: a RedisInterface, or what it takes as host.
+        policy: What an iteration keeps for a loop that is slower than the updates.
+        stored: Follow what is only stored, too, whoever stores it.
+    """
+
+    def __init__(
+        self, channel: str, interface: Any = None, policy: Policy | None = None, *, stored: bool = False
+    ) -> None:
+        self.interface: RedisInterface = (
+            interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
+        )
+        # An empty path has no top-level key, which `keys` says better.
+        key, *rest = parse(channel) or ("",)
+        self.channel = channel
+        self._keys, self._path = self.interface.session.keys(key), tuple(rest)
+        self.full_path: Path = (self._keys.name, *rest)
+        self.policy = policy or Newest()
+        self.stored = stored
+        self._link = Link(self.interface.session, self._keys, self._path, [], stored=stored)
+        self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()  # a loop that was left by `break` drops its own
+
+    async def listen(self) -> None:
+        """Begin to follow. When this returns, no later publish is missed. Idempotent; two or three round trips.
+
+        Raises:
+            NotConnected: Nobody listens there.
+            InterfaceClosed: It was closed before.
+        """
+        await self._link.follow()
+
+    async def close(self) -> None:
+        """Stop following; the value stays as it is. Idempotent."""
+        for watch in list(self._watches):
+            await watch.close()
+        await self._link.unfollow()
+
+    def value(self) -> Any:
+        """Return a copy of the value as of now, None if there is none. No round trip; any thread may call."""
+        follower = self._link.follower
+        return None if follower is None else follower.value()
+
+    @property
+    def local_copy(self) -> Any:
+        """A copy of the value as of now, an empty dict if there is none."""
+        value = self.value()
+        return {} if value is None else value
+
+    def __getitem__(self, key: str | int) -> LocalAccessor:
+        return LocalAccessor(self, (check_element(key, (self.channel,)),))
+
+    def watch(self, policy: Policy | None = None) -> Watch:
+        """Return an async iterator over the updates, beginning with the value that is there."""
+        watch = Watch(self.interface.session, self._keys, self._path, policy or self.policy, stored=self.stored)
+        self._watches.add(watch)
+        return watch
+
+    def __aiter__(self) -> Watch:
+        return self.watch()
+
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        self[key].write(value)
+
+    def __delitem__(self, key: str | int) -> NoReturn:
+        self[key].write()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (type(self), (self.channel, self.interface, self.policy), self.stored)
+
+    def __repr__(self) -> str:
+        return f"<reem_async.{type(self).__name__} {self.channel}>"
+
+
+def _rebuilt(kind: type[SilentSubscriber], arguments: tuple[Any, ...], stored: bool) -> SilentSubscriber:
+    """Make a subscriber from the parts of a pickled one."""
+    return kind(*arguments, stored=stored)
+
+
+class LocalAccessor(Handle):
+    """One place in a subscriber's local copy."""
+
+    __slots__ = ("_path", "_subscriber")
+
+    def __init__(self, subscriber: Any, path: Path) -> None:
+        self._subscriber = subscriber
+        self._path = path
+
+    def __getitem__(self, key: str | int) -> LocalAccessor:
+        return type(self)(self._subscriber, (*self._path, check_element(key, self._path)))
+
+    def read(self) -> Any:
+        """Return a copy of the value here as of now. No round trip.
+
+        Raises:
+            MissingKey: Nothing is here.
+        """
+        follower = self._subscriber._link.follower
+        found = MISSING if follower is None else follower.at(self._path)
+        if found is MISSING:
+            what = show((self._subscriber.channel, *self._path))
+            raise MissingKey(
+                f"nothing has been published at {what} yet" + ("" if follower else "; call listen() first")
+            )
+        return copied(found)
+
+    def get(self, default: Any = None) -> Any:
+        """Return the value here, or `default`. No round trip."""
+        try:
+            return self.read()
+        except MissingKey:
+            return default
+
+    def write(self, value: Any = None) -> NoReturn:
+        """Raise ReadOnly."""
+        where = show((self._subscriber.channel, *self._path))
+        raise ReadOnly(f"{where}: a subscriber only follows the server; write with a KeyValueStore or a PublishSpace")
+
+    def __setitem__(self, key: str | int, value: Any) -> NoReturn:
+        self[key].write(value)
+
+    def __delitem__(self, key: str | int) -> NoReturn:
+        self[key].write()
+
+    def __iadd__(self, value: Any) -> NoReturn:
+        self.write(value)
+
+    append = extend = increment = multiply = divide = delete = write
+    __isub__ = __imul__ = __itruediv__ = __iadd__
+
+    @property
+    def _place(self) -> tuple[object, Path]:
+        return self._subscriber, (self._subscriber.channel, *self._path)
+
+
+class CallbackSubscriber(SilentSubscriber):
+    """Calls a function for each update of what is published at a path.
+
+    Called as `callback(data, updated_path, **kwargs)`, the first two by name where it has these
+    names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
+    which path was updated, such as "callback_channel.number". Calls are made one after the other,
+    in order. An exception in one is logged and does not end the subscription. If calls are slower
+    than updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
+    `data` may have later ones in it already, which are called for too.
+
+    Args:
+        channel: The path to follow.
+        interface: The server: a RedisInterface, or what it takes as host.
+        callback_function: A plain function (then it must not block) or a coroutine function.
+        kwargs: Keyword arguments for each call.
+        policy: What to keep when calls are slower than updates.
+        stored: Call for what is only stored, too, whoever stores it.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        interface: Any,
+        callback_function: Callable[..., Any],
+        kwargs: Mapping[str, Any] | None = None,
+        policy: Policy | None = None,
+        *,
+        stored: bool = False,
+    ) -> None:
+        super().__init__(channel, interface, policy or Last(1000), stored=stored)
+        if not callable(callback_function):
+            raise BadType(f"callback_function is a function, not {type(callback_function).__name__}")
+        self.callback_function = callback_function
+        self.kwargs = dict(kwargs or {})
+        self._call = arranged(callback_function, self.kwargs)
+        self._begin()
+
+    def _begin(self) -> None:
+        session = self.interface.session
+        queue = Places(self.policy)
+        self._updates = Watch(session, self._keys, self._path, self.policy, queue, stored=self.stored)
+        self._watches.add(self._updates)
+        self._link = self._updates._link  # one follower serves the calls and value()
+        self._calls: Calls | None = None
+
+    async def listen(self) -> None:
+        """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
+        manager = manager_of(self.interface.session)  # raises, before anything is changed, where this cannot be used
+        if self._calls is not None and self._calls.loop is not asyncio.get_running_loop() and not self._link.closed:
+            self._watches.discard(self._updates)  # it ended with the other event loop
+            self._begin()
+        await self._updates.listen()
+        if self._calls is None:
+            # The manager keeps them though nobody may hold the subscriber: it works until the interface is closed.
+            self._calls = Calls(self._caller(), self._updates, manager.callers)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        arguments = self.channel, self.interface, self.callback_function, self.kwargs, self.policy
+        return _rebuilt, (type(self), arguments, self.stored)
+
+    def _caller(self) -> Caller:
+        """Return what makes the calls."""
+        return Caller(self.channel, self._call, self.kwargs)
+
+    async def close(self) -> None:
+        """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
+        await super().close()
+        if self._calls is not None:
+            await self._calls.done()

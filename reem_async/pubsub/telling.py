@@ -1,0 +1,181 @@
+"""What a replica tells of its copy: updates, skipped ones, what is only stored, snapshots. Without I/O."""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Sequence
+from enum import Enum, auto
+from typing import Any
+
+from ..plan.copies import applied, concerns, is_whole
+from ..plan.differences import difference
+from ..plan.notices import ANNOUNCED, Notice
+from ..plan.overtaken import is_own
+from ..plan.paths import Path
+from ..plan.trees import MISSING, CannotApply, get, replaced
+from .division import Heard
+from .outputs import Output, Skipped, Snapshot, Stored, Updated
+
+__all__ = ["Teller", "Told"]
+
+
+class Told(Enum):
+    """As what the next snapshot is told."""
+
+    INITIAL = auto()
+    """As the value that was there when following began."""
+
+    GAP = auto()
+    """As what is there after updates were lost, those in it included."""
+
+    UPDATES = auto()
+    """Not at all: each update in it is told of."""
+
+
+class Teller:
+    """Makes events of what changes a copy.
+
+    Args:
+        path: Where the copy is, below the top-level key.
+        rest: What is followed below that.
+        outputs: Where the events go.
+
+    Attributes:
+        told: As what the next snapshot is told.
+        missed: How many updates were lost and not told of yet, None if nobody knows.
+    """
+
+    def __init__(self, path: Path, rest: Path, outputs: collections.deque[Output]) -> None:
+        self._path = path
+        self._rest = rest
+        self._outputs = outputs
+        self.told = Told.INITIAL
+        self.missed: int | None = 0
+
+    def begin(self, told: Told) -> None:
+        """Tell the next snapshot so; after a loss nobody knows how many updates that has."""
+        self.told, self.missed = told, None if told is Told.GAP else 0
+
+    def miss(self, heard: Sequence[Heard[Notice]]) -> None:
+        """Count what was lost before these updates as lost before what is told of next."""
+        lost = [each.missed for each in heard]
+        self.missed = None if self.missed is None or None in lost else self.missed + sum(filter(None, lost))
+
+    def update(self, notice: Notice, tree: Any, written: Any = MISSING) -> None:
+        """Tell of an update; its value is what was `written` if that is given, else what the copy has."""
+        data = value = get(tree, self._rest) if self._rest else tree
+        inner = () if self._rest else notice.path[len(self._path) :]
+        if written is not MISSING:
+            value = written
+        elif inner:  # of what was deleted, the next item has the place
+            value = None if notice.deleted else get(data, inner)
+        # Losses are told with the next event, whatever that is.
+        missed, self.missed = self.missed, 0
+        self._outputs.append(Updated(notice, data, value, missed))
+
+    def snapshot(self, before: Any, tree: Any, covered: Sequence[Heard[Notice]], *, stored: bool) -> None:
+        """Tell of a snapshot, or of the updates that it has and of what is only stored.
+
+        Args:
+            before: The copy until now.
+            tree: The copy from now on.
+            covered: The updates that it has.
+            stored: It is known to differ from what was published only in what is stored.
+        """
+        told, self.told = self.told, Told.UPDATES
+        if told is Told.UPDATES:
+            if stored:
+                before, covered = self._in_turn(before, covered)
+            self._updates(covered, tree)
+            if stored and self.missed == 0:  # else the snapshot is told of
+                self._stored(self._expected(before, tree, covered), tree)
+        elif told is Told.GAP:
+            self.miss(covered)
+        data = get(tree, self._rest)
+        if told is Told.INITIAL:
+            if data is not MISSING:
+                self._outputs.append(Snapshot(data, True, 0))
+        elif told is Told.GAP or self.missed != 0:
+            missed, self.missed = self.missed, 0
+            self._outputs.append(Snapshot(data, False, missed))
+
+    def _in_turn(self, before: Any, covered: Sequence[Heard[Notice]]) -> tuple[Any, Sequence[Heard[Notice]]]:
+        """Tell of updates that say all that they wrote as if nothing had been read, each with the tree it led to.
+
+        Returns the last of these trees, and the updates from the first one on that only what was read can tell.
+        """
+        for place, heard in enumerate(covered):
+            notice = heard.update
+            if notice is None or heard.missed != 0 or not heard.follows:
+                return before, covered[place:]
+            if not concerns(notice, self._path):
+                continue
+            if not is_whole(notice, self._path, before):
+                return before, covered[place:]
+            try:
+                after = applied(before, notice, self._path)
+            except CannotApply:
+                return before, covered[place:]
+            if not self._rest or get(after, self._rest) is not get(before, self._rest):
+                self.update(notice, after)
+            before = after
+        return before, ()
+
+    def _updates(self, covered: Sequence[Heard[Notice]], tree: Any) -> None:
+        """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
+
+        `plan/overtaken.py` says which. What came with its value has that, whatever came later. What was lost may
+        have changed any of those announced before.
+        """
+        notices = [each.update if each.update and concerns(each.update, self._path) else None for each in covered]
+        newest = {notice.path: notice for notice in notices if notice is not None}
+        # The place of the last loss: an update that was announced before it may have been changed by what was lost.
+        loss = max([place for place, each in enumerate(covered) if each.missed != 0], default=-1)
+        for place, (heard, notice) in enumerate(zip(covered, notices, strict=True)):
+            self.miss([heard])
+            if notice is None:
+                continue
+            if notice.deleted or notice.value is not ANNOUNCED:
+                self.update(notice, tree, self._written(notice))
+            elif place >= loss and is_own(notice.path, [later for later in notices[place + 1 :] if later is not None]):
+                self.update(notice, tree)
+            else:
+                self._outputs.append(Skipped(notice, get(tree, self._rest), newest[notice.path] is notice))
+
+    def _written(self, notice: Notice) -> Any:
+        """Return what an update wrote, as far as it is below what is followed; MISSING if the copy says so."""
+        if notice.deleted:
+            return None
+        if self._rest:
+            return MISSING
+        found = get(notice.value, self._path[len(notice.path) :])
+        return None if found is MISSING else found
+
+    def _expected(self, before: Any, tree: Any, covered: Sequence[Heard[Notice]]) -> Any:
+        """Return what the copy would be now if nothing but the updates that a snapshot has had changed it.
+
+        Where that is not known, it is what is there: the updates are told with it.
+        """
+        expected = before
+        for heard in covered:
+            notice = heard.update
+            if notice is None or not concerns(notice, self._path):
+                continue
+            inner = notice.path[len(self._path) :]
+            try:
+                if is_whole(notice, self._path, expected):
+                    expected = applied(expected, notice, self._path)
+                elif inner and not notice.deleted:  # announced: its value is what is there
+                    expected = replaced(expected, inner, get(tree, inner))
+                else:
+                    expected = tree
+            except CannotApply:
+                expected = tree
+        return expected
+
+    def _stored(self, expected: Any, tree: Any) -> None:
+        """Tell of what is there if it differs from what was expected."""
+        data = get(tree, self._rest)
+        inner = difference(get(expected, self._rest), data)
+        if inner is not None:
+            self._outputs.append(Stored(inner, data, get(data, inner)))

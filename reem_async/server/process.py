@@ -1,0 +1,302 @@
+"""One run of a server program, seen from the process that owns it: configure, start, stop."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import weakref
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from reem_async.errors import ServerFailed
+
+HOST = "127.0.0.1"
+# For a PING to a server on this machine: one that takes longer is taken for one that does not answer.
+ANSWER_SECONDS = 1.0
+READY_SECONDS = 10.0  # without any answer; loading data from disk may take longer
+STOP_SECONDS = 20.0  # more than the watchdog gives the server
+LOG_BYTES = 1 << 20  # a log that has grown beyond this starts afresh
+LOG_LINES = 12  # shown when a start fails
+SOCKET_CHARACTERS = 100  # the path of a unix socket: 107 at most on Linux, 103 on macOS
+KEEP_MEMORY = "glibc.malloc.mmap_threshold=33554432:glibc.malloc.trim_threshold=67108864"
+"""A server with glibc's malloc keeps up to 64 MiB of what it frees: a camera's frames cost page faults otherwise."""
+WATCHDOG = Path(__file__).with_name("watchdog.py")
+
+
+@dataclass(frozen=True)
+class ServerProgram:
+    """A server executable.
+
+    Attributes:
+        path: Where it is.
+        modules: What it has to load.
+        json: It understands JSON then.
+    """
+
+    path: str
+    modules: tuple[str, ...] = ()
+    json: bool = False
+
+
+class PortTaken(ServerFailed):
+    """Another program listens on the port."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(
+            f"port {port} on {HOST} is taken by another program: stop that one, or use another port"
+            f" (port=0, or `reem up --port 0`, takes a free one)"
+        )
+
+
+class ServerProcess:
+    """A server that is up: loopback port (0: none), unix socket, data in `directory` (None: in memory).
+
+    It begins with the data of the file `rdb`, if there is one; a `directory` must have no data of its own then.
+
+    The process started here is the watchdog (see `watchdog.py`), the server is its child.
+
+    Raises:
+        ServerFailed: it did not come up; nothing is left behind.
+    """
+
+    def __init__(
+        self,
+        program: ServerProgram,
+        *,
+        port: int,
+        directory: Path | None,
+        password: str | None,
+        rdb: Path | None = None,
+    ) -> None:
+        self.port = port
+        self.json = program.json
+        self.scratch = _private_directory()
+        self.directory = directory or self.scratch
+        self.log = self.directory / "server.log"
+        self.socket_path = str(self.scratch / "redis.sock")
+        self.pid = 0
+        self._watchdog: subprocess.Popen[bytes] | None = None
+        self._planted: Path | None = None
+        self._ended = False
+        self._owner = os.getpid()
+        try:
+            self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if rdb is not None:
+                self._plant(rdb, keep=directory is not None)
+            offset = self._spawn(program, self._config(program, directory is not None, password), directory)
+            self._wait_until_ready(program, offset, password)
+        except BaseException as error:
+            self.stop()
+            if self._planted is not None:
+                shutil.rmtree(self._planted, ignore_errors=True)
+            if isinstance(error, OSError):
+                raise ServerFailed(f"the server could not be started: {error}") from error
+            raise
+
+    def ask(self, *command: str, password: str | None = None) -> bytes:
+        """Send one command by the unix socket; the first line of the reply, empty if none comes."""
+        login = _packed("AUTH", password) if password is not None else b""
+        with socket.socket(socket.AF_UNIX) as connection, suppress(OSError):
+            connection.settimeout(ANSWER_SECONDS)
+            connection.connect(self.socket_path)
+            connection.sendall(login + _packed(*command))
+            with connection.makefile("rb") as replies:
+                return replies.readline() if not login else replies.readline() and replies.readline()
+        return b""
+
+    def ended(self) -> bool:
+        """Whether the server is gone, by itself or by `stop`."""
+        if os.getpid() != self._owner:
+            return not os.path.exists(self.socket_path)  # the server removes it as it ends
+        if not self._ended:
+            assert self._watchdog is not None
+            assert self._watchdog.stdout is not None
+            try:  # None: nothing to read, so nothing has happened
+                self._ended = self._watchdog.stdout.read(64) is not None
+            except ValueError:  # closed by `stop`
+                self._ended = True
+        return self._ended
+
+    def stop(self) -> None:
+        """End the server, its data safely on disk if it keeps any, and remove the scratch directory."""
+        if os.getpid() != self._owner:
+            return
+        watchdog = self._watchdog
+        if watchdog is not None:
+            _running.discard(self)
+            _close_pipes(watchdog)  # this is the order to end
+            try:
+                watchdog.wait(STOP_SECONDS)
+            except subprocess.TimeoutExpired:
+                watchdog.kill()
+                watchdog.wait()
+        shutil.rmtree(self.scratch, ignore_errors=True)
+
+    def forget(self) -> None:
+        """Let go of a server that belongs to the process this one was forked from."""
+        if self._watchdog is not None:
+            _close_pipes(self._watchdog)
+            self._watchdog.returncode = 0  # not this process's to wait for
+
+    def _config(self, program: ServerProgram, keep: bool, password: str | None) -> str:
+        """The configuration: private to this user, and quiet about everything else.
+
+        With a directory, a write is in the append-only file before it is answered, unless the disk is so busy that
+        the fsync of the second before still runs: then it waits for that, two seconds at most. So a kill -9 of the
+        server can lose as much as a power failure does.
+        """
+        lines = [
+            f"port {self.port}",
+            f"bind {HOST}",
+            "protected-mode yes",
+            f"unixsocket {_quoted(os.fsencode(self.socket_path))}",
+            "unixsocketperm 700",
+            f"dir {_quoted(os.fsencode(self.directory))}",
+            'save ""',
+            f"appendonly {'yes' if keep else 'no'}",
+            "appendfsync everysec",
+            "daemonize no",
+            *(f"loadmodule {_quoted(os.fsencode(module))}" for module in program.modules),
+        ]
+        if password is not None:
+            lines.append(f"requirepass {_quoted(password.encode())}")
+        return "\n".join(lines) + "\n"
+
+    def _plant(self, rdb: Path, *, keep: bool) -> None:
+        """Put a copy of an RDB file where a server that starts in the directory loads it."""
+        if not keep:
+            shutil.copyfile(rdb, self.directory / "dump.rdb")
+            return
+        # A server that appends to a log loads nothing else: the file becomes the base of that log.
+        log = self.directory / "appendonlydir"
+        log.mkdir(mode=0o700)
+        self._planted = log
+        shutil.copyfile(rdb, log / "appendonly.aof.1.base.rdb")
+        (log / "appendonly.aof.manifest").write_text("file appendonly.aof.1.base.rdb seq 1 type b\n")
+
+    def _spawn(self, program: ServerProgram, config: str, lock: Path | None) -> int:
+        """Start watchdog and server; returns where in the log this run begins."""
+        if not sys.executable:
+            raise ServerFailed("sys.executable is empty: an embedded server needs a Python interpreter to run")
+        fresh = not self.log.exists() or self.log.stat().st_size > LOG_BYTES
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | (os.O_TRUNC if fresh else 0)
+        with os.fdopen(os.open(self.log, flags, 0o600), "ab") as log:
+            offset = log.tell()
+            # A session of its own: Ctrl-C in the owner's terminal is for the owner to act upon.
+            self._watchdog = subprocess.Popen(  # noqa: S603 - this very package
+                [sys.executable, "-I", "-S", str(WATCHDOG)],
+                bufsize=0,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                cwd="/",
+                env={"GLIBC_TUNABLES": KEEP_MEMORY, **os.environ},
+                umask=0o077,
+                start_new_session=True,
+            )
+        _running.add(self)
+        order = {
+            "program": program.path,
+            "config": config,
+            "scratch": str(self.scratch),
+            "lock": None if lock is None else str(lock / "server.lock"),
+        }
+        self._send(json.dumps(order))
+        self._hear_pid(offset)
+        return offset
+
+    def _send(self, line: str) -> None:
+        assert self._watchdog is not None
+        assert self._watchdog.stdin is not None
+        rest = memoryview(f"{line}\n".encode())
+        with suppress(BrokenPipeError):  # it ended at once: noticed when its answer does not come
+            while rest:  # unbuffered: one write may take a part only
+                rest = rest[self._watchdog.stdin.write(rest) :]
+
+    def _hear_pid(self, offset: int) -> None:
+        assert self._watchdog is not None
+        assert self._watchdog.stdout is not None
+        word, _, rest = self._watchdog.stdout.readline().decode().strip().partition(" ")
+        if word == "busy":
+            raise ServerFailed(f"another server keeps its data in {self.directory}: stop that one first")
+        if word == "failed":
+            raise ServerFailed(f"the server could not be started: {rest}")
+        if word != "pid":
+            raise ServerFailed(f"the server's watchdog ended at once{self._last_words(offset)}")
+        self.pid = int(rest)
+        os.set_blocking(self._watchdog.stdout.fileno(), False)
+
+    def _wait_until_ready(self, program: ServerProgram, offset: int, password: str | None) -> None:
+        deadline = time.monotonic() + READY_SECONDS
+        while not self.ended():
+            answer = self.ask("PING", password=password)
+            if answer.startswith(b"+PONG"):
+                return
+            if answer.startswith(b"-LOADING"):
+                deadline = time.monotonic() + READY_SECONDS
+            if time.monotonic() > deadline:
+                raise ServerFailed(f"{program.path} does not answer{self._last_words(offset)}")
+            time.sleep(0.003)
+        words = self._last_words(offset)
+        if "Address already in use" in words:
+            raise PortTaken(self.port)
+        raise ServerFailed(f"{program.path} did not start{words}")
+
+    def _last_words(self, offset: int) -> str:
+        with suppress(OSError), self.log.open("rb") as log:
+            log.seek(offset)
+            lines = log.read().decode(errors="replace").splitlines()[-LOG_LINES:]
+            if lines:
+                return "; the log ends:\n    " + "\n    ".join(lines)
+        return "; its log is empty"
+
+
+# A fork inherits the pipe to the watchdog. Left open there, it would keep the server alive after its owner.
+_running: weakref.WeakSet[ServerProcess] = weakref.WeakSet()
+
+
+def _forget_all() -> None:
+    for process in list(_running):
+        process.forget()
+    _running.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_all)
+
+
+def _close_pipes(process: subprocess.Popen[bytes]) -> None:
+    for pipe in (process.stdin, process.stdout):
+        if pipe is not None:
+            with suppress(OSError):
+                pipe.close()
+
+
+def has_data(directory: Path) -> bool:
+    """Whether a server has kept data in the directory."""
+    return any((directory / name).exists() for name in ("appendonlydir", "appendonly.aof", "dump.rdb"))
+
+
+def _private_directory() -> Path:
+    """A new directory of mode 700, with a name short enough for the unix socket in it."""
+    roomy = len(os.fsencode(tempfile.gettempdir())) + len("/reem-12345678/redis.sock") <= SOCKET_CHARACTERS
+    return Path(tempfile.mkdtemp(prefix="reem-", dir=None if roomy else "/tmp"))  # noqa: S108
+
+
+def _packed(*words: str) -> bytes:
+    """A command as it travels."""
+    encoded = [word.encode() for word in words]
+    return b"*%d\r\n" % len(encoded) + b"".join(b"$%d\r\n%b\r\n" % (len(word), word) for word in encoded)
+
+
+def _quoted(value: bytes) -> str:
+    """A value as the server's configuration takes it, whatever is in it."""
+    plain = (chr(byte) if 32 <= byte < 127 and byte not in b'"\\' else f"\\x{byte:02x}" for byte in value)
+    return f'"{"".join(plain)}"'

@@ -1,0 +1,63 @@
+"""What starts with a `with` block and stops with it, in blocking and in asyncio programs."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import Self
+
+import anyio
+import anyio.to_thread
+
+from ..concurrency.aside import aside
+
+__all__ = ["Startable"]
+
+
+class Startable(ABC):
+    """A server, or several."""
+
+    @abstractmethod
+    def start(self) -> None:
+        """Start it, and wait until it answers."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """End it. Idempotent."""
+
+    @abstractmethod
+    def _start(self) -> None:
+        """Do what `start` does, where no signal interrupts."""
+
+    def _start_aside(self) -> None:
+        try:
+            aside(self._start)
+        except BaseException:  # whoever is interrupted leaves nothing running that would be nobody's
+            self.stop()
+            raise
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    async def __aenter__(self) -> Self:
+        try:
+            await anyio.to_thread.run_sync(self.start)
+        except BaseException:  # cancelled: the thread goes on, and what it starts would be nobody's
+            await self._stop_shielded()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self._stop_shielded()
+
+    async def _stop_shielded(self) -> None:
+        with anyio.CancelScope(shield=True):
+            await anyio.to_thread.run_sync(self.stop)

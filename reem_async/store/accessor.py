@@ -1,0 +1,391 @@
+"""Accessor: one place in the dictionary, and what can be done there."""
+
+from __future__ import annotations
+
+import builtins
+import operator
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..concurrency.aside import ensure_imported
+from ..errors import BadType, Conflict, MissingDocument, MissingKey
+from ..plan.documents import number_text
+from ..plan.handles import Handle
+from ..plan.paths import Path, check_element, check_name, show
+from .document import DocumentWriter
+from .edit import Edit
+from .low_level import Reader, Writer
+from .reader import DocumentReader, opened
+
+if TYPE_CHECKING:
+    from ..concurrency.queues import Policy
+    from ..pubsub.mirror import Mirror
+    from ..pubsub.subscribers import Watch
+    from ..session import Session
+    from .catalog import Outline
+
+__all__ = ["Accessor", "Edit"]
+
+_NOTHING: Any = object()
+
+_TRIES = [False] * 49 + [True]
+"""Tries of a call that reads and then writes; whether one is the last."""
+
+
+class Accessor(Handle):
+    """One place in the dictionary: `kvs["foo"]["bar"]`, `kvs["foo"]["tiles"][0]`.
+
+    It is only a path, immutable and cheap; nothing is sent before a method is awaited. Every method
+    is atomic, may be cancelled at any time (the call is then applied once or not at all) and raises
+    `redis.exceptions.RedisError` if the server or the connection fails. It is not its value: comparing it with one,
+    its truth, arithmetic and the like raise a TypeError that says how to read.
+    """
+
+    __slots__ = ("_path", "_reader", "_writer")
+    _how_to_read = "await handle.read()"
+
+    def __init__(self, reader: DocumentReader, writer: DocumentWriter, path: Path) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._path = path
+
+    def __getitem__(self, key: str | int) -> Accessor:
+        return type(self)(self._reader, self._writer, (*self._path, check_element(key, self.full_path)))
+
+    def __setitem__(self, key: str | int, value: Any) -> None:
+        raise BadType(f"assignment cannot wait for the server; use: await accessor[{key!r}].write(value)")
+
+    def __delitem__(self, key: str | int) -> None:
+        raise BadType(f"del cannot wait for the server; use: await accessor[{key!r}].delete()")
+
+    def __iter__(self) -> Any:
+        raise BadType("iterating cannot wait for the server; use: for key in await accessor.keys(), or await .read()")
+
+    def __contains__(self, key: object) -> bool:
+        raise BadType(f"`in` cannot wait for the server; use: await accessor.contains({key!r}), or await .read()")
+
+    @property
+    def _place(self) -> tuple[object, Path]:
+        return self._reader.session, self.full_path
+
+    @property
+    def full_path(self) -> Path:
+        """The keys and indexes that lead here, top-level key first."""
+        return (self._reader.name, *self._path)
+
+    @property
+    def path(self) -> list[str | int]:
+        """The keys and indexes that lead here from the top-level key."""
+        return list(self._path)
+
+    @property
+    def reader(self) -> Reader:
+        """The reader of the top-level key."""
+        return Reader(self._reader.name, self._reader.session.interface)
+
+    @property
+    def writer(self) -> Writer:
+        """The writer of the top-level key."""
+        return Writer(self._reader.name, self._reader.session.interface)
+
+    async def read(self) -> Any:
+        """Return the value here. Arrays are read-only: they share memory with the reply.
+
+        None if nothing at all is stored under the top-level key, as redis-py's GET does; the store's `contains`
+        tells whether there is.
+
+        One round trip; two or more the first time that arrays are met, or if they moved. Document
+        and arrays are always of one instant.
+
+        Raises:
+            MissingKey: Nothing is stored here, though the top-level key is there.
+            BadData: What is stored here was not written by REEM, or by a ship this interface lacks.
+        """
+        try:
+            return await self._reader.read(self._path)
+        except MissingDocument:
+            return None
+        except MissingKey as error:
+            if not self._path or not isinstance(self._path[-1], int):
+                raise error.with_traceback(None) from None
+        raise await self._reader.no_item(self._path)
+
+    async def get(self, *default: Any, default_value: Any = _NOTHING) -> Any:
+        """Return the value here, or `default` (None if not given) if nothing is stored here.
+
+        `get(key, default)`, with two arguments, does so for the element `key`, as in REEM 0.1, where the default may
+        also be named: `get(key, default_value=0)`.
+        """
+        if default_value is not _NOTHING:
+            default = (*default, default_value)
+        place = self[default[0]] if len(default) > 1 else self
+        try:
+            return await place._reader.read(place._path)
+        except MissingKey:
+            return default[-1] if default else None
+
+    async def write(self, value: Any) -> None:
+        """Store `value` here, in place of what was here. One round trip.
+
+        Two where this interface puts arrays for the first time (unless it is a whole top-level key), two or
+        three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
+
+        An array of 64 KB or more lets calls of this interface that are under way in the same event loop be answered
+        first, since encoding and sending it keep the loop; it is stored as it is then. (Publishing keeps the order of
+        calls instead.)
+
+        Raises:
+            BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
+            PathRefused: The parent is missing or cannot hold this element; nothing was stored. (One array, or other
+                value that goes by ship, just below a top-level key that is not there makes a dict for it.)
+        """
+        await self._writer.set(self._path, value)
+
+    async def delete(self) -> None:
+        """Remove what is here. One round trip; more if there were arrays that this interface did not know.
+
+        Raises:
+            MissingKey: Nothing was here.
+        """
+        await self._writer.delete(self._path)
+
+    async def length(self) -> int:
+        """Return the number of entries, items, characters, bytes, or rows. One round trip for dicts and lists.
+
+        Raises:
+            MissingKey: Nothing is here.
+            WrongType: It has no length.
+        """
+        return await self._reader.length_at(self._path)
+
+    async def contains(self, key: str) -> bool:
+        """Return whether the dict here has the key. One round trip; nothing of it is fetched.
+
+        Raises:
+            MissingKey: Nothing is here.
+            WrongType: It is not a dict.
+        """
+        return await self._reader.contains_at(self._path, key)
+
+    async def keys(self) -> list[str]:
+        """Return the keys of the dict here, in its order. One round trip; the values are not fetched.
+
+        Raises:
+            MissingKey: Nothing is here.
+            WrongType: It is not a dict.
+        """
+        return await self._reader.keys_at(self._path)
+
+    async def outline(self) -> Outline:
+        """Return what is here without fetching arrays: types, sizes, plain values. One round trip.
+
+        Printed, or shown by a notebook, it is a line for each value; an array is its dtype, shape and bytes.
+
+        Raises:
+            MissingKey: Nothing is here.
+            BadData: What is here was not written by REEM.
+        """
+        ensure_imported("reem_async.store.catalog")
+        from .catalog import outline_at
+
+        return await outline_at(self._reader.session, self.full_path)
+
+    async def pop(self, key: str | int = -1, *default: Any) -> Any:
+        """Remove the element `key`, by default the last item of a list, and return what it was.
+
+        Three round trips, again if somebody else writes to the same top-level key in between; one if there is nothing
+        and a default is given, which is then returned.
+
+        Raises:
+            MissingKey: Nothing is there and no default was given.
+            Conflict: Others changed it each of many times.
+        """
+        return await self[key]._take(*default)
+
+    async def _take(self, *default: Any) -> Any:
+        """Do what `pop` does, with what is here."""
+        if len(default) > 1:
+            raise BadType(f"pop() takes one default, not {len(default)}")
+        for last in _TRIES:
+            try:
+                before = await self._reader.raw_read(self._path)
+                value = await opened(before)
+                await self._writer.take(self._path, before)
+            except Conflict:
+                if last:
+                    raise
+            except MissingKey:
+                if not default:
+                    raise
+                return default[0]
+            else:
+                return value
+        raise AssertionError  # the last try returns or raises
+
+    async def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
+        """Store each of `values`, and of the named ones, in the dict here, as `dict.update` does: all or none.
+
+        One transaction, one round trip; two where this interface puts arrays for the first time. Each value
+        is published by itself, in the same transaction. As with `write`, more if another client changed the
+        shape of what is replaced.
+
+        Raises:
+            BadValue, BadType, BadKey, TooDeep: A value cannot be stored; nothing was sent.
+            PathRefused: No dict is here; nothing was stored.
+        """
+        await self._writer.update(self._path, dict(values, **more))
+
+    async def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return the value at `key` of the dict here; where there is none, store `default` first.
+
+        One round trip if it is there (two or more for arrays, as `read`), else three, again if somebody else writes
+        to the same top-level key in between.
+
+        Raises:
+            PathRefused: No dict is here.
+            Conflict: Others changed it each of many times.
+        """
+        return await self[check_name(key, self.full_path)]._read_or_put(default)
+
+    async def _read_or_put(self, default: Any) -> Any:
+        """Do what `setdefault` does, with what is here."""
+        for last in _TRIES:
+            try:
+                return await self._reader.read(self._path)
+            except MissingKey as error:
+                why = error
+            try:
+                await self._writer.put_absent(self._path, default, why)
+            except Conflict:
+                if last:
+                    raise
+            else:
+                return default
+        raise AssertionError  # the last try returns or raises
+
+    async def type(self) -> builtins.type:
+        """Return the Python type of what is here: dict, list, int, float, bool, str, numpy.ndarray, ...
+
+        One round trip, two for strings and arrays.
+
+        Raises:
+            MissingKey: Nothing is here.
+        """
+        return await self._reader.type_at(self._path)
+
+    async def increment(self, number: float = 1) -> Any:
+        """Add `number` to the number here; returns the result.
+
+        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits.
+
+        Raises:
+            MissingKey: Nothing is here.
+            WrongType: It is not a number.
+            Overflow: The result is out of range; the old value is kept.
+        """
+        return await self._writer.calculate(self._path, "JSON.NUMINCRBY", operator.add, number)
+
+    async def decrement(self, number: float = 1) -> Any:
+        """Subtract `number` from the number here; returns the result. Raises and costs as `increment`."""
+        plain = number.item() if isinstance(number, np.generic) else number  # unsigned ones have no negative
+        number_text(plain, self.full_path)
+        if plain == 0:  # the integer 0 has no negative either: -0.0 - 0 is -0.0, -0.0 + 0 is 0.0
+            return await self._writer.compute(self._path, lambda value: value - plain)
+        return await self.increment(-plain)
+
+    async def multiply(self, number: float) -> Any:
+        """Multiply the number here by `number`; returns the result. Raises and costs as `increment`."""
+        return await self._writer.calculate(self._path, "JSON.NUMMULTBY", operator.mul, number)
+
+    async def divide(self, number: float) -> Any:
+        """Divide the number here by `number`, as Python's `/` does; returns the result.
+
+        Two round trips, again if somebody else writes to the same top-level key in between. Raises
+        as `increment`, and ZeroDivisionError.
+        """
+        number_text(number, self.full_path)
+        if isinstance(number, np.generic):
+            number = number.item()
+        if number == 0:
+            raise ZeroDivisionError(f"{show(self.full_path)}: division by zero")
+        return await self._writer.compute(self._path, lambda value: value / number)
+
+    async def add(self, value: Any) -> None:
+        """Do what `+=` does: extend the list here by a list or tuple, or else `increment` the number here.
+
+        One round trip. Raises as these two.
+        """
+        if isinstance(value, list | tuple):
+            await self.extend(value)
+        else:
+            await self.increment(value)
+
+    async def append(self, value: Any) -> None:
+        """Append `value` to the list here. One round trip, two if it holds arrays.
+
+        Raises:
+            MissingKey: Nothing is here.
+            WrongType: It is not a list.
+            BadType: `value` cannot be stored.
+        """
+        await self._writer.extend(self._path, [value])
+
+    async def extend(self, values: Iterable[Any]) -> None:
+        """Append each of `values` to the list here, all or none. Raises and costs as `append`."""
+        await self._writer.extend(self._path, list(values))
+
+    def edit(self) -> Edit:
+        """Return a context manager that reads the value, lets you change it, and writes it back.
+
+        Nothing is written if the block raises. Two round trips to write.
+
+        Raises:
+            MissingKey: Nothing is here (on entering).
+            WrongType: It is a number, text or None, which cannot be changed in place.
+            Conflict: Somebody else changed it meanwhile (on leaving); nothing was written.
+        """
+        return Edit(self._reader, self._writer, self._path)
+
+    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+        """Return an async iterator over the value here, first as it is, then each time it is changed, by whomever.
+
+        What is published is told update by update. What is only stored (by a KeyValueStore, another language,
+        redis-cli, an expiry, ...) is told as the state that it led to; `update.origin` says so. Several changes in a
+        short time may be one update, the last state is always told, and nothing if nothing differs.
+
+        Args:
+            policy: What to keep for a loop that is slower than the updates: `Newest()` (the
+                default), `Last(n)` or `Every(bound)`.
+            stored: Yield what is only stored, too. It needs the right to use CLIENT TRACKING; without, a warning is
+                logged, and what is published is told.
+        """
+        from ..concurrency.queues import Newest
+        from ..pubsub.subscribers import Watch
+
+        return Watch(self._reader.session, self._reader.keys, self._path, policy or Newest(), stored=stored)
+
+    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+        """Return a local copy of what is here that follows every change: `async with kvs["arm"].mirror() as arm:`.
+
+        `arm.value()` and `arm["joint"].read()` answer from memory, `arm.age` says how old that may be, and
+        `await arm.wait_until(predicate, timeout)` waits for a change.
+
+        Args:
+            max_age: Seconds that an answer may be old; an older one is an error (Stale), as it is without a connection.
+            largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
+                is told in its place. `kvs["arm"]["image"].read()` fetches it.
+        """
+        ensure_imported("reem_async.pubsub.mirror")
+        from ..pubsub.mirror import Mirror
+
+        return Mirror(self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)
+
+
+def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> Any:
+    """Make an accessor from the parts of a pickled one."""
+    return kind(DocumentReader(session, path[0]), writer(session, path[0]), path[1:])

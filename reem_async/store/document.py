@@ -1,0 +1,384 @@
+"""Writing one top-level key, from values to plans."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ..concurrency.aside import ensure_imported
+from ..errors import SELF_EXPLANATORY, ConnectionLost, MissingKey, MissingTop, ReemError
+from ..plan import Plan
+from ..plan.changes import SILENT, Change, EncodedAttachment, Telling
+from ..plan.documents import number_text
+from ..plan.paths import Path, check_name, has_index, suffix
+from ..plan.reads import RawRead, nothing
+from ..plan.sizes import has_large
+from ..plan.together import together
+from ..plan.writes import append_change, appendable, change, delete_change, exchange, into_new, set_change, takes
+from ..session import Session
+from .encoding import HUGE, Encoder, unique_tail
+from .tracking import ALWAYS_TRACKED, saw_shape
+
+if TYPE_CHECKING:
+    from ..plan.arithmetic import Operation
+
+__all__ = ["Assignment", "DocumentWriter", "Notifier", "Outages", "Turn"]
+
+
+class Assignment(NamedTuple):
+    """What a call stores or removes at one place, encoded.
+
+    Attributes:
+        path: The place, below the top-level key.
+        text: The text of the document there; None if what is there is removed.
+        attachments: What goes by ship.
+        is_entry: It goes into a dict that has to be there: an array does not make its top-level key.
+    """
+
+    path: Path
+    text: bytes | None
+    attachments: tuple[EncodedAttachment, ...] = ()
+    is_entry: bool = False
+
+
+class Turn(Protocol):
+    """The turn of one call, and how subscribers are told of what it changes, in the transaction that changes it.
+
+    Attributes:
+        time: When the call was made, in seconds since 1970; None for now.
+    """
+
+    time: float | None
+
+    def with_value(self, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Telling:
+        """Return what tells of a value that is set."""
+        ...
+
+    def without_value(self, *, deleted: bool = False) -> Telling:
+        """Return what tells of any other change."""
+        ...
+
+    async def share(self, telling: Telling, path: Path) -> None:
+        """Put a large value that is about to be set where subscribers of the same host find it.
+
+        Raises:
+            NotConnected: The server is out of reach; nothing was set.
+        """
+        ...
+
+    def not_sent(self, count: int) -> None:
+        """Note that the last `count` changes were not applied: their numbers are free."""
+        ...
+
+    def settle(self) -> None:
+        """Note that nothing is to come any more of the changes so far: what tells of them is let go."""
+        ...
+
+
+class Notifier(Protocol):
+    """Whom changes of one top-level key are told, and in which order.
+
+    Attributes:
+        keeps_order: A later call must not overtake an earlier one.
+    """
+
+    keeps_order: bool
+
+    def turn(self) -> AbstractAsyncContextManager[Turn]:
+        """Wait for the turn of a call; the next one begins when this is left."""
+        ...
+
+
+class Outages(Protocol):
+    """What is done while the server is out of reach."""
+
+    async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
+        """Send the assignments of one call, or do with them what is to be done in an outage."""
+        ...
+
+    async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
+        """Send what depends on what is there, behind what is kept; raises in an outage."""
+        ...
+
+
+class _Silent:
+    """Tells nobody, so that calls need not wait for each other."""
+
+    # Calls of one task are in order anyhow: each is awaited. Those of several tasks have none.
+    keeps_order = False
+    time: float | None = None
+
+    def turn(self) -> _Silent:
+        return self
+
+    async def __aenter__(self) -> _Silent:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        return None
+
+    def with_value(self, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Telling:
+        return SILENT
+
+    def without_value(self, *, deleted: bool = False) -> Telling:
+        return SILENT
+
+    async def share(self, telling: Telling, path: Path) -> None:
+        return
+
+    def not_sent(self, count: int) -> None:
+        return
+
+    def settle(self) -> None:
+        return
+
+
+class DocumentWriter:
+    """Writes one top-level key.
+
+    Args:
+        session: The server.
+        name: The key.
+        notifier: Tells subscribers; None if nobody is to be told.
+        outages: What is done in an outage; None if calls raise.
+
+    Attributes:
+        tracking: What the store that it belongs to vouches for.
+        encoder: Encodes the values.
+    """
+
+    def __init__(
+        self, session: Session, name: object, notifier: Notifier | None = None, outages: Outages | None = None
+    ) -> None:
+        self.session = session
+        self.keys = session.keys(name)
+        self.name = self.keys.name
+        self.tracking = ALWAYS_TRACKED
+        self.encoder = Encoder(session, self.keys)
+        self._notifier: Notifier = notifier or _Silent()
+        self._outages = outages
+
+    def maker(self) -> Callable[[Session, object], DocumentWriter]:
+        """Return what makes another one, which can be pickled."""
+        return type(self)
+
+    async def check(self, value: Any) -> None:
+        """Raise BadInput if `value` cannot be stored as the whole document."""
+        await self.encoder.encoded((), value)
+
+    async def set(self, path: Path, value: Any) -> None:
+        """Store `value` at `path`: one transaction."""
+        # The hot path: a value that is plain JSON goes on without anything that ships or sizes may ask for.
+        text = self.encoder.plain(path, value)
+        if text is None:
+            await self._set_shipped(path, value)
+            return
+        if len(text) > HUGE:
+            await self.encoder.check_sizes(path, [text])
+        await self._set(path, text, ())
+
+    async def _set_shipped(self, path: Path, value: Any) -> None:
+        """Store what is not plain JSON."""
+        text, attachments = await self.encoder.walked(path, value)
+        if attachments and await self._let_pass(attachments):
+            # Another task may have changed an array meanwhile; all that is stored is to be of one instant.
+            text, attachments = await self.encoder.walked(path, value)
+        await self._set(path, text, attachments)
+
+    def _store(self, assignments: Sequence[Assignment]) -> Awaitable[None]:
+        return self.in_turn(self.send, assignments) if self._outages is None else self._outages.put(self, assignments)
+
+    def _set(self, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Awaitable[None]:
+        if self._outages is None:
+            return self.in_turn(self._put, path, text, attachments)
+        return self._store([Assignment(path, text, attachments)])
+
+    def _demand(self, send: Callable[..., Awaitable[Any]], *what: Any) -> Awaitable[Any]:
+        """Send what depends on what is there."""
+        return self.in_turn(send, *what) if self._outages is None else self._outages.demand(self, send, what)
+
+    async def _let_pass(self, attachments: tuple[EncodedAttachment, ...]) -> bool:
+        """Let small calls that are under way be answered before a large one; returns whether it waited."""
+        # A publisher that let others pass would publish out of order.
+        if self._notifier.keeps_order or not any(has_large(each.commands) for each in attachments):
+            return False
+        return await self.session.transport.let_pass()
+
+    async def update(self, path: Path, values: dict[str, Any]) -> None:
+        """Store each of `values` in the dict at `path`: one transaction."""
+        # One for the whole call, so that what belongs together can be told by its names.
+        tail = unique_tail() if has_index(path) else ""
+        encoded = [
+            ((*path, check_name(key, (self.name, *path))), await self.encoder.encoded((*path, key), value, tail))
+            for key, value in values.items()
+        ]
+        assignments = [Assignment(place, *it, is_entry=True) for place, it in encoded]
+        every = [each for it in assignments for each in it.attachments]
+        await self.encoder.check_sizes(path, [text for _, (text, _) in encoded], every)
+        if assignments:
+            await self._store(assignments)
+
+    async def delete(self, path: Path) -> None:
+        """Remove what is at `path`."""
+        # Kept in an outage as a value is: a deletion is the newest state of its place.
+        await self._store([Assignment(path, None)])
+
+    async def extend(self, path: Path, values: Sequence[Any]) -> None:
+        """Append `values` to the list at `path`, all or none."""
+        tail = unique_tail()
+        texts: list[bytes] = []
+        attachments: list[EncodedAttachment] = []
+        for number, value in enumerate(values):
+            text, its = await self.encoder.encoded((*path, -1), value, f"{tail}.{number}")
+            texts.append(text)
+            attachments.extend(its)
+        await self.encoder.check_sizes(path, texts, attachments)
+        if texts:
+            await self._demand(self._append, path, texts, tuple(attachments))
+
+    async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
+        """Apply a JSON arithmetic command; returns the new number."""
+        ensure_imported("reem_async.plan.arithmetic")
+        from ..plan.arithmetic import calculate
+
+        text = number_text(operand, (self.name, *path))
+        if isinstance(operand, np.generic):
+            operand = operand.item()
+
+        def plan(telling: Telling) -> Plan:
+            return calculate(self.keys, path, command, operation, operand, text, telling, self.session.cache)
+
+        return await self._demand(self._calculate, plan)
+
+    async def compute(self, path: Path, function: Any) -> Any:
+        """Replace the number at `path` by a function of it; returns the new number."""
+        ensure_imported("reem_async.plan.arithmetic")
+        from ..plan.arithmetic import compute
+
+        def plan(telling: Telling) -> Plan:
+            return compute(self.keys, path, function, telling, self.session.cache)
+
+        return await self._demand(self._calculate, plan)
+
+    async def exchange(self, path: Path, value: Any, before: RawRead) -> None:
+        """Store `value` at `path` if what is there is still `before`; raises Conflict."""
+        await self._demand(self._put_instead, path, *await self.encoder.encoded(path, value, unique_tail()), before)
+
+    async def put_absent(self, path: Path, value: Any, why: MissingKey) -> None:
+        """Store `value` at `path` if still nothing is there, which a read has found by raising `why`; or Conflict."""
+        await self.exchange(path, value, nothing(self.keys, path, why))
+
+    async def take(self, path: Path, before: RawRead) -> None:
+        """Remove what is at `path` if it is still `before`; raises Conflict."""
+        await self._demand(self._take, path, before)
+
+    async def in_turn(self, send: Callable[..., Awaitable[Any]], *what: Any) -> Any:
+        """Call `send` with the turn of this call and `what` it is to send; returns its result.
+
+        If it is broken off, the next change of the same key looks for what it may have left.
+        """
+        session, document = self.session, self.keys.document
+        async with self._notifier.turn() as turn:
+            # What cancelled calls have left on its way, over another connection, must not come after this. There is
+            # nearly never anything to wait for, and a coroutine costs time.
+            if not session.transport.is_settled(document):
+                await session.transport.settle(document)
+            try:
+                return await send(turn, *what)
+            except BaseException as error:
+                # Cancelled, interrupted, or without an answer: nobody knows what was applied, and a later change cleans
+                # up.
+                if not isinstance(error, ReemError) or isinstance(error, ConnectionLost):
+                    session.cache.broke_off(document)
+                else:
+                    session.cache.forget_numbers(document)
+                # The message says all; the steps of the library on the way here would only hide the caller's own line.
+                if isinstance(error, SELF_EXPLANATORY):
+                    raise error.with_traceback(None) from None
+                raise
+
+    async def send(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
+        """Send the assignments of one call, in its turn: all in one transaction."""
+        if len(assignments) > 1 or assignments[0].is_entry:
+            await self._put_all(turn, assignments)
+            return
+        path, text, attachments, _ = assignments[0]
+        await (self._remove(turn, path) if text is None else self._put(turn, path, text, attachments))
+
+    async def _put(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> None:
+        """Store a value; a single array just below a top-level key that is not there makes that."""
+        try:
+            if attachments:
+                await self._check_place(path, attachments)
+            it = self._setting(turn, path, text, attachments)
+            if attachments:
+                await turn.share(it.notices, path)
+            await self.session.run(change(it, self.session.cache))
+        except MissingTop:
+            # Only for `kvs["cam"]["image"] = array`: it would be of no use to have to write {} first.
+            if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
+                raise
+        else:
+            saw_shape(self.session.cache, self.keys, path, attachments)
+            return
+        it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
+        await self.session.run(change(it, self.session.cache))
+        saw_shape(self.session.cache, self.keys, path, attachments)
+
+    async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
+        shipped = next((each for each in assignments if each.attachments), None)
+        if shipped is not None:
+            await self._check_place(shipped.path, shipped.attachments)
+        changes = [self._setting(turn, path, text or b"", attachments) for path, text, attachments, _ in assignments]
+        if shipped is not None:
+            for each in changes:
+                await turn.share(each.notices, each.path)
+        await self.session.run(together(changes, self.session.cache))
+        for path, _, attachments, _ in assignments:
+            saw_shape(self.session.cache, self.keys, path, attachments)
+
+    async def _put_instead(
+        self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...], before: RawRead
+    ) -> None:
+        # Something that was there could be replaced, so its place can take an array as well.
+        if attachments and not before.holder:  # it is put where nothing is
+            await self._check_place(path, attachments)
+        await self._if_still(before, set_change(self.keys, path, text, attachments, notices=turn.without_value()))
+
+    async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
+        await self._if_still(before, delete_change(self.keys, path, notices=turn.without_value(deleted=True)))
+        self.session.cache.forget_shapes(self.keys.document)
+
+    async def _if_still(self, before: RawRead, it: Change) -> None:
+        # What was read names its arrays, and the transaction fails if anything is not as it was read: these are all.
+        it = it._replace(gone=tuple(slot.placeholder.suffix.encode() for slot, _, _ in before.slots))
+        await self.session.run(exchange(it, before.commands, before.raw, self.session.cache))
+
+    async def _remove(self, turn: Turn, path: Path) -> None:
+        it = delete_change(self.keys, path, notices=turn.without_value(deleted=True))
+        await self.session.run(change(it, self.session.cache))
+        self.session.cache.forget_shapes(self.keys.document)
+
+    async def _append(
+        self, turn: Turn, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...]
+    ) -> None:
+        if attachments:  # they would be stored though there is no list to append to
+            await self.session.run(appendable(self.keys, path))
+        it = append_change(self.keys, path, texts, attachments, notices=turn.without_value())
+        await self.session.run(change(it, self.session.cache))
+
+    async def _calculate(self, turn: Turn, plan: Callable[[Telling], Plan]) -> Any:
+        return await self.session.run(plan(turn.without_value()))
+
+    async def _check_place(self, path: Path, attachments: tuple[EncodedAttachment, ...]) -> None:
+        """Raise PathRefused if ships' values would be stored for nothing."""
+        plan = takes(self.keys, path, attachments, self.session.cache)
+        if plan is not None:
+            await self.session.run(plan)
+
+    def _setting(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Change:
+        looks = self.tracking.looks(self.session.cache, self.keys, path, attachments)
+        return set_change(self.keys, path, text, attachments, looks, turn.with_value(text, attachments))

@@ -1,0 +1,127 @@
+"""From the values of calls to what is stored: the text of a document, and what goes by ship."""
+
+from __future__ import annotations
+
+import inspect
+import secrets
+from collections.abc import Sequence
+from typing import Any
+
+from ..errors import BadValue
+from ..plan import Command
+from ..plan.changes import EncodedAttachment
+from ..plan.documents import Attachment, plain, walk
+from ..plan.keys import Keys
+from ..plan.paths import Path, has_index, show, suffix
+from ..plan.sizes import USUAL, check_sizes, limits, sizes_of
+from ..session import Session
+
+__all__ = ["HUGE", "Encoder", "unique_tail"]
+
+HUGE = 256 << 20
+"""Bytes from which it is looked exactly whether the server takes a value; a ship may need more for it than it says."""
+
+Encoded = tuple[bytes, tuple[EncodedAttachment, ...]]
+"""The text of a document, and what goes by ship."""
+
+
+def unique_tail() -> str:
+    """Return a tail for names of ships' keys: in lists items move while their keys keep their names."""
+    # 40 bits, behind the path: no two arrays in the lists of one top-level key get the same name by chance.
+    return secrets.token_hex(5)
+
+
+class Encoder:
+    """Encodes the values of one top-level key, and refuses what cannot be stored.
+
+    Args:
+        session: The server.
+        keys: The names of the top-level key.
+    """
+
+    def __init__(self, session: Session, keys: Keys) -> None:
+        self._session = session
+        self._keys = keys
+
+    def plain(self, path: Path, value: Any) -> bytes | None:
+        """Return the text of a value that is plain JSON; None for any other. Its size is not looked at."""
+        # A ship may claim types that orjson would write by itself: then every value is walked through.
+        return None if self._session.ships.asks_first else plain(value, len(path))
+
+    async def encoded(self, path: Path, value: Any, tail: str | None = None) -> Encoded:
+        """Encode a value for `path`, and have the ships record their commands.
+
+        `tail` goes behind the names of ships' keys; if it is not given, one is made up where the path leads through a
+        list.
+
+        Raises:
+            BadInput: It cannot be stored.
+        """
+        text = self.plain(path, value)
+        if text is None:
+            return await self.walked(path, value, tail)
+        await self.check_sizes(path, [text])
+        return text, ()
+
+    async def walked(self, path: Path, value: Any, tail: str | None = None) -> Encoded:
+        """Encode a value that is not plain JSON: look at each part of it, and have the ships record their commands."""
+        if tail is None:
+            tail = unique_tail() if has_index(path) else ""
+        ships = self._session.ships
+        fits: Any = ships.fits
+        if ships.asynchronous:
+            await ships.ready()
+            # Asked before the walk, which cannot wait.
+            fits = await ships.choices(value)
+
+        def name(inner: Path) -> str:
+            return suffix(path + inner) + (f"~{tail}" if tail else "")
+
+        found = walk(value, (self._keys.name, *path), fits, name, ships.claimed)
+        attachments = [
+            self._packed(each) if each.ship.blob is not None else await self._recorded(each)
+            for each in found.attachments
+        ]
+        # The sizes that ships name are a quick look, the exact ones are taken where it comes near to what servers
+        # refuse.
+        if len(found.text) + sum([each.size for each in found.attachments]) > HUGE:
+            await self._ask_for_limits(path, [found.text], attachments)
+        return found.text, tuple(attachments)
+
+    async def check_sizes(
+        self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment] = ()
+    ) -> None:
+        """Raise BadValue if the server would close the connection upon so much in one call."""
+        if sum(map(len, texts)) + sum([sum(sizes_of(each.commands)) for each in attachments]) > HUGE:
+            await self._ask_for_limits(path, texts, attachments)
+
+    async def _ask_for_limits(
+        self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment]
+    ) -> None:
+        """Look exactly; the server is asked if it is in doubt."""
+        sizes = [(show((self._keys.name, *path)), len(text)) for text in texts]
+        for each in attachments:
+            where = self._keys.name + each.suffix.partition("~")[0]
+            sizes += [(where, size) for size in sizes_of(each.commands)]
+        # Most servers have the usual limits, and a value within them needs no question.
+        try:
+            check_sizes(sizes, USUAL)
+        except BadValue:
+            at = await self._session.transport.owner(self._keys.document.encode())
+            check_sizes(sizes, await self._session.run(limits(), at))
+
+    def _packed(self, attachment: Attachment) -> EncodedAttachment:
+        blob = attachment.ship.blob.pack(attachment.value)
+        # Several pieces stay apart, header and data: the transport sends them as they are, so an array is not copied.
+        command = ("SET", self._keys.tag + attachment.suffix, blob[0] if len(blob) == 1 else blob)
+        return EncodedAttachment(attachment.suffix, attachment.ship.label, (command,), blob)
+
+    async def _recorded(self, attachment: Attachment) -> EncodedAttachment:
+        key, ship = self._keys.tag + attachment.suffix, attachment.ship
+        # A ship of the original kind writes to a client itself; here it is given one that only notes the commands.
+        recorder = self._session.ships.new_recorder()
+        result = ship.ship.write(key, attachment.value, recorder)
+        if inspect.isawaitable(result):
+            await result
+        commands: tuple[Command, ...] = tuple(recorder.commands)
+        return EncodedAttachment(attachment.suffix, ship.label, commands)

@@ -1,0 +1,118 @@
+"""Reading one top-level key, from replies to values."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+from ..errors import BadData, MissingKey, WrongType
+from ..plan import Plan
+from ..plan.olddata import first_read, is_new
+from ..plan.paths import Path, check_name, show
+from ..plan.reads import RawRead, exists, has_key, interpret, keys_at, length, read, type_of
+from ..session import Session
+
+__all__ = ["DocumentReader", "opened"]
+
+
+class DocumentReader:
+    """Reads one top-level key.
+
+    Args:
+        session: The server.
+        name: The key.
+    """
+
+    def __init__(self, session: Session, name: object) -> None:
+        self.session = session
+        self.keys = session.keys(name)
+        self.name = self.keys.name
+
+    async def read(self, path: Path) -> Any:
+        """Return the value at `path`; raises MissingKey."""
+        session = self.session
+        at = session.readers
+        if session.ships.asynchronous:
+            await session.ships.ready()
+        try:
+            raw_read: RawRead = await session.run(self._reading(path), at)
+            return await opened(raw_read) if raw_read.slots else raw_read.holder[0]
+        except BadData:
+            # The primary itself has a document that names arrays which are not there: that is damage, not lag.
+            if at is session.transport:
+                raise
+        # From a replica of a node that gives up a slot, arrays may have gone before their document.
+        return await opened(await self.raw_read(path))
+
+    async def no_item(self, path: Path) -> MissingKey:
+        """Return the error for an item that is not there: it may be one of an array."""
+        outer, where = path[:-1], show((self.name, *path))
+        try:
+            kind = await self.type_at(outer)
+        except MissingKey:
+            kind = type(None)
+        if kind is not np.ndarray:
+            return MissingKey(f"nothing is stored at {where}")
+        return MissingKey(
+            f"{where}: {show((self.name, *outer))} is an array, and arrays are read whole: "
+            f"read it, then take [{path[-1]}] of what that gives"
+        )
+
+    async def exists(self) -> bool:
+        """Return whether there is a document under the key."""
+        found: bool = await self.session.run(exists(self.keys), self.session.readers)
+        return found
+
+    async def raw_read(self, path: Path) -> RawRead:
+        """Return what the server has at `path`, ships' replies not yet interpreted."""
+        if self.session.ships.asynchronous:
+            await self.session.ships.ready()
+        raw_read: RawRead = await self.session.run(self._reading(path))
+        return raw_read
+
+    async def contains_at(self, path: Path, key: object) -> bool:
+        """Return whether the dict at `path` has the key."""
+        name = check_name(key, (self.name, *path))
+        found: bool = await self.session.run(has_key(self.keys, path, name), self.session.readers)
+        return found
+
+    async def keys_at(self, path: Path) -> list[str]:
+        """Return the keys of the dict at `path`."""
+        names: list[str] = await self.session.run(keys_at(self.keys, path), self.session.readers)
+        return names
+
+    def _reading(self, path: Path) -> Plan:
+        session = self.session
+        plan = read(self.keys, path, session.ships, session.cache)
+        # Until a key is known not to be of REEM 0.1, its reads ask that too, in the same round trip.
+        known = is_new(self.keys, path, session.cache)
+        return plan if known else first_read(plan, self.keys, path, session.cache)
+
+    async def type_at(self, path: Path) -> type:
+        """Return the Python type of the value at `path`."""
+        await self.session.ships.ready()
+        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships), self.session.readers)
+        return type(await self.read(path)) if kind is None else kind
+
+    async def length_at(self, path: Path) -> int:
+        """Return the length of the value at `path`."""
+        count: int | None = await self.session.run(length(self.keys, path), self.session.readers)
+        if count is not None:
+            return count
+        # A text or an array: the server knows the length of its placeholder only.
+        value = await self.read(path)
+        try:
+            return len(value)
+        except TypeError:
+            where = show((self.name, *path))
+            raise WrongType(f"{where} is of type {type(value).__name__} and has no length") from None
+
+
+async def opened(raw_read: RawRead) -> Any:
+    """Return the value a read brought, everything the ships hold put in its place."""
+    for slot, ship, reply in raw_read.slots:
+        value = interpret(raw_read.name, slot, ship, reply)
+        slot.container[slot.key] = await value if ship.blob is None and inspect.isawaitable(value) else value
+    return raw_read.holder[0]

@@ -1,0 +1,214 @@
+"""KeyValueStore: the dictionary on the server."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..concurrency.aside import ensure_imported
+from ..connection import RedisInterface
+from ..errors import BadType, MissingKey
+from ..plan.paths import parse
+from ..session import Session
+from .accessor import _NOTHING as _NOTHING
+from .accessor import Accessor
+from .document import DocumentWriter
+from .reader import DocumentReader
+from .tracking import Tracking
+
+if TYPE_CHECKING:
+    from ..concurrency.queues import Policy
+    from ..pubsub.pattern_watch import PatternWatch
+
+_MOST_TOPS = 1000
+"""Accessors of top-level keys that are kept: only to be quick, any is made anew when it is asked for."""
+
+__all__ = ["KeyValueStore"]
+
+Interface = TypeVar("Interface")
+
+
+def without_options(interface: Interface, options: Mapping[str, Any]) -> Interface:
+    """Return an interface that is there already; raises BadType if it is to have options besides."""
+    if options:
+        raise BadType(f"{', '.join(options)}: options go to the RedisInterface when it is made, or with a host")
+    return interface
+
+
+class KeyValueStore:
+    """The dictionary on the server.
+
+    `kvs["foo"]["bar"]` is an `Accessor`: a path, nothing is sent yet; `await` its `read()`,
+    `write(value)` and so on.
+
+    Args:
+        interface: The server: a RedisInterface, another store, or what RedisInterface takes as host.
+        options: With a host, what else RedisInterface takes: `KeyValueStore("localhost", port=7400)`.
+    """
+
+    _accessor: type[Accessor] = Accessor
+    _writer: Callable[[Session, object], DocumentWriter] = DocumentWriter
+
+    def __init__(self, interface: Any = None, **options: Any) -> None:
+        if isinstance(interface, KeyValueStore):
+            interface = interface.interface
+        self.interface: RedisInterface = (
+            without_options(interface, options)
+            if isinstance(interface, RedisInterface)
+            else RedisInterface(interface, **options)
+        )
+        self._tops: dict[str, Accessor] = {}
+        self._tracking = Tracking()
+
+    def __getitem__(self, key: str) -> Accessor:
+        return self._top(key)
+
+    def _top(self, key: object) -> Accessor:
+        # The hot path: a key that was used before needs no check and no new objects.
+        if type(key) is str and (known := self._tops.get(key)) is not None:
+            return known
+        session = self.interface.session
+        name = session.keys(key).name
+        writer = self._writer(session, name)
+        writer.tracking = self._tracking
+        if len(self._tops) >= _MOST_TOPS:
+            self._tops.clear()
+        # Another thread may have made one meanwhile: all use the same.
+        return self._tops.setdefault(name, self._accessor(DocumentReader(session, name), writer, ()))
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        raise BadType(f"assignment cannot wait for the server; use: await store[{key!r}].write(value)")
+
+    def __delitem__(self, key: str) -> None:
+        raise BadType(f"del cannot wait for the server; use: await store[{key!r}].delete()")
+
+    def __iter__(self) -> Any:
+        raise BadType("iterating cannot wait for the server; use: for key in await store.keys()")
+
+    def __contains__(self, key: object) -> bool:
+        raise BadType(f"`in` cannot wait for the server; use: await store.contains({key!r})")
+
+    def at(self, path: str) -> Accessor:
+        """Return the accessor of a dotted path such as "foo.bar" or "foo.tiles[2]"; sends nothing.
+
+        `store["foo.bar"]` is another place, a top-level key with a dot; as a path it is quoted: `["foo.bar"]`.
+        """
+        key, *rest = parse(path) or ("",)
+        top = self._top(key)
+        return self._accessor(top._reader, top._writer, tuple(rest))
+
+    async def get(self, path: str, default: Any = _NOTHING) -> Any:
+        """Return the value at a dotted path, or `default` if given and nothing is there.
+
+        Raises:
+            MissingKey: Nothing is there and no default was given.
+        """
+        place = self.at(path)
+        try:
+            return await place._reader.read(place._path)
+        except MissingKey:
+            if default is _NOTHING:
+                raise
+            return default
+
+    async def contains(self, key: str) -> bool:
+        """Return whether a top-level key is there. One round trip.
+
+        What a program without REEM stored under that name does not count.
+        """
+        return await self._top(key)._reader.exists()
+
+    async def keys(self, pattern: str = "*") -> list[str]:
+        """Return the top-level keys, sorted; with a pattern, those it names (`*` and `?` stand for others).
+
+        One round trip for about 1000 keys of the server. Not atomic: a key that is written or deleted
+        meanwhile may or may not be among them.
+        """
+        ensure_imported("reem_async.store.catalog")
+        from .catalog import names
+
+        return sorted([name async for name in names(self.interface, pattern)])
+
+    async def pop(self, key: str, *default: Any) -> Any:
+        """Remove a top-level key and return what it held, or `default` if given and it is not there.
+
+        Raises and costs as `Accessor.pop`.
+        """
+        return await self._top(key)._take(*default)
+
+    async def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
+        """Store each of `values`, and of the named ones, under its top-level key.
+
+        Each is a `write`, one after the other. Not atomic: each key is a document of its own. Should the
+        connection fail, the first ones may have been stored. All keys and values are looked at first.
+
+        Raises:
+            BadValue, BadType, BadKey, TooDeep: A value cannot be stored; nothing was sent.
+        """
+        every = dict(values, **more)
+        # Every value is looked at before the first is sent, so that a bad one changes nothing.
+        for key, value in every.items():
+            await self._top(key)._writer.check(value)
+        for key, value in every.items():
+            await self._top(key).write(value)
+
+    def watch(self, *patterns: str, policy: Policy | None = None, largest: int | None = None) -> PatternWatch:
+        """Return an async iterator over every change of all keys that some patterns name, those that come and go too.
+
+        As `kvs["foo"].watch()` for each key there is (which comes first, `initial`) or comes to be: one that is only
+        stored is found within a second. `update.path` says where it was.
+
+        Args:
+            patterns: Globs of paths, such as "arm", "cam_*", "robot1.*" or "robot.*.battery"; all keys if none.
+            policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
+            largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
+                is told in its place, another object when it has changed.
+
+        Raises:
+            BadKey: Not a pattern.
+        """
+        ensure_imported("reem_async.pubsub.pattern_watch")
+        from ..pubsub.pattern_watch import PatternWatch
+
+        return PatternWatch(self.interface.session, patterns, policy, largest=largest)
+
+    async def setdefault(self, key: str, default: Any = None) -> Any:
+        """Return the value of a top-level key; where it is not there, store `default` first.
+
+        Raises and costs as `Accessor.setdefault`.
+        """
+        return await self._top(key)._read_or_put(default)
+
+    async def set(self, path: str, value: Any) -> None:
+        """Store `value` at a dotted path; see `Accessor.write`."""
+        await self.at(path).write(value)
+
+    def track_schema_changes(
+        self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
+    ) -> None:
+        """Say whether the shape of what is written may change (True, the default) or never does.
+
+        With False, a write no longer looks for arrays that it replaces: the places of the arrays at
+        a path must be those of the first write there; others are refused with a TypeError.
+
+        Args:
+            set_value: Whether shapes may change.
+            keys: The top-level keys meant; None for all, present and future.
+            track: Another name of `set_value`.
+        """
+        set_value = track if set_value is None else set_value
+        if set_value is None:
+            raise BadType("track_schema_changes() takes True or False")
+        if keys is None:
+            self._tracking.static = not set_value
+            # "For all keys" also overrules what was said of single ones before.
+            self._tracking.by_key.clear()
+            return
+        for key in keys:
+            self._tracking.by_key[self._top(key)._writer.name] = not set_value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.interface,)
+
+    def __repr__(self) -> str:
+        return f"<reem_async.{type(self).__name__} {self.interface.hostname}>"

@@ -1,0 +1,194 @@
+"""What the page asks for: the tree, values, plots, and time. Everything as JSON, but pictures."""
+
+from __future__ import annotations
+
+import secrets
+from typing import Any
+
+from starlette.requests import Request
+from starlette.responses import Response
+from starlette.routing import Route
+
+from ...errors import BadData, BadKey, BadValue, MissingKey
+from ...plan.paths import Path, show
+from .addresses import address, path_of
+from .answers import Refused, answered, at_of, body_of, integer_of, number_of, path_in, reply, told, value_path_in
+from .guard import same_origin
+from .nodes import Node, visible
+from .source import NotKept, Series, Source
+
+__all__ = ["Api"]
+
+# What one question of a page may ask for, so that no page keeps the program from answering others: open branches of the
+# tree, rows of one and of all of them, paths that are marked as changed, points of a curve, paths that a search names,
+# and characters of a text.
+_MOST_BRANCHES = 100
+_MOST_ROWS = 1000
+_MOST_ROWS_IN_ALL = 3000
+_MOST_MARKS = 5000
+_MOST_POINTS = 1200
+_MOST_FOUND = 60
+_LONGEST_TEXT = 200_000
+
+
+class Api:
+    """Answers about one source.
+
+    Args:
+        source: What is shown.
+        allow_write: Whether values may be changed.
+
+    Attributes:
+        key: What a request that changes something must carry: pages from elsewhere do not know it.
+    """
+
+    def __init__(self, source: Source, allow_write: bool) -> None:
+        self._source = source
+        self.allow_write = allow_write and source.writable
+        self.key = secrets.token_urlsafe(24)
+
+    def routes(self) -> list[Route]:
+        """Return the routes below /api, but those of arrays and events."""
+        asked = {
+            "tree": self.tree,
+            "series": self.series,
+            "step": self.step,
+            "activity": self.activity,
+            "search": self.search,
+        }
+        routes = [Route(f"/{name}", answered(handler), methods=["GET"]) for name, handler in asked.items()]
+        routes.append(Route("/node", told(self.node), methods=["GET"]))
+        return [*routes, Route("/write", answered(self.write), methods=["POST"])]
+
+    async def tree(self, request: Request) -> Response:
+        """Return the items of all open branches, what changed since an instant marked."""
+        at = at_of(request)
+        marks = await self._marks(request, at)
+        branches: list[dict[str, Any]] = []
+        left = _MOST_ROWS_IN_ALL
+        for text in request.query_params.getlist("open")[:_MOST_BRANCHES]:
+            count, start, where = _branch(text)
+            try:
+                page = await self._source.children(path_of(where), start, min(count, max(left, 1)), at)
+            except (MissingKey, NotKept, BadKey, BadData) as error:
+                branches.append({"address": where, "error": visible(str(error)), "total": 0, "start": 0, "nodes": []})
+                continue
+            left -= len(page.nodes)
+            nodes = [_marked(node, marks) for node in page.nodes]
+            branches.append({"address": where, "total": page.total, "start": page.start, "nodes": nodes})
+        return reply({"branches": branches, **self.span()})
+
+    async def _marks(self, request: Request, at: float | None) -> tuple[set[Path], set[Path]]:
+        """Return what changed, and what is above it."""
+        since = number_of(request, "since")
+        if since is None:
+            return set(), set()
+        until = self._source.status().end if at is None else at
+        changed = await self._source.differing(min(since, until), max(since, until), _MOST_MARKS)
+        return changed, {path[:end] for path in changed for end in range(1, len(path))}
+
+    def span(self) -> dict[str, Any]:
+        """Return the span of time that can be shown."""
+        return dict(self._source.status()._asdict())
+
+    async def node(self, request: Request) -> Response:
+        """Return what is at a path, and the text of a string."""
+        path, at = path_in(request), at_of(request)
+        (node,) = await self._source.nodes([path], at) if path else [Node((), "dict")]
+        if node is None:
+            raise MissingKey(f"nothing {'is' if at is None else 'was'} stored at {visible(show(path))}")
+        answer = node.as_json() | {
+            "shown": visible(show(path)),
+            "snippets": self._source.snippets(path, at) if path else {},
+        }
+        if node.kind == "str":
+            text = (await self._source.value(path, at)).value
+            answer |= {"full": visible(str(text)[:_LONGEST_TEXT]), "cut": len(str(text)) > _LONGEST_TEXT}
+        if self.allow_write and at is None and node.kind in ("dict", "list"):
+            answer["editable"] = (node.count or 0) <= _MOST_ROWS
+        return reply(answer)
+
+    async def series(self, request: Request) -> Response:
+        """Return the number, or list of numbers, at a path over a span of time."""
+        status = self._source.status()
+        start, end = number_of(request, "start"), number_of(request, "end")
+        start = status.start if start is None else start
+        found = await self._source.series(value_path_in(request), start, status.end if end is None else end)
+        return reply({"start": start, "end": status.end if end is None else end, **_thinned(found)._asdict()})
+
+    async def step(self, request: Request) -> Response:
+        """Return the instant of the next or previous change."""
+        at = number_of(request, "at")
+        if at is None:
+            raise BadValue("at= is missing")
+        forward = request.query_params.get("forward", "1") == "1"
+        return reply({"at": await self._source.step(at, forward, path_in(request))})
+
+    async def activity(self, request: Request) -> Response:
+        """Return how many changes there were, for the strip above the slider."""
+        status = self._source.status()
+        bins = max(integer_of(request, "bins", 100, 400), 1)
+        span, path = (status.start, status.end), path_in(request)
+        counts = await self._source.activity(*span, bins, path)
+        pictures = await self._source.pictures(*span, bins, path)
+        return reply({"start": status.start, "end": status.end, "counts": counts, "pictures": pictures})
+
+    async def search(self, request: Request) -> Response:
+        """Return paths that have a text in them."""
+        text = request.query_params.get("q", "").strip()[:200]
+        at = at_of(request)
+        paths = await self._source.search(text, at, _MOST_FOUND) if text else []
+        nodes = await self._source.nodes(paths, at)
+        found = [node.as_json() | {"shown": visible(show(node.path))} for node in nodes if node is not None]
+        return reply({"found": found, "most": _MOST_FOUND})
+
+    async def write(self, request: Request) -> Response:
+        """Publish a value, if that is allowed, and asked by a page from here."""
+        if not self.allow_write:
+            raise Refused(403, "this page is read-only; start it with: reem browse --allow-write")
+        if not same_origin(request.headers):
+            raise Refused(403, "this did not come from a page of this program")
+        offered = request.headers.get("x-reem-key", "")
+        # The key of this start of the program, which only its own page has: no other site can make a browser send it.
+        if not secrets.compare_digest(offered.encode(), self.key.encode()):
+            raise Refused(403, "the page is older than this program; load it again")
+        content = await body_of(request)
+        if not isinstance(content, dict) or "value" not in content or not isinstance(content.get("path"), str):
+            raise Refused(400, 'send {"path": ..., "value": ...}')
+        path = path_of(content["path"])
+        if not path:
+            raise Refused(400, "a top-level key is needed")
+        await self._source.write(path, content["value"])
+        return reply({"written": address(path)})
+
+
+def _branch(text: str) -> tuple[int, int, str]:
+    """Return how many rows of which branch, from which on, are asked for: "100:0:foo.bar"."""
+    count, _, rest = text.partition(":")
+    start, _, where = rest.partition(":")
+    if not (count.isascii() and count.isdigit() and start.isascii() and start.isdigit() and len(count + start) < 20):
+        raise BadValue(f"open={text[:40]!r} is not like 100:0:foo.bar")
+    return min(int(count), _MOST_ROWS), int(start), where
+
+
+def _marked(node: Node, marks: tuple[set[Path], set[Path]]) -> dict[str, Any]:
+    changed, above = marks
+    mark = "changed" if node.path in changed else "inside" if node.path in above else ""
+    return node.as_json() | {"mark": mark}
+
+
+def _thinned(series: Series) -> Series:
+    """Return a series with as many points as a screen has room for: the extremes of each part of the first line."""
+    count = len(series.times)
+    if count <= _MOST_POINTS:
+        return series
+    # Two points for each part: the least and the greatest, so that no peak is lost.
+    step = -(-count * 2 // _MOST_POINTS)
+    chosen: set[int] = {0, count - 1}
+    first = series.lines[0]
+    for edge in range(0, count, step):
+        part = [(value, index) for index, value in enumerate(first[edge : edge + step], edge) if value is not None]
+        chosen.update((min(part)[1], max(part)[1]) if part else (edge,))
+    places = sorted(chosen)
+    lines = [[values[index] for index in places] for values in series.lines]
+    return Series(series.names, [series.times[index] for index in places], lines)

@@ -1,0 +1,197 @@
+"""Reading what was only announced into the rolling buffer, between the updates where it belongs."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from ...errors import RedisError, ReemError
+from ...plan import Reply
+from ...plan.paths import Path, below
+from ...plan.placeholders import marked
+from ...plan.trees import MISSING, get
+from ...pubsub.division import Division, Heard
+from ...pubsub.fetching import divided_read
+from ...pubsub.gaps import GapDetector
+from ...pubsub.monitor import ANNOUNCED, Event
+from ...session import Session
+from ..recording.fetch import fetch
+from .history import History
+from .partial_reads import noted_text
+from .timeline import PENDING
+from .trees import Leaf, changed, framed, leaf_of, tree_of, walk
+
+__all__ = ["Allowance", "Fetcher", "array_bytes"]
+
+_RECENT = 16
+"""Updates that are known again if they come twice while something is read."""
+
+_REST = 4
+"""How many times as long as reading arrays took nothing of the kind is read: a slow connection is left to others."""
+
+
+class Allowance:
+    """So many bytes a second, saved up to a limit.
+
+    Args:
+        rate: Bytes a second.
+        most: Bytes that can be saved up.
+    """
+
+    def __init__(self, rate: float, most: float) -> None:
+        self._rate, self._most, self._saved, self._then = rate, most, most, time.monotonic()
+
+    def take(self, size: int) -> bool:
+        """Take so many bytes if they are there; else nothing, and return False."""
+        if self.wait(size) > 0:
+            return False
+        self._saved -= size
+        return True
+
+    def wait(self, size: int) -> float:
+        """Return the seconds until so many bytes are there; infinite if there never are so many."""
+        now = time.monotonic()
+        self._saved = min(self._saved + (now - self._then) * self._rate, self._most)
+        self._then = now
+        return math.inf if size > self._most else max((size - self._saved) / self._rate, 0.0)
+
+
+class Fetcher:
+    """Reads one announced value after the other, the newest of each path.
+
+    Arrays are read in turn as far as the allowance goes, so that of each path there is one now and then, in even
+    intervals: what was announced and could not be read yet is read when its turn comes, as it is then.
+
+    What is read goes into the buffer once it is known which updates it has, with those applied that it has not: no
+    update is applied twice, or undone.
+
+    Args:
+        session: The server.
+        history: Where the values go.
+        allowance: Bytes of arrays that may be read.
+        last_note: Returns the note of the last notice of a key that was heard.
+        fence: Returns when all that was published before has been `heard`.
+
+    Attributes:
+        behind: Keys with an announcement that has not been answered.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        history: History,
+        allowance: Allowance,
+        last_note: Callable[[str], str],
+        fence: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._session = session
+        self._history = history
+        self._allowance = allowance
+        self._last_note = last_note
+        self._fence = fence
+        self._paths: dict[Path, None] = {}
+        self._owed: dict[Path, int] = {}  # whose arrays are to be read, and how many bytes they have
+        self._rested = 0.0  # the instant from which on arrays may be read again, on the monotonic clock
+        self._news = asyncio.Event()
+        self._name = ""  # what is being read, and what is heard of it meanwhile
+        self._division: Division[Event] = Division()
+        self.behind: set[str] = set()
+
+    def want(self, path: Path, when: float) -> None:
+        """Note that the buffer lacks what is at a path since an instant."""
+        self._history.add(path, PENDING, 0, when)
+        self.behind.add(str(path[0]))
+        self._paths.setdefault(path)
+        self._news.set()
+
+    def heard(self, event: Event) -> None:
+        """Take notice of an update, whatever it is."""
+        if event.name == self._name and self._division.gaps.count(event) is not None:
+            self._division.hear(Heard(event, None if event.gap else 0))
+
+    async def run(self) -> None:
+        """Read what is wanted, for ever."""
+        while True:
+            path, with_arrays = await self._next()
+            with suppress(ReemError, RedisError, OSError):
+                await self._fetch_one(path, with_arrays)
+
+    async def _next(self) -> tuple[Path, bool]:
+        """Return what is to be read next, and whether the turn of its arrays has come."""
+        while True:
+            self._news.clear()
+            owed = next(iter(self._owed), None)
+            wait = None if owed is None else self._until_turn(self._owed[owed])
+            if owed is not None and wait == 0:
+                del self._owed[owed]
+                self._paths.pop(owed, None)
+                return owed, True
+            for path in self._paths:
+                del self._paths[path]
+                return path, not self._owed
+            with suppress(TimeoutError):
+                async with asyncio.timeout(wait):  # wait_for of Python 3.11 loses a cancellation that comes with news
+                    await self._news.wait()
+
+    def _until_turn(self, size: int) -> float:
+        return max(self._allowance.wait(size), self._rested - time.monotonic(), 0.0)
+
+    async def _fetch_one(self, path: Path, with_arrays: bool) -> None:
+        self._name = name = str(path[0])
+        self._division = Division(GapDetector(_RECENT))
+        self._division.gaps.begin_with(self._last_note(name).encode())
+        try:
+            tree = await divided_read(self._division, partial(self._read, path, with_arrays), self._fence)
+        finally:
+            self._name = ""
+        later = [each.update for each in self._division.take()[1] if each.update is not None]
+        tree = _rebased(tree, path, later)
+        self._history.add_read(path, tree, time.time(), answer=True)
+        if not any(event.value is ANNOUNCED for event in later):
+            self.behind.discard(name)
+
+    async def _read(self, path: Path, with_arrays: bool) -> tuple[Any, Reply]:
+        """Return the document's part, with its arrays if it is their turn, and the note of what it includes."""
+        self._division.asked(in_order=False)
+        text, note = await noted_text(self._session, path)
+        if text is None:
+            return MISSING, note
+        tree = tree_of(text, str(path[0]))
+        size = array_bytes(tree) if marked(text) else 0
+        if not size or self._allowance.wait(size) == math.inf:
+            return tree, note
+        if not with_arrays or self._until_turn(size) > 0 or not self._allowance.take(size):
+            self._owed.setdefault(path, size)
+            return tree, note
+        began = time.monotonic()
+        self._division.asked(in_order=False)
+        value, _, note = await fetch(self._session, self._session.keys(path[0]), path[1:])
+        now = time.monotonic()
+        self._rested = now + _REST * (now - began)
+        return await asyncio.to_thread(framed, value), note
+
+
+def array_bytes(tree: Any) -> int:
+    """Return how many bytes the arrays in a tree have."""
+    return sum([leaf_of(it).size for _, it in walk(tree, ()) if isinstance(it, Leaf | np.ndarray | bytes)])
+
+
+def _rebased(tree: Any, path: Path, later: Iterable[Event]) -> Any:
+    """Return what was read at a path with the updates applied that it does not include; those announced are to come."""
+    for event in later:
+        value = MISSING if event.deleted else event.value
+        if value is ANNOUNCED:
+            continue
+        if below(path, event.path):
+            rest = path[len(event.path) :]
+            tree = MISSING if value is MISSING else get(value, rest)
+        elif below(event.path, path):
+            tree = changed(tree, event.path[len(path) :], value)
+    return tree

@@ -1,0 +1,284 @@
+"""The rolling buffer: every change of the last seconds, within a number of bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from bisect import bisect_right
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
+from typing import Any
+
+from ...plan.paths import Path
+from ...plan.trees import MISSING
+from .frames import Frames
+from .source import rate_span
+from .timeline import PENDING, UNKNOWN, Change, Kept, Timeline
+from .trees import Frame, Leaf, same, tree_of, weight
+
+__all__ = ["History"]
+
+Text = bytes
+"""A document as the server sends it; History has something else of the name of that type."""
+
+_OVERHEAD = 300
+"""Bytes of memory that a change takes besides its value."""
+
+# Seconds between two looks for what is too old.
+_TRIM_SECONDS = 1.0
+
+_FILLED = 0.9
+"""The part of the bytes that is left full when room is made: it is then a while until more must be."""
+
+_LARGEST_TEXT = 1 << 18
+"""Bytes of a document's text up to which it is kept as the state before the first change."""
+
+
+class History:
+    """What is known of the past of every top-level key.
+
+    Args:
+        seconds: How long a change is kept.
+        budget: Bytes that all of it may take; the oldest goes first.
+
+    Attributes:
+        start: From when on the past is known, in seconds since 1970.
+        frames: The arrays that were read.
+        dropped: How many changes had to go before their time.
+    """
+
+    def __init__(self, seconds: float, budget: int) -> None:
+        self.seconds = seconds
+        self.budget = budget
+        self.start = time.time()
+        self.frames = Frames(seconds)
+        self.dropped = 0
+        self._bytes = 0  # of all but the frames
+        self._lines: dict[str, Timeline] = {}
+        # The same changes twice: by key, to know what a key held; all in order, to forget the oldest first.
+        self._all: deque[Change] = deque()
+        self._heavy: set[str] = set()  # keys whose base may hold arrays
+        self._trimmed = 0.0
+
+    @property
+    def bytes(self) -> int:
+        """Return about how much memory all of it takes."""
+        return self._bytes + self.frames.bytes
+
+    # --- what happened
+
+    def add(self, path: Path, value: Any, size: int, when: float, *, answer: bool = False) -> None:
+        """Note a change: `value` is what is at `path` since; MISSING or PENDING stand for what they say.
+
+        It may be the `answer` to one that was PENDING.
+        """
+        # A change is put into the line of its top-level key: only those can change what was at a path.
+        line = self._line(str(path[0]))
+        change = Change(when, path, value, size + _OVERHEAD, answer)
+        line.add(change)
+        self._all.append(change)
+        self._bytes += change.size
+        self._trim(when)
+
+    def add_read(self, path: Path, tree: Any, when: float, *, answer: bool = False) -> None:
+        """Note what was read at a path, with a `Frame` for each array that is to be kept."""
+        self.frames.add(path, tree, when)
+        self.add(path, tree, weight(tree), when, answer=answer)
+
+    def begin(self, name: str, text: Text | None) -> None:
+        """Note what a key held before anything is known to have changed."""
+        if name in self._lines:
+            return
+        # Of a long document only a mark is kept: what it held before its first change is unknown.
+        base = MISSING if text is None else text if len(text) <= _LARGEST_TEXT else UNKNOWN
+        line = self._lines[name] = Timeline(base, None if base is UNKNOWN else text)
+        self._bytes += line.base_size + _OVERHEAD
+
+    def differs(self, name: str, text: Text | None, when: float) -> bool:
+        """Return whether a document's text, read just now, is not what the changes led to.
+
+        Of a long one nothing is known at first: it differs from when on it was `remember`ed.
+        """
+        line = self._lines.get(name)
+        if line is None:
+            return text is not None
+        if text is None:
+            return line.state(when) is not MISSING
+        # The same text, or a digest of it: nothing has changed. This is what most looks find.
+        if line.text == _mark(text):
+            return False
+        state = line.state(when)
+        if state is UNKNOWN:
+            return line.text is not None or len(text) <= _LARGEST_TEXT
+        return state is MISSING or not same(tree_of(text, name), state)
+
+    def remember(self, name: str, text: Text | None) -> None:
+        """Note what was read last, and is in the changes."""
+        line = self._lines.get(name)
+        if line is not None:
+            line.text = None if text is None else _mark(text)
+
+    def _line(self, name: str) -> Timeline:
+        if name not in self._lines:
+            self._lines[name] = Timeline(UNKNOWN)
+            self._bytes += _OVERHEAD
+        return self._lines[name]
+
+    def _trim(self, when: float) -> None:
+        """Make what is too old, or too much, part of the state before; in batches, since that costs a copy."""
+        if when >= self._trimmed + _TRIM_SECONDS:
+            self._trimmed = when
+            self._fold(sum(1 for _ in takewhile(lambda change: change.time < when - self.seconds, self._all)))
+            self.start = max(self.start, when - self.seconds)
+            self.frames.forget(self.start, lambda path: isinstance(self.tree(path, when), Frame | Leaf))
+        if self.bytes > self.budget:
+            # Pictures go first, thinned evenly; but not below half of all memory for the sake of plain values.
+            room = int(_FILLED * self.budget) - self._bytes
+            self.frames.thin(max(room, self.budget // 2), when)
+        # Then plain changes, a tenth at a time: folding each by itself would copy the state each time.
+        while self.bytes > self.budget and self._all:
+            self._shed()
+            if self.bytes <= self.budget:
+                break
+            count = max(len(self._all) // 10, 1)
+            self.dropped += count
+            self._fold(count)
+
+    def _shed(self) -> None:
+        """Let go of the arrays of states that nobody can move the slider to any more."""
+        while self._heavy:
+            self._bytes -= self._lines[self._heavy.pop()].strip()
+
+    # The oldest changes become the state that the past begins with.
+    def _fold(self, count: int) -> None:
+        counts: Counter[str] = Counter()
+        for _ in range(count):
+            first = self._all.popleft()
+            counts[str(first.path[0])] += 1
+            self.start = max(self.start, first.time)
+        for name, changes in counts.items():
+            self._bytes -= self._lines[name].fold(changes)
+            self._heavy.add(name)
+
+    # --- what there was
+
+    @property
+    def names(self) -> Iterable[str]:
+        """All keys of which anything is known."""
+        return self._lines.keys()
+
+    def knows(self, name: str) -> bool:
+        """Return whether anything is known of a key."""
+        return name in self._lines
+
+    def is_whole(self, name: str) -> bool:
+        """Return whether all of a key is known, as far as it was heard of at all."""
+        line = self._lines.get(name)
+        return line is None or line.whole
+
+    def unchanged(self, name: str, since: float) -> bool:
+        """Return whether a key is known not to have changed since an instant: it is as it is now."""
+        line = self._lines.get(name)
+        return line is None or line.upto(since) == len(line.changes)
+
+    def existed(self, name: str, at: float) -> bool | None:
+        """Return whether there was such a key, None if that is not known."""
+        line = self._lines.get(name)
+        state = UNKNOWN if line is None else line.state(at)
+        return None if state is UNKNOWN else state is not MISSING
+
+    def tree(self, path: Path, at: float) -> Any:
+        """Return what was at a path: a tree not to be changed, MISSING or UNKNOWN."""
+        return self.kept(path, at).value
+
+    def kept(self, path: Path, at: float) -> Kept:
+        """Return what was at a path, and how old that is: of an array the last one of which something is kept."""
+        line = self._lines.get(str(path[0]))
+        if line is None:
+            return Kept(UNKNOWN)
+        kept = line.kept(path, at)
+        # Of an array the line knows only that it changed; which picture of it is still there, the frames know.
+        if not isinstance(kept.value, Frame | Leaf):
+            return kept
+        frame = self.frames.before(path, at, line.moved(path, at))
+        if frame is None:
+            return Kept(kept.value.leaf if isinstance(kept.value, Frame) else kept.value, kept.late)
+        # A millisecond at least: the picture is older than the last change, if only just.
+        late = kept.late if frame is kept.value else max(line.newest(path, at) - frame.time, 1e-3)
+        return Kept(frame, late)
+
+    def last(self, paths: Sequence[Path], at: float) -> dict[Path, float]:
+        """Return when each path last changed before `at`, as far as that is known."""
+        groups: dict[str, list[Path]] = {}
+        for path in paths:
+            if path and path[0] in self._lines:
+                groups.setdefault(str(path[0]), []).append(path)
+        found: dict[Path, float] = {}
+        for name, group in groups.items():
+            found |= self._lines[name].last(group, at)
+        return found
+
+    def rate(self, name: str, at: float, over: float = 5.0) -> float | None:
+        """Return updates per second of a key about `at`; None if there was none, or it is not known yet."""
+        line = self._lines.get(name)
+        if line is None:
+            return None
+        span = rate_span(at, self.start, max(time.time(), at), over)
+        if span is None:
+            return None
+        some = line.changes[line.upto(span[0]) : line.upto(span[1])]
+        # An answer belongs to a change that was counted when it was announced.
+        count = sum([not change.answer for change in some])
+        return count / (span[1] - span[0]) if count else None
+
+    def between(self, since: float, until: float) -> Iterator[Change]:
+        """Yield the changes after `since` and not after `until`, newest first."""
+        for change in reversed(self._all):
+            if change.time <= since:
+                return
+            if change.time <= until:
+                yield change
+
+    def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
+        """Yield what was at `path` at `start` and after each change."""
+        line = self._lines.get(str(path[0]))
+        return iter(()) if line is None else line.values(path, start, end)
+
+    def times(self, path: Path) -> list[float]:
+        """Return when there were changes that concern `path` (all of them for the root), in order."""
+        if not path:
+            return [change.time for change in self._all if not change.answer]
+        line = self._lines.get(str(path[0]))
+        return line.times(path) if line else []
+
+    def _seen(self, path: Path) -> list[float]:
+        if not path:
+            return [change.time for change in self._all if change.value is not PENDING]
+        line = self._lines.get(str(path[0]))
+        return line.seen(path) if line else []
+
+    def step(self, at: float, forward: bool, path: Path) -> float | None:
+        """Return the next instant after `at`, or the last one before it, from which on something else is to be seen."""
+        times = self._seen(path)
+        if forward:
+            index = bisect_right(times, at + 1e-6)
+            return times[index] if index < len(times) else None
+        earlier = [when for when in times if when < at - 1e-6]
+        return earlier[-1] if earlier else None
+
+    def matching(self, needle: str, at: float) -> Iterator[tuple[str, Any]]:
+        """Yield the keys, and what they held, that may have `needle` in the name of something below."""
+        needle_bytes = needle.encode()
+        for name, line in list(self._lines.items()):
+            # The text of a document is searched before it is parsed: most do not have the word.
+            if not line.changes and line.text is not None and needle_bytes not in line.text.lower():
+                continue
+            tree = line.state(at)
+            if tree is not UNKNOWN and tree is not MISSING:
+                yield name, tree
+
+
+def _mark(text: bytes) -> bytes:
+    """Return what tells a text from others: itself, or a digest of a long one."""
+    return text if len(text) <= _LARGEST_TEXT else hashlib.blake2b(text, digest_size=16).digest()

@@ -1,0 +1,294 @@
+"""A live server as a source: what is there is read from the server, what was there comes from the rolling buffer."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from ...connection import RedisInterface
+from ...errors import BadType, ConnectionLost, MissingKey, NotConnected, ServerNotReady
+from ...plan.paths import Path, show
+from ...plan.trees import MISSING
+from ...store.catalog import outline
+from ...store.publish import PublishSpace
+from ...store.reader import DocumentReader
+from .addresses import address, snippets
+from .follower import Follower
+from .history import History
+from .marks import differing
+from .nodes import Node, Page, node_of
+from .partial_reads import keys_at, peek
+from .source import NotKept, Sample, Series, Status, counted, numbers_in
+from .timeline import UNKNOWN
+from .trees import Frame, Leaf, thawed, tree_of_outline, walk
+
+__all__ = ["LiveSource"]
+
+_LARGEST = 1 << 28
+"""Bytes of arrays up to which a value is read for a page."""
+
+_SHARED_SECONDS = 0.2
+"""How long one reading of a large value serves all who ask."""
+
+_SHORT = 128
+"""Bytes of a value up to which it is read to be drawn."""
+
+# Places that are looked at for one search, so that the program answers others meanwhile.
+_WALKED = 200_000
+
+_AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
+"""What is raised while the server cannot be asked: its past is known all the same."""
+
+
+class LiveSource:
+    """What a server holds, and what it held in the last seconds.
+
+    Sees every update that is published. What a KeyValueStore writes is seen when the server is looked
+    at, about twice a second for some hundreds of keys, long documents and arrays as often as 1 MB a second
+    allows; its arrays only while their key is not published. Arrays of the past are kept as far as the
+    budget allows.
+
+    Args:
+        interface: The server; closed with the source.
+        seconds: How long the past is kept.
+        budget: Bytes of memory for the past.
+    """
+
+    live = True
+    writable = True
+
+    def __init__(self, interface: RedisInterface, seconds: float = 60.0, budget: int = 128 << 20) -> None:
+        self.interface = interface
+        self.title = interface.hostname + (f" · {interface.namespace}" if interface.namespace else "")
+        self.history = History(seconds, budget)
+        self._follower = Follower(interface, self.history)
+        self._shared: dict[str, asyncio.Task[Any]] = {}
+        self._space = PublishSpace(interface)
+
+    async def start(self) -> None:
+        """Connect and begin to follow. Idempotent; raises NotConnected and the like."""
+        await self._follower.start()
+
+    async def close(self) -> None:
+        """Stop following and close the interface. Idempotent."""
+        await self._follower.close()
+        await self.interface.close()
+
+    def status(self) -> Status:
+        """Return the span of the buffer, and whether the server answers."""
+        notes = ["the buffer is full: it reaches back less far than asked for"] if self.history.dropped else []
+        if self._follower.skipped:
+            notes.append(f"{self._follower.skipped} updates came too fast to be kept")
+        end = time.time()
+        return Status(
+            min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
+        )
+
+    def snippets(self, path: Path, at: float | None) -> dict[str, str]:
+        """Return Python that reads a path, for both fronts."""
+        return snippets(path, self.interface.session.options.url, self.interface.namespace)
+
+    # --- the tree
+
+    async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
+        """Return what is at each path: three round trips at most."""
+        when = time.time() if at is None else at
+        # What has not changed since an instant is still there: it is asked of the server, and costs no memory here.
+        now = [path for path in paths if at is None or self.history.unchanged(str(path[0]), at)]
+        try:
+            found = dict(zip(now, await self._peek(now), strict=True))
+        except _AWAY:
+            if at is None:
+                raise
+            found = {}  # the past is known without a server
+        for path in paths:
+            if path not in found:
+                found[path] = self._past(path, when)
+        last = self.history.last(paths, when)
+        return [self._stamped(found[path], last, when, live=at is None) for path in paths]
+
+    async def _peek(self, paths: Sequence[Path]) -> list[Node | None]:
+        self._follower.shown([str(path[0]) for path in paths])
+        return await peek(self.interface.session, paths)
+
+    def _past(self, path: Path, at: float) -> Node | None:
+        value = self.history.tree(path, at)
+        if value is UNKNOWN:
+            return Node(path, "unknown", "not kept for this instant")
+        return None if value is MISSING else node_of(path, value)
+
+    def _stamped(self, node: Node | None, last: dict[Path, float], when: float, *, live: bool) -> Node | None:
+        if node is None:
+            return None
+        if len(node.path) > 1:
+            return node.stamped(last.get(node.path), None)
+        name = str(node.path[0])
+        shared = live and self._follower.is_shared(name)
+        return node.stamped(last.get(node.path), self.history.rate(name, when), shared=shared)
+
+    async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
+        """Return some of what is below a path: four round trips at most."""
+        keys = self._names(at) if not path else await self._keys(path, at)
+        chosen = [(*path, key) for key in keys[start : start + count]]
+        nodes = await self.nodes(chosen, at)
+        return Page(len(keys), start, [node for node in nodes if node is not None])
+
+    def _names(self, at: float | None) -> Sequence[str]:
+        names = self._follower.names
+        if at is None:
+            return names
+        # None: not known, so what is there now is taken to have been there then.
+        known = {name: self.history.existed(name, at) for name in self.history.names}
+        present = {name for name in names if known.get(name) is not False}
+        return sorted(present | {name for name, existed in known.items() if existed})
+
+    async def _keys(self, path: Path, at: float | None) -> Sequence[str | int]:
+        if at is None or self.history.unchanged(str(path[0]), at):
+            try:
+                keys = await keys_at(self.interface.session, path)
+                if keys is None:
+                    raise MissingKey(f"nothing is stored at {show(path)}, or nothing is below it")
+                return range(keys) if isinstance(keys, int) else keys
+            except _AWAY:
+                if at is None:
+                    raise
+        value = self.history.tree(path, at)
+        if value is UNKNOWN:
+            raise NotKept(f"{show(path)} was too large to be kept, so its past cannot be shown")
+        if not isinstance(value, dict | list):
+            raise MissingKey(f"nothing was below {show(path)} then")
+        return list(value) if isinstance(value, dict) else range(len(value))
+
+    # --- values
+
+    async def value(self, path: Path, at: float | None) -> Sample:
+        """Return the value at a path, arrays included; readings of the same moment are shared."""
+        name = str(path[0])
+        # A doubtful key may have changed without a word that could be heard: its present does not speak for its past.
+        if at is None or (self.history.unchanged(name, at) and name not in self._follower.doubtful):
+            try:
+                return Sample(await self._read(path), 0.0, self._age(path, at))
+            except _AWAY:
+                if at is None:
+                    raise
+        kept = self.history.kept(path, at)
+        if kept.value is UNKNOWN:
+            raise NotKept(f"{show(path)} is not kept for this instant")
+        if kept.value is MISSING:
+            raise MissingKey(f"nothing was stored at {show(path)} then")
+        if not isinstance(kept.value, Frame):
+            return Sample(thawed(kept.value), kept.late)
+        frame = kept.value
+        # The best that is left of it.
+        value = frame.preview if frame.whole is None else frame.whole
+        return Sample(frame.leaf if value is None else value, kept.late, max(at - frame.time, 0.0))
+
+    def _age(self, path: Path, at: float | None) -> float | None:
+        """Return for how long what is there now had been there at an instant of the past."""
+        since = None if at is None else self.history.last([path], at).get(path)
+        return None if at is None or since is None else max(at - since, 0.0)
+
+    async def _read(self, path: Path) -> Any:
+        key = address(path)
+        if key not in self._shared:
+            # One reading of a camera serves all panes and pages that ask at the same time.
+            self._shared[key] = asyncio.create_task(self._read_new(path))
+            self._shared[key].add_done_callback(lambda done: self._let_go(key, done))
+        # Who goes away must not break off the reading for the others.
+        return await asyncio.shield(self._shared[key])
+
+    def _let_go(self, key: str, done: asyncio.Task[Any]) -> None:
+        if not done.cancelled():
+            # Looked at, so that asyncio does not complain if nobody waits for it any more.
+            done.exception()
+        asyncio.get_running_loop().call_later(_SHARED_SECONDS, self._shared.pop, key, None)
+
+    async def _read_new(self, path: Path) -> Any:
+        (node,) = await peek(self.interface.session, [path])
+        # Before it is fetched: a page must not make this program take all memory.
+        if node is not None and (node.size or 0) > _LARGEST:
+            raise NotKept(f"{show(path)} has {node.size} bytes, too many for a page; read it with Python")
+        return await DocumentReader(self.interface.session, str(path[0])).read(path[1:])
+
+    async def write(self, path: Path, value: Any) -> None:
+        """Publish a value in the place of a plain one; subscribers learn of it. Three round trips.
+
+        Raises:
+            BadType: An array is there, or nothing at all below the top level.
+        """
+        (node,) = await peek(self.interface.session, [path])
+        if node is None:
+            raise MissingKey(f"nothing is stored at {show(path)}; the page changes only what is there")
+        if node.count is None and node.kind not in ("str", "int", "float", "bool", "NoneType"):
+            raise BadType(f"{show(path)} is of type {node.kind}, which a page cannot write; use Python")
+        # A dict that holds arrays would lose them: what the page sends is JSON.
+        if node.count is not None and await self._has_leaves(path):
+            raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
+        accessor: Any = self._space
+        for key in path:
+            accessor = accessor[key]
+        await accessor.write(value)
+
+    async def _has_leaves(self, path: Path) -> bool:
+        tree = tree_of_outline(await outline(self.interface, path))
+        return any(isinstance(it, Leaf) for _, it in walk(tree, path))
+
+    # --- time
+
+    async def changes(self, since: float, until: float, most: int) -> list[Path]:
+        """Return which paths were published or seen to change, the newest first; from the buffer."""
+        found: dict[Path, None] = {}
+        for change in self.history.between(since, until):
+            found[change.path] = None
+            if len(found) >= most:
+                break
+        return list(found)
+
+    async def differing(self, since: float, until: float, most: int) -> set[Path]:
+        """Return which paths have another value at one instant than at another; from the buffer."""
+        before, after = (lambda name, at=at: self.history.tree((name,), at) for at in (since, until))
+        return differing(await self.changes(since, until, most), before, after, most)
+
+    async def step(self, at: float, forward: bool, path: Path) -> float | None:
+        """Return the instant of the next or previous change; from the buffer."""
+        return self.history.step(at, forward, path)
+
+    async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return how many changes there were in parts of a span; from the buffer."""
+        return counted(self.history.times(path), start, end, bins)
+
+    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return in which parts of a span arrays were kept: 2 whole, 1 as previews, 0 not; from the buffer."""
+        found = [0] * bins
+        frames = list(self.history.frames.concerning(path))
+        for frame in frames:
+            place = min(max(int((frame.time - start) / max(end - start, 1e-9) * bins), 0), bins - 1)
+            if frame.time <= end:
+                found[place] = max(found[place], 1 if frame.whole is None else 2)
+        return found if frames else []
+
+    async def series(self, path: Path, start: float, end: float) -> Series:
+        """Return numbers over time, the present one last."""
+        samples = list(self.history.values(path, max(start, self.history.start), end))
+        if not samples:
+            (node,) = await peek(self.interface.session, [path])
+            if node is not None and (node.text if node.size is None else node.size <= _SHORT):
+                samples = [(end, await self._read(path))]
+        return numbers_in(samples)
+
+    async def search(self, text: str, at: float | None, most: int) -> list[Path]:
+        """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""
+        needle = text.lower()
+        found: dict[Path, None] = {(name,): None for name in self._names(at) if needle in address((name,)).lower()}
+        last = needle.replace("[", ".").replace('"', "").split(".")[-1]
+        walked = 0
+        for name, tree in self.history.matching(last, time.time() if at is None else at):
+            for path, _ in walk(tree, (name,)):
+                walked += 1
+                if len(found) >= most or walked > _WALKED:
+                    return list(found)[:most]
+                if len(path) > 1 and needle in address(path).lower():
+                    found[path] = None
+        return list(found)[:most]

@@ -1,0 +1,214 @@
+"""A recording as a source."""
+
+from __future__ import annotations
+
+import bisect
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path as FilePath
+from typing import Any, TypeVar
+
+import anyio
+import anyio.to_thread
+import numpy as np
+
+from ...errors import MissingKey, ReadOnly
+from ...plan.paths import Path, show
+from ...plan.trees import MISSING, get
+from ..recording.log import Log, open_log
+from .addresses import address
+from .marks import differing
+from .nodes import Node, Page, node_of
+from .source import Sample, Series, Status, counted, is_small_vector, numbers_in, rate_span
+from .trees import tree_of_outline, walk
+
+__all__ = ["LogSource"]
+
+Result = TypeVar("Result")
+
+# States, and lists of times, that are kept: neighbouring instants are asked for together.
+_CACHED = 8
+# Places that are looked at for one search.
+_WALKED = 200_000
+# Values that are read to find out whether a path is worth drawing.
+_LOOKS = 6
+_ROUNDING = 1e-6
+"""Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
+
+
+class _Times:
+    """When there was news of which path: read once it is asked for, since all of a long recording takes seconds."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._known: OrderedDict[Path, np.ndarray[Any, Any]] = OrderedDict()
+
+    def concerning(self, path: Path) -> np.ndarray[Any, Any]:
+        """Return the times of all that concerns `path`, all there are for the root; sorted."""
+        if path not in self._known:
+            self._known[path] = self._log.news_times(path)
+            while len(self._known) > _CACHED:
+                self._known.popitem(last=False)
+        self._known.move_to_end(path)
+        return self._known[path]
+
+    def rate(self, name: str, at: float) -> float | None:
+        """Return updates per second of a key about `at`."""
+        # The same span as of a live server, so that both show the same rate.
+        span = rate_span(at, self._log.start, max(self._log.end, at))
+        since, until = span or (self._log.start, at)  # a recording of less than a second counts as one
+        count = self._log.news_count((name,), since, until)
+        return count / max(until - since, 1.0) if count else None
+
+
+class LogSource:
+    """What a recording says that a server held.
+
+    Reading takes place in a thread, one at a time.
+
+    Args:
+        path: The file that `reem record` wrote.
+
+    Raises:
+        DamagedRecording: It is no recording of REEM.
+        OSError: It cannot be read.
+    """
+
+    live = False
+    writable = False
+
+    def __init__(self, path: str | FilePath) -> None:
+        self.title = FilePath(path).name
+        self.log: Log = open_log(path)
+        self._times = _Times(self.log)
+        self._states: OrderedDict[float, dict[str, Any]] = OrderedDict()
+        self._turns: anyio.CapacityLimiter | None = None
+
+    async def start(self) -> None:
+        """Nothing is to be done."""
+
+    async def close(self) -> None:
+        """Close the file. Idempotent."""
+        self.log.close()
+
+    def status(self) -> Status:
+        """Return the span of the recording."""
+        notes = [] if self.log.indexed else ["the recording was not ended properly"]
+        if self.log.damaged:
+            notes.append(f"{self.log.damaged} damaged records are skipped")
+        start, end = (instant and instant + _ROUNDING for instant in (self.log.start, self.log.end))
+        return Status(start, end, "", "; ".join(notes))
+
+    def snippets(self, path: Path, at: float | None) -> dict[str, str]:
+        """Return Python that reads a path from the recording."""
+        code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path.resolve())!r})\n"
+        when = "log.end" if at is None else repr(at)
+        return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
+
+    async def _do(self, work: Callable[[], Result]) -> Result:
+        if self._turns is None:
+            self._turns = anyio.CapacityLimiter(1)
+        return await anyio.to_thread.run_sync(work, limiter=self._turns)
+
+    def _state(self, at: float) -> dict[str, Any]:
+        """Return the trees of all keys at an instant; the last few are kept."""
+        if at not in self._states:
+            self._states[at] = {name: tree_of_outline(it) for name, it in self.log.outline_at(at).items()}
+            while len(self._states) > _CACHED:
+                self._states.popitem(last=False)
+        self._states.move_to_end(at)
+        return self._states[at]
+
+    def _when(self, at: float | None) -> float:
+        return self.log.end + _ROUNDING if at is None else at
+
+    async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
+        """Return what was at each path."""
+        return await self._do(lambda: [self._node(path, self._when(at)) for path in paths])
+
+    def _node(self, path: Path, at: float) -> Node | None:
+        value = get(self._state(at), path)
+        if value is MISSING:
+            return None
+        rate = self._times.rate(str(path[0]), at) if len(path) == 1 else None
+        return node_of(path, value).stamped(self.log.last_news(path, at), rate)
+
+    async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
+        """Return some of what was directly below a path."""
+        return await self._do(lambda: self._children(path, start, count, self._when(at)))
+
+    def _children(self, path: Path, start: int, count: int, at: float) -> Page:
+        value = get(self._state(at), path)
+        if not isinstance(value, dict | list):
+            raise MissingKey(f"nothing was below {show(path)} then")
+        keys: Sequence[str | int] = range(len(value)) if isinstance(value, list) else list(value)
+        keys = keys if path else sorted([str(key) for key in keys])
+        nodes = [self._node((*path, key), at) for key in keys[start : start + count]]
+        return Page(len(keys), start, [node for node in nodes if node is not None])
+
+    async def value(self, path: Path, at: float | None) -> Sample:
+        """Return the value at a path; raises MissingKey, DamagedRecording."""
+        return Sample(await self._do(lambda: self.log.value_at(path, self._when(at))))
+
+    async def changes(self, since: float, until: float, most: int) -> list[Path]:
+        """Return which paths were updated."""
+        return sorted(await self._do(lambda: self.log.changes(since, until)), key=show)[:most]
+
+    async def differing(self, since: float, until: float, most: int) -> set[Path]:
+        """Return which paths have another value at one instant than at another."""
+        return await self._do(lambda: self._differing(since, until, most))
+
+    def _differing(self, since: float, until: float, most: int) -> set[Path]:
+        before, after = self._state(since), self._state(until)
+        paths = self.log.changes(since, until)
+        return differing(paths, lambda name: before.get(name, MISSING), lambda name: after.get(name, MISSING), most)
+
+    async def step(self, at: float, forward: bool, path: Path) -> float | None:
+        """Return the instant of the next or previous change."""
+        return await self._do(lambda: self._step(at, forward, path))
+
+    def _step(self, at: float, forward: bool, path: Path) -> float | None:
+        times = self._times.concerning(path)
+        place = (
+            bisect.bisect_right(times, at + _ROUNDING) if forward else bisect.bisect_left(times, at - 3 * _ROUNDING) - 1
+        )
+        return float(times[place]) + _ROUNDING if 0 <= place < len(times) else None
+
+    async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return how many changes there were in parts of a span."""
+        return await self._do(lambda: counted(self._times.concerning(path), start, end, bins))
+
+    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return nothing: a recording has all its arrays."""
+        return []
+
+    async def series(self, path: Path, start: float, end: float) -> Series:
+        """Return numbers over time."""
+        return await self._do(lambda: numbers_in(self._samples(path, start, end)))
+
+    def _samples(self, path: Path, start: float, end: float) -> Iterable[tuple[float, Any]]:
+        times = self._times.concerning(path)
+        places = np.linspace(0, len(times) - 1, min(len(times), _LOOKS)).astype(int)
+        news = [float(times[place]) - (place > 0) * _ROUNDING for place in places]
+        # Large arrays are not read for this. What was deleted at the end may have been numbers before.
+        found = [get(self._state(at), path) for at in {end, *news}]
+        if any(isinstance(it, bool | int | float | list) or is_small_vector(it) for it in found):
+            yield from self.log[path].values(start, end)
+
+    async def search(self, text: str, at: float | None, most: int) -> list[Path]:
+        """Return paths with `text` in them, top-level keys first."""
+        return await self._do(lambda: self._search(text.lower(), self._state(self._when(at)), most))
+
+    def _search(self, needle: str, state: dict[str, Any], most: int) -> list[Path]:
+        found = [(name,) for name in sorted(state) if needle in address((name,)).lower()][:most]
+        inner: list[Path] = list(found)
+        for number, (path, _) in enumerate(walk(state, ())):
+            if len(inner) >= most or number > _WALKED:
+                break
+            if len(path) > 1 and needle in address(path).lower():
+                inner.append(path)
+        return inner
+
+    async def write(self, path: Path, value: Any) -> None:
+        """Raise ReadOnly."""
+        raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")

@@ -1,0 +1,201 @@
+"""Looking at parts of large documents: what is at some paths, never a whole document.
+
+Three round trips for any number of paths: the types; the lengths, and the short values; and the items
+of short lists, if all of them are plain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ...errors import BadData, MissingKey, NotAllowed, WrongKind
+from ...plan import Command, Plan, Reply
+from ...plan.keys import Keys
+from ...plan.paths import Path, to_jsonpath
+from ...plan.reads import count_in, entries_command, get_command
+from ...plan.replies import checked, type_name
+from ...session import Session
+from .addresses import is_addressable
+from .nodes import Node, node_of, shown_text
+from .trees import tree_of
+
+__all__ = ["document_texts", "keys_at", "noted_text", "noted_texts", "peek"]
+
+_LONGEST = 2048
+"""Bytes of a text that are fetched to show its beginning; placeholders are shorter."""
+
+# Items of a list that the tree shows in its row.
+_SHORT_LIST = 8
+# The server's words for types -> Python's.
+_CONTAINERS = {"object": "dict", "array": "list"}
+_PLAIN = {b"integer", b"number", b"boolean", b"null"}
+
+
+async def _ask(session: Session, commands: Sequence[Command]) -> list[Reply]:
+    """Return the replies, errors among them: what is not there, or not a document, is no reason to stop."""
+    return list(await session.run(Plan(list(commands), list))) if commands else []
+
+
+async def peek(session: Session, paths: Sequence[Path]) -> list[Node | None]:
+    """Return the node at each path, None where nothing is. Three round trips at most."""
+    nodes: list[Node | None] = [None] * len(paths)
+    # Round trips: types and lengths of texts; then lengths of containers and values; then items of short lists.
+    where = {index: _place(session, path) for index, path in enumerate(paths) if all(map(is_addressable, path[1:]))}
+    reach = list(where)
+    for index in set(range(len(paths))) - set(reach):
+        nodes[index] = Node(paths[index], "unreachable", "its key cannot be addressed; read the dict that holds it")
+    replies = await _ask(
+        session, [(command, *where[index]) for index in reach for command in ("JSON.TYPE", "JSON.STRLEN")]
+    )
+    kinds: dict[int, str] = {}
+    texts: dict[int, int] = {}
+    for number, index in enumerate(reach):
+        kind = _kind(replies[2 * number])
+        if kind is not None:
+            kinds[index] = kind
+            texts[index] = _number(replies[2 * number + 1])
+    await _fill(session, paths, where, kinds, texts, nodes)
+    return nodes
+
+
+async def _fill(
+    session: Session,
+    paths: Sequence[Path],
+    where: Mapping[int, tuple[str, str]],
+    kinds: dict[int, str],
+    texts: dict[int, int],
+    nodes: list[Node | None],
+) -> None:
+    """Fetch the lengths of containers and the values of all else."""
+    # A long text is described by its length and not fetched; texts[index] is 0 for all other types.
+    asked = [(index, kind) for index, kind in kinds.items() if texts[index] <= _LONGEST]
+    replies = await _ask(session, [_question(kind)(*where[index]) for index, kind in asked])
+    for (index, kind), reply in zip(asked, replies, strict=True):
+        path = paths[index]
+        if kind in _CONTAINERS:
+            nodes[index] = Node(path, _CONTAINERS[kind], "", None, count_in(reply) or 0)
+        elif isinstance(reply, bytes | bytearray):
+            nodes[index] = _scalar(path, bytes(reply))
+    for index in kinds.keys() - dict(asked).keys():
+        nodes[index] = Node(paths[index], "str", f"{texts[index]} bytes of text", texts[index])
+    await _preview(session, where, nodes)
+
+
+def _question(kind: str) -> Callable[[str, str], Command]:
+    """Return what makes the command that asks for a container's length, or for the value of anything else."""
+    if kind == "object":
+        return entries_command
+    name = "JSON.ARRLEN" if kind == "array" else "JSON.GET"
+    return lambda document, place: (name, document, place)
+
+
+async def _preview(session: Session, where: Mapping[int, tuple[str, str]], nodes: list[Node | None]) -> None:
+    """Put the items of short lists of numbers into their nodes."""
+    short = [
+        index
+        for index, node in enumerate(nodes)
+        if node is not None and node.kind == "list" and node.count and node.count <= _SHORT_LIST
+    ]
+    kinds = await _ask(session, [("JSON.TYPE", key, f"{place}[*]") for key, place in (where[index] for index in short)])
+    # Items that are not all numbers may be large: only their types were asked for.
+    plain = [
+        index
+        for index, reply in zip(short, kinds, strict=True)
+        if isinstance(reply, list) and set(_flat(reply)) <= _PLAIN
+    ]
+    replies = await _ask(session, [("JSON.GET", *where[index]) for index in plain])
+    for index, reply in zip(plain, replies, strict=True):
+        node = nodes[index]
+        if node is not None and isinstance(reply, bytes | bytearray):
+            (value,) = tree_of(bytes(reply), "") or [[]]
+            nodes[index] = node_of(node.path, value)
+
+
+def _scalar(path: Path, reply: bytes) -> Node | None:
+    try:
+        found = tree_of(reply, str(path[0]))
+    except BadData as error:
+        return Node(path, "unreadable", shown_text(str(error)))
+    return node_of(path, found[0]) if found else None
+
+
+async def keys_at(session: Session, path: Path) -> list[str] | int | None:
+    """Return the keys of the dict at `path`, the length of the list there, or None. One round trip."""
+    if not all(map(is_addressable, path[1:])):
+        return None
+    place = _place(session, path)
+    # Asked both at once, since it is not known which it is: one of the replies says that it is not such.
+    keys, length = await _ask(session, [("JSON.OBJKEYS", *place), ("JSON.ARRLEN", *place)])
+    if isinstance(keys, list) and keys and isinstance(keys[0], list):
+        return [key.decode(errors="replace") for key in keys[0]]
+    if isinstance(length, list) and length and isinstance(length[0], int):
+        return length[0]
+    return None
+
+
+async def document_texts(session: Session, names: Sequence[str]) -> list[bytes | None]:
+    """Return the text of each top-level key's document, None if it has none. One round trip."""
+    documents = [session.keys(name) for name in names]
+    replies = await _ask(session, [("JSON.GET", keys.document) for keys in documents])
+    return [_text(reply, keys) for keys, reply in zip(documents, replies, strict=True)]
+
+
+async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[bytes | None, str]]:
+    """Return the text at each path with the note of the last notice that it includes. One round trip.
+
+    The text is None if nothing is there. The note is "" if there is none, and if something was published
+    while the text was read.
+    """
+    documents = [session.keys(path[0]) for path in paths]
+    commands: list[Command] = []
+    for keys, path in zip(documents, paths, strict=True):
+        commands += [("GET", keys.last), get_command(keys, path[1:]), ("GET", keys.last)]
+    replies = await _ask(session, commands)
+    found: list[tuple[bytes | None, str]] = []
+    for keys, before, reply, after in zip(documents, replies[::3], replies[1::3], replies[2::3], strict=True):
+        # The note before and after the text: if they are equal, that update is in it, and no later one.
+        noted = before if before == after and isinstance(before, bytes | bytearray) else b""
+        found.append((_found(reply, keys), bytes(noted).decode(errors="replace")))
+    return found
+
+
+async def noted_text(session: Session, path: Path) -> tuple[bytes | None, Reply]:
+    """Return the text at a path, None if nothing is there, and the server's note of the last update that is in it.
+
+    One round trip, in which nothing is published.
+    """
+    keys = session.keys(path[0])
+    commands: list[Command] = [get_command(keys, path[1:]), ("GET", keys.last)]
+    reply, note = await session.run(Plan(commands, tuple, atomic=True))
+    return _found(reply, keys), note
+
+
+def _found(reply: Reply, keys: Keys) -> bytes | None:
+    return (_text(reply, keys) or b"")[1:-1] or None  # what a path of the server finds is in a list
+
+
+def _text(reply: Reply, keys: Keys) -> bytes | None:
+    """Return a document's text, None if there is no document that may be read."""
+    try:
+        found = checked(reply, keys, ())
+    except (MissingKey, NotAllowed, WrongKind):
+        return None
+    return bytes(found) if isinstance(found, bytes | bytearray) else None
+
+
+def _place(session: Session, path: Path) -> tuple[str, str]:
+    return session.keys(path[0]).document, to_jsonpath(path[1:])
+
+
+def _kind(reply: Reply) -> str | None:
+    return None if isinstance(reply, Exception) else type_name(reply)
+
+
+def _number(reply: Any) -> int:
+    flat = list(_flat(reply)) if isinstance(reply, list) else []
+    return flat[0] if flat and isinstance(flat[0], int) else 0
+
+
+def _flat(reply: list[Any]) -> list[Any]:
+    return [item for each in reply for item in (_flat(each) if isinstance(each, list) else [each])]

@@ -1,0 +1,200 @@
+"""Source: what the page shows, be it a live server or a recording."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from ...errors import ReemError
+from ...plan.paths import Path
+from .nodes import Node, Page
+from .trees import Frame, Leaf, leaf_of
+
+__all__ = ["NotKept", "Sample", "Series", "Source", "Status", "counted", "is_small_vector", "numbers_in", "rate_span"]
+
+
+class NotKept(ReemError):
+    """What was there at that instant is not known: it was too large for the buffer, or too long ago."""
+
+
+class Status(NamedTuple):
+    """How things are with a source.
+
+    Attributes:
+        start: From when on its past can be shown, in seconds since 1970.
+        end: The newest instant.
+        lost: Why nothing can be read at the moment; empty if all is well.
+        note: What else is to be said of the past that is shown; usually empty.
+    """
+
+    start: float
+    end: float
+    lost: str = ""
+    note: str = ""
+
+
+class Sample(NamedTuple):
+    """A value at an instant.
+
+    Attributes:
+        value: The value, arrays included; a `Preview` of an array of which no more is kept.
+        late: Seconds by which it is older than it should be, since what came after was not kept.
+        age: Seconds from when it was read to the instant asked for; None if that is not known.
+    """
+
+    value: Any
+    late: float = 0.0
+    age: float | None = None
+
+
+class Series(NamedTuple):
+    """Numbers over time.
+
+    Attributes:
+        names: What each line is: one empty text, or the indexes of a list.
+        times: Seconds since 1970.
+        lines: For each name as many numbers as there are times, None where there was no number.
+    """
+
+    names: list[str]
+    times: list[float]
+    lines: list[list[float | None]]
+
+
+class Source(Protocol):
+    """What the page can ask. An instant is in seconds since 1970; None is now, or the end of a recording.
+
+    Attributes:
+        title: Where it is from, without credentials.
+        live: It goes on; else it is a recording.
+        writable: `write` can work.
+    """
+
+    title: str
+    live: bool
+    writable: bool
+
+    async def start(self) -> None:
+        """Begin. Idempotent."""
+
+    async def close(self) -> None:
+        """End. Idempotent."""
+
+    def status(self) -> Status:
+        """Return the span of time that can be shown, and whether the source can be read."""
+
+    def snippets(self, path: Path, at: float | None) -> dict[str, str]:
+        """Return Python that reads a path, by what to call it; no passwords in it."""
+
+    async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
+        """Return what is at each path, None where nothing is."""
+
+    async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
+        """Return some of what is directly below a path, the top-level keys for the root."""
+
+    async def value(self, path: Path, at: float | None) -> Sample:
+        """Return the value at a path; raises MissingKey or NotKept."""
+
+    async def changes(self, since: float, until: float, most: int) -> list[Path]:
+        """Return which paths were published or seen to change, at most so many."""
+
+    async def differing(self, since: float, until: float, most: int) -> set[Path]:
+        """Return which paths have another value at one instant than at another, at most so many."""
+
+    async def step(self, at: float, forward: bool, path: Path) -> float | None:
+        """Return the instant of the next or previous change at, above or below a path."""
+
+    async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return how many changes at, above or below a path fall into each of `bins` equal parts of a span."""
+
+    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
+        """Return of which of `bins` equal parts of a span arrays at, above or below a path are kept.
+
+        2 stands for whole ones, 1 for previews, 0 for none. Empty if all of them are kept, or there are none.
+        """
+
+    async def series(self, path: Path, start: float, end: float) -> Series:
+        """Return the number, or list of numbers, at a path over time."""
+
+    async def search(self, text: str, at: float | None, most: int) -> list[Path]:
+        """Return paths that have `text` in them, top-level keys first."""
+
+    async def write(self, path: Path, value: Any) -> None:
+        """Publish a value."""
+
+
+# Seconds before an instant in which updates are counted.
+_RATE_SECONDS = 5.0
+_SHORTEST_RATE = 1.0
+"""Seconds: at the beginning of what is known, where there is no such span before an instant, it is the one after."""
+
+
+def rate_span(at: float, start: float, end: float, over: float = _RATE_SECONDS) -> tuple[float, float] | None:
+    """Return the span in which updates are counted for the rate at an instant; None if too little is known.
+
+    Args:
+        at: The instant.
+        start: From when on the past is known.
+        end: Until when.
+        over: How long the span is where it can be.
+    """
+    since = max(at - over, start)
+    until = max(at, since + min(over, _SHORTEST_RATE))
+    return None if until > end else (since, until)
+
+
+# Items of a list or vector up to which each is drawn as a line over time.
+_MOST_LINES = 16
+_LARGEST_VECTOR = 8 * _MOST_LINES
+"""Bytes."""
+
+
+def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
+    """Return the numbers in a history of values: one line, or one for each item of a short list or vector."""
+    pairs = [(when, _row(value)) for when, value in samples]
+    # A value may have been a number and a list by turns: as many lines as the longest has items.
+    width = max([len(row) for _, row in pairs if isinstance(row, list)], default=0)
+    times = [when for when, _ in pairs]
+    if not width:
+        lines = [[_number(value) for _, value in pairs]]
+    else:
+        rows = [row if isinstance(row, list) else [row] for _, row in pairs]
+        lines = [[_number(row[index]) if index < len(row) else None for row in rows] for index in range(width)]
+    if all(number is None for line in lines for number in line):
+        return Series([], [], [])
+    return Series([f"[{index}]" for index in range(width)] if width else [""], times, lines)
+
+
+def _row(value: Any) -> Any:
+    """Return the items of a short list or vector, None for a longer one, and anything else as it is."""
+    array = value.whole if isinstance(value, Frame) else value
+    if isinstance(array, np.ndarray):
+        return (
+            array.tolist() if array.ndim == 1 and 0 < array.size <= _MOST_LINES and array.dtype.kind in "biuf" else None
+        )
+    return (value if 0 < len(value) <= _MOST_LINES else None) if isinstance(value, list) else value
+
+
+def is_small_vector(value: Any) -> bool:
+    """Return whether an array, or what is known of one, may be so small that its items are drawn over time."""
+    return isinstance(value, Leaf | Frame | np.ndarray) and leaf_of(value).size <= _LARGEST_VECTOR
+
+
+def _number(value: Any) -> float | None:
+    if type(value) is not float and not isinstance(value, bool | int | float):
+        return None
+    number = float(value)
+    return number if math.isfinite(number) else None
+
+
+def counted(times: Iterable[float] | np.ndarray[Any, Any], start: float, end: float, bins: int) -> list[int]:
+    """Return how many of the times fall into each of `bins` equal parts of a span."""
+    given = times if isinstance(times, np.ndarray) else np.fromiter(times, np.float64)
+    inside = given[(given >= start) & (given <= end)]
+    width = max(end - start, 1e-9) / bins
+    # What happened at the very end belongs to the last part.
+    places = np.minimum(((inside - start) / width).astype(np.int64), bins - 1)
+    return [int(count) for count in np.bincount(places, minlength=bins)]

@@ -1,0 +1,133 @@
+// Time: the slider, the strip of changes above it, playing, stepping, and the clock.
+import { clockText, getJson } from "./util.js";
+
+const FRAME = 100; // ms between frames when playing
+
+export class TimeBar {
+  constructor(app) {
+    this.app = app;
+    const find = (id) => document.getElementById(id);
+    this.bar = document.querySelector(".time");
+    [this.slider, this.clock, this.play, this.live, this.speed, this.canvas] = ["slider", "clock", "play", "live", "speed", "activity"].map(find);
+    this.dragging = false;
+    this.playing = null;
+    this.counts = null;
+    if (!app.config.live) {
+      this.live.textContent = "End";
+      this.live.title = "To the end (l)";
+    }
+    this.slider.addEventListener("pointerdown", () => { this.dragging = true; this.pause(); });
+    for (const name of ["pointerup", "pointercancel", "blur"]) this.slider.addEventListener(name, () => { this.dragging = false; });
+    this.slider.addEventListener("input", () => this.onInput());
+    this.live.addEventListener("click", () => { this.pause(); app.seek(null); });
+    this.play.addEventListener("click", () => this.toggle());
+    find("back").addEventListener("click", (event) => this.step(false, event.shiftKey));
+    find("forth").addEventListener("click", (event) => this.step(true, event.shiftKey));
+    new ResizeObserver(() => this.drawActivity()).observe(this.canvas);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawActivity());
+  }
+
+  onInput() {
+    const value = Number(this.slider.value), most = Number(this.slider.max);
+    // The right end is now: dragging there is going back to live.
+    this.app.seek(value >= most - 1e-6 ? null : this.origin + value);
+  }
+
+  show() {
+    const { app } = this, { start, end } = app.span;
+    if (!this.dragging) {
+      this.origin = start;
+      this.slider.max = Math.max(end - start, 0.001).toFixed(3);
+      this.slider.value = (app.at === null ? end - start : app.at - start).toFixed(3);
+    }
+    const past = app.at !== null;
+    this.bar.classList.toggle("past", past && app.config.live);
+    document.body.classList.toggle("in-past", past || !app.config.live);
+    this.bar.classList.toggle("playing", this.playing !== null);
+    this.play.setAttribute("aria-label", this.playing ? "Pause" : "Play");
+    this.live.setAttribute("aria-pressed", String(!past));
+    this.live.disabled = !past && !app.config.live;
+    this.clock.textContent = this.texts().join("\n");
+    this.slider.setAttribute("aria-valuetext", this.texts().join(", "));
+  }
+
+  texts() {
+    const { app } = this, { start, end } = app.span, at = app.at ?? end;
+    if (!end) return ["no recording", ""];
+    const first = app.config.live && app.at === null ? clockText(at, 0) : clockText(at);
+    if (!app.config.live) return [first, `${(at - start).toFixed(2)} of ${(end - start).toFixed(2)} s`];
+    return [first, app.at === null ? `${Math.round(end - start)} s kept` : `${(at - end).toFixed(1)} s`];
+  }
+
+  toggle() {
+    if (this.playing) return this.pause();
+    const { app } = this;
+    if (app.at === null || app.at >= app.span.end) app.seek(app.span.start);
+    this.before = performance.now();
+    this.playing = setInterval(() => this.frame(), FRAME);
+    this.show();
+  }
+
+  pause() {
+    clearInterval(this.playing);
+    this.playing = null;
+    this.show();
+  }
+
+  frame() {
+    const { app } = this, now = performance.now();
+    const passed = ((now - this.before) / 1000) * Number(this.speed.value);
+    this.before = now;
+    const next = (app.at ?? app.span.end) + passed;
+    if (next < app.span.end) return app.seek(next);
+    this.pause();
+    app.seek(null);
+  }
+
+  async step(forward, ofValue) {
+    this.pause();
+    const { app } = this;
+    try {
+      const found = await getJson("step", { at: app.at ?? app.span.end, forward: forward ? 1 : 0, path: ofValue ? app.path : "" });
+      if (found.at !== null) app.seek(Math.max(found.at, app.span.start), found.at - 1e-4); // marks just this change
+      else if (forward) app.seek(null);
+      else if (app.at === null || app.at > app.span.start) app.seek(app.span.start);
+    } catch (error) {
+      app.failed(error);
+    }
+  }
+
+  async loadActivity() {
+    try {
+      this.counts = await getJson("activity", { bins: 150, path: this.app.path });
+    } catch { /* the strip is an extra: what else fails says so */ }
+    this.drawActivity();
+  }
+
+  drawActivity() {
+    const { canvas, counts } = this, box = canvas.getBoundingClientRect();
+    if (!counts || !box.width) return;
+    const ratio = window.devicePixelRatio || 1;
+    canvas.width = Math.round(box.width * ratio);
+    canvas.height = Math.round(box.height * ratio);
+    const context = canvas.getContext("2d"), style = getComputedStyle(canvas);
+    context.scale(ratio, ratio);
+    context.fillStyle = style.getPropertyValue("--accent").trim();
+    context.globalAlpha = 0.4;
+    const most = Math.max(...counts.counts, 1), { start, end } = this.app.span, span = Math.max(end - start, 0.001);
+    const each = (counts.end - counts.start) / counts.counts.length;
+    const bar = (index, up, tall) => {
+      const left = ((counts.start + index * each - start) / span) * box.width, width = Math.max((each / span) * box.width - 0.5, 1);
+      if (left + width > 0) context.fillRect(left, box.height - up - tall, width, tall);
+    };
+    const foot = counts.pictures.length ? 4 : 0; // below the bars there is a line where pictures are kept
+    counts.counts.forEach((count, index) => { if (count) bar(index, foot, 3 + (box.height - foot - 3) * Math.sqrt(count / most)); });
+    context.fillStyle = style.getPropertyValue("--mark").trim();
+    counts.pictures.forEach((kept, index) => {
+      context.globalAlpha = kept === 2 ? 1 : 0.45;
+      if (kept) bar(index, 0, 3);
+    });
+    const [whole, small] = [2, 1].map((kind) => counts.pictures.filter((kept) => kept === kind).length);
+    canvas.title = foot ? `Changes, and below them where arrays are kept: whole in ${whole} of ${counts.pictures.length} parts, small pictures in ${small}` : "Changes";
+  }
+}

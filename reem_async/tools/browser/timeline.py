@@ -1,0 +1,221 @@
+"""One top-level key over time: what it was at the beginning, and each change since."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+from ...errors import BadData
+from ...plan.paths import Path
+from ...plan.trees import MISSING, get
+from .places import Places, concerns
+from .trees import changed, strip, tree_of, weight
+
+__all__ = ["PENDING", "UNKNOWN", "Change", "Kept", "Timeline"]
+
+PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
+"""In place of a value that was announced, and is not known."""
+
+UNKNOWN: Any = type("Unknown", (), {"__repr__": lambda self: "UNKNOWN"})()
+"""What a key held before anything is known of it."""
+
+_LOOK_BACK = 2000
+"""Changes looked at to find when a path last changed."""
+
+
+class Change(NamedTuple):
+    """One change.
+
+    Attributes:
+        time: Seconds since 1970.
+        path: What changed, top-level key first.
+        value: What is there since; MISSING if it was removed, PENDING if it is not known.
+        size: About how many bytes this takes in memory.
+        answer: It is what was found where a change was announced before: not one more change.
+    """
+
+    time: float
+    path: Path
+    value: Any
+    size: int
+    answer: bool = False
+
+
+class Kept(NamedTuple):
+    """A value of the past.
+
+    Attributes:
+        value: The value; MISSING if there was none, UNKNOWN if it is not known what there was.
+        late: Seconds from this value to a later change before the instant asked for, which was not kept.
+    """
+
+    value: Any
+    late: float = 0.0
+
+
+class Timeline:
+    """What is known of one top-level key.
+
+    Args:
+        base: What it held at first: a document's text, a tree, MISSING or UNKNOWN.
+
+    Attributes:
+        changes: The changes since, oldest first.
+        text: The document's text when it was last looked at, a digest of a long one; None if it changed since.
+        base_size: About how many bytes `base` takes.
+        whole: All of the key is known, after the last change at least.
+    """
+
+    __slots__ = ("_base", "_gone", "_known", "_moves", "_pending", "_times", "base_size", "changes", "text", "whole")
+
+    def __init__(self, base: Any, text: bytes | None = None) -> None:
+        self._base = base
+        self._times: list[float] = []
+        self._gone = 0  # the number of the first change that is still here
+        self._known, self._pending = Places(), Places()
+        self._moves: list[int] = []  # where an item was removed from a list: those behind it have other paths since
+        self.base_size = len(base) if isinstance(base, bytes) else 0
+        self.changes: list[Change] = []
+        self.text = text
+        self.whole = base is not UNKNOWN
+
+    def add(self, change: Change) -> None:
+        """Append a change; times never go back."""
+        # Numbers only grow; what was folded into the base keeps its number, so indexes need not be made anew.
+        number = self._gone + len(self.changes)
+        self.text = None
+        self.changes.append(change)
+        # A clock may be set back: for searching, times must be in order.
+        self._times.append(max(change.time, self._times[-1] if self._times else 0.0))
+        (self._pending if change.value is PENDING else self._known).add(change.path, number)
+        if change.value is MISSING and isinstance(change.path[-1], int):
+            self._moves.append(number)
+        self.whole = self.whole or (len(change.path) == 1 and change.value is not PENDING)
+
+    def upto(self, at: float) -> int:
+        """Return how many of the changes are not after `at`."""
+        return bisect_right(self._times, at)
+
+    def fold(self, count: int) -> int:
+        """Make the first `count` changes part of the base; returns by how many bytes all of it became smaller."""
+        before = self.base_size + sum([change.size for change in self.changes[:count]])
+        # The state after these changes is what the past begins with from now on.
+        self._base = self._state(count)
+        del self.changes[:count], self._times[:count]
+        self._gone += count
+        self._known.drop(self._gone)
+        self._pending.drop(self._gone)
+        self._moves = [number for number in self._moves if number >= self._gone]
+        self.base_size = 0 if self._base is MISSING or self._base is UNKNOWN else weight(self._base)
+        return before - self.base_size
+
+    def strip(self) -> int:
+        """Let go of the arrays of the base; returns how many bytes that saved."""
+        before = self.base_size
+        if not isinstance(self._base, bytes) and self._base is not UNKNOWN:
+            self._base = strip(self._base)
+            self.base_size = weight(self._base)
+        return before - self.base_size
+
+    def state(self, at: float) -> Any:
+        """Return the tree at an instant, MISSING or UNKNOWN. Not to be changed."""
+        return self._state(self.upto(at))
+
+    def _state(self, count: int) -> Any:
+        """Return the tree after the first `count` changes: the last of each path, in order."""
+        end = self._gone + count
+        moved = bool(self._moves) and self._moves[0] < end
+        # Once items have moved, what a path meant before is not what it means now: nothing can be left out.
+        numbers = range(self._gone, end) if moved else sorted(self._known.lasts(end))
+        chosen = [self.changes[number - self._gone] for number in numbers]
+        # What came before the last change of the whole key does not matter.
+        whole = next((index for index in reversed(range(len(chosen))) if _replaces_all(chosen[index])), None)
+        tree = self._first() if whole is None else chosen[whole].value
+        for change in chosen[0 if whole is None else whole + 1 :]:
+            if change.value is not PENDING:
+                tree = changed(tree, change.path[1:], change.value)
+        return tree
+
+    def _first(self) -> Any:
+        if not isinstance(self._base, bytes):
+            return self._base
+        try:
+            return tree_of(self._base, "a document")
+        except BadData:
+            return UNKNOWN
+
+    def kept(self, path: Path, at: float) -> Kept:
+        """Return what was at `path`, and how old it is if the value of that very instant was not kept."""
+        count = self.upto(at)
+        state = self._state(count)
+        value = state if state is UNKNOWN else get(state, path[1:])
+        end = self._gone + count
+        waiting = [number for number in self._pending.lasts(end, path) if not self._answered(number, end, path)]
+        if not waiting:
+            return Kept(value)
+        known = max(self._known.lasts(min(waiting), path), default=-1)
+        since = self._times[max(known - self._gone, 0)]
+        return Kept(value, max(self._times[max(waiting) - self._gone] - since, 1e-3))
+
+    def _answered(self, number: int, end: int, path: Path) -> bool:
+        """Return whether all that a pending change left unknown of `path` was told later: not by one inside of it."""
+        place = max(self.changes[number - self._gone].path, path, key=len)
+        return any(self._known.last(place[:depth], end) > number for depth in range(1, len(place) + 1))
+
+    def newest(self, path: Path, at: float) -> float:
+        """Return when there was the last change of what is at `path`, known or not; 0 if none is left."""
+        end = self._gone + self.upto(at)
+        number = max([*self._known.lasts(end, path), *self._pending.lasts(end, path)], default=-1)
+        return self._times[number - self._gone] if number >= self._gone else 0.0
+
+    def moved(self, path: Path, at: float) -> float:
+        """Return since when a path is that of the same item: before, items of lists had others."""
+        if not any(isinstance(key, int) for key in path):
+            return 0.0
+        numbers = self._moves[: bisect_left(self._moves, self._gone + self.upto(at))]
+        return self._times[numbers[-1] - self._gone] if numbers else 0.0
+
+    def last(self, paths: Sequence[Path], at: float) -> dict[Path, float]:
+        """Return when each of the paths last changed before `at`, as far as that is known."""
+        found: dict[Path, float] = {}
+        wanted = set(paths)
+        count = self.upto(at)
+        for change in reversed(self.changes[max(count - _LOOK_BACK, 0) : count]):
+            hit = [path for path in wanted if concerns(change.path, path)]
+            for path in hit:
+                found[path] = change.time
+                wanted.discard(path)
+            if not wanted:
+                break
+        return found
+
+    def times(self, path: Path) -> list[float]:
+        """Return when there were changes that concern `path`, in order."""
+        numbers = self._known.of(path) + self._pending.of(path)
+        answers = {number for number in numbers if self.changes[number - self._gone].answer}
+        return sorted([self._times[number - self._gone] for number in numbers if number not in answers])
+
+    def seen(self, path: Path) -> list[float]:
+        """Return from when on there was something else to be seen at `path`, in order."""
+        return [self._times[number - self._gone] for number in self._known.of(path)]
+
+    def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
+        """Yield what was at `path`, at `start` and after each change that may have changed it."""
+        state = self.state(start)
+        value = state if state is UNKNOWN else get(state, path[1:])
+        yield start, value
+        numbers, last = self._known.of(path), self._gone + self.upto(end)
+        for number in numbers[bisect_left(numbers, self._gone + self.upto(start)) :]:
+            if number >= last:
+                return
+            change = self.changes[number - self._gone]
+            if len(change.path) <= len(path):
+                value = MISSING if change.value is MISSING else get(change.value, path[len(change.path) :])
+            else:
+                value = changed(value, change.path[len(path) :], change.value)
+            yield change.time, value
+
+
+def _replaces_all(change: Change) -> bool:
+    return len(change.path) == 1 and change.value is not PENDING

@@ -1,0 +1,196 @@
+"""Trees as the browser keeps them: plain values, with arrays in their places or only what is known of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import orjson
+
+from ...errors import BadData
+from ...plan.paths import Path
+from ...plan.placeholders import find, marked
+from ...plan.trees import MISSING, CannotApply, removed, replaced
+from ...ships.numpy import NumpyShip
+from ...store.catalog import Outline
+from .previews import preview_of
+
+__all__ = [
+    "Frame",
+    "Leaf",
+    "changed",
+    "framed",
+    "leaf_of",
+    "same",
+    "strip",
+    "thawed",
+    "tree_of",
+    "tree_of_outline",
+    "walk",
+    "weight",
+]
+
+_NUMPY = NumpyShip()
+_SCALARS = (str, int, float, bool, type(None))
+_OVERHEAD = 200
+"""Bytes of memory that an array takes besides its items."""
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """What a ship holds, whose bytes are not here.
+
+    Attributes:
+        label: The ship's label, such as "numpy".
+        summary: What it is, for people.
+        size: Bytes.
+    """
+
+    label: str
+    summary: str
+    size: int
+
+
+class Frame:
+    """An array or bytes of the past, in the place of a value in a tree: the content is let go of as room runs short.
+
+    Attributes:
+        leaf: What it is.
+        whole: The value, None once there is no room for it.
+        preview: A small picture of it; None if there is none.
+        time: Since when it is known, in seconds since 1970.
+    """
+
+    # Not a dataclass: two frames are the same only if they are one, and there are thousands.
+    __slots__ = ("leaf", "preview", "time", "whole")
+
+    def __init__(self, whole: np.ndarray[Any, Any] | bytes) -> None:
+        self.leaf = leaf_of(whole)
+        self.whole: np.ndarray[Any, Any] | bytes | None = whole
+        self.preview = preview_of(whole) if isinstance(whole, np.ndarray) else None
+        self.time = 0.0
+
+    @property
+    def size(self) -> int:
+        """Return about how many bytes the content takes."""
+        small = len(self.preview.file) + _OVERHEAD if self.preview else 0
+        return small + (self.leaf.size + _OVERHEAD if self.whole is not None else 0)
+
+
+def framed(tree: Any) -> Any:
+    """Return `tree` with a `Frame` in the place of each array and of bytes; it takes milliseconds for a picture."""
+    if isinstance(tree, dict):
+        return {key: framed(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [framed(item) for item in tree]
+    return Frame(tree) if isinstance(tree, np.ndarray | bytes) else tree
+
+
+def thawed(tree: Any) -> Any:
+    """Return `tree` with the content of each `Frame` in its place, or what is to be said of it."""
+    if isinstance(tree, dict):
+        return {key: thawed(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [thawed(item) for item in tree]
+    if isinstance(tree, Frame):
+        return tree.leaf if tree.whole is None else tree.whole
+    return tree
+
+
+def leaf_of(value: Any) -> Leaf:
+    """Return what is to be said of a value that a ship carries."""
+    if isinstance(value, Leaf):
+        return value
+    if isinstance(value, Frame):
+        return value.leaf
+    if isinstance(value, np.ndarray):
+        size, summary = _NUMPY.describe(value)
+        return Leaf("numpy", summary, size)
+    if isinstance(value, bytes):
+        return Leaf("bytes", "bytes", len(value))
+    return Leaf(type(value).__name__, "", 0)
+
+
+def tree_of(text: bytes, name: str) -> Any:
+    """Return the tree in a document's text, a `Leaf` in the place of each placeholder.
+
+    Raises:
+        BadData: It is no JSON, or holds something that looks like a placeholder and is none.
+    """
+    try:
+        holder = [orjson.loads(text)]
+    except orjson.JSONDecodeError as error:  # nested too deep, or not from RedisJSON
+        raise BadData(f"{name}: what the server sent is not JSON: {error}") from None
+    for slot in find(holder, name) if marked(text) else ():
+        it = slot.placeholder
+        slot.container[slot.key] = Leaf(it.label, it.summary, it.size)
+    return holder[0]
+
+
+def tree_of_outline(it: Outline) -> Any:
+    """Return the tree that an outline describes."""
+    if it.kind == "dict":
+        return {str(child.path[-1]): tree_of_outline(child) for child in it.children}
+    if it.kind == "list":
+        return [tree_of_outline(child) for child in it.children]
+    if it.kind in ("str", "int", "float", "bool", "NoneType"):
+        return it.value
+    return Leaf(it.kind, it.summary, it.size)
+
+
+def changed(tree: Any, path: Path, value: Any) -> Any:
+    """Return `tree` with `value` at `path` (MISSING removes what is there); unchanged where that does not fit."""
+    try:
+        return removed(tree, path) if value is MISSING else replaced(tree, path, value)
+    except CannotApply:
+        return tree
+
+
+def walk(tree: Any, path: Path) -> Iterator[tuple[Path, Any]]:
+    """Yield every path in `tree`, which is at `path`, and what is there; parents first."""
+    # No recursion: documents may be nested a hundred deep, and a generator for each level is slow.
+    stack = [(path, tree)]
+    while stack:
+        where, it = stack.pop()
+        yield where, it
+        if isinstance(it, dict):
+            stack.extend([((*where, key), item) for key, item in reversed(it.items())])
+        elif isinstance(it, list):
+            stack.extend([((*where, key), it[key]) for key in reversed(range(len(it)))])
+
+
+def same(one: Any, other: Any) -> bool:
+    """Return whether two trees are equal, as far as is known: of arrays, that they are alike."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return one.keys() == other.keys() and all(same(item, other[key]) for key, item in one.items())
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(same, one, other))
+    # Types too: 1, 1.0 and True are equal in Python, but not the same value for a reader.
+    if isinstance(one, _SCALARS) or isinstance(other, _SCALARS):
+        return type(one) is type(other) and bool(one == other)
+    return leaf_of(one) == leaf_of(other)
+
+
+def strip(tree: Any) -> Any:
+    """Return `tree` with a `Leaf` in the place of everything that a ship carries, but what a `Frame` holds."""
+    if isinstance(tree, dict):
+        return {key: strip(item) for key, item in tree.items()}
+    if isinstance(tree, list):
+        return [strip(item) for item in tree]
+    return tree if isinstance(tree, (Frame, *_SCALARS)) or tree is MISSING else leaf_of(tree)
+
+
+def weight(tree: Any) -> int:
+    """Return about how many bytes of memory a tree takes, without what is in its frames."""
+    total = 0
+    for _, it in walk(tree, ()):
+        if isinstance(it, np.ndarray):
+            total += it.nbytes + _OVERHEAD
+        elif isinstance(it, bytes | str):
+            # What objects of Python take besides their content, about.
+            total += len(it) + 80
+        else:
+            total += 100
+    return total

@@ -1,0 +1,64 @@
+"""The command `reem`. Each subcommand is in a module of its own, imported when it is called."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import typer
+
+__all__ = ["build", "main"]
+
+
+def main() -> None:
+    """Run the command line; exit code 1 and the remedy if what it needs is not installed."""
+    # Before anything is printed: a shell may have closed a stream (`>&-`), and print would fail later.
+    _mend_streams()
+    try:
+        app = build()
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package not in ("typer", "rich"):
+            raise
+        sys.stderr.write(
+            f"The command `reem` needs {package}: pip install 'reem[server]', or 'reem[tools]' to do without a server\n"
+        )
+        raise SystemExit(1) from None
+    app(prog_name="reem")
+
+
+def _mend_streams() -> None:
+    """Have all three streams, whatever the shell has closed; show characters that a terminal does not know as codes."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            stream = open(os.devnull, mode, encoding="utf-8")  # noqa: SIM115 - until the program ends
+            atexit.register(stream.close)
+            setattr(sys, name, stream)
+        elif mode == "w":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def build() -> typer.Typer:
+    """The command line, put together here so that nothing is imported before it is known to be there."""
+    import rich  # noqa: F401 - needed only later, by the command; said at once if it is missing
+    import typer
+
+    from reem_async.tools.cli import lazy, version
+    from reem_async.tools.cli.commands import COMMANDS
+
+    # Pretty tracebacks are off: they show the values of variables, and one is a password.
+    app = typer.Typer(
+        cls=lazy.group_of(COMMANDS),
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(version.root)
+    return app

@@ -1,0 +1,145 @@
+"""`reem browse`: a page that shows what a server holds, or what a recording says it held."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import webbrowser
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Url, existing
+from reem_async.tools.cli.running import USAGE, Refused, guarded, interface_to
+
+if TYPE_CHECKING:
+    from reem_async.tools.browser import Source
+
+__all__ = ["browse"]
+
+_PACKAGES = {"starlette": "starlette", "uvicorn": "uvicorn", "PIL": "pillow"}
+_MEGABYTE = 1 << 20
+
+
+def browse(
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    log: Annotated[
+        Path | None,
+        typer.Option(
+            "--log", metavar="FILE", callback=existing, dir_okay=False, help="Show this recording in place of a server."
+        ),
+    ] = None,
+    host: Annotated[
+        str,
+        typer.Option(metavar="ADDRESS", help="Where to listen; with any but this machine's own, a token is needed."),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the page; 0 takes a free one.")] = 8080,
+    buffer: Annotated[
+        float, typer.Option(min=1, max=86400, metavar="SECONDS", help="How far back the slider reaches, live.")
+    ] = 60,
+    memory: Annotated[
+        int, typer.Option(min=8, max=65536, metavar="MB", help="How much memory the past may take, live.")
+    ] = 128,
+    allow_write: Annotated[bool, typer.Option("--allow-write", help="Let the page change values.")] = False,
+    open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a web browser.")] = True,
+) -> None:
+    """Show all keys on a page in the web browser, with a slider for the time.
+
+    The page is updated as things change. The slider goes back through the last seconds, or through a recording.
+    Arrays are shown as images, lines, tables and histograms. It can only look, unless --allow-write is given.
+
+    What programs publish is kept for the slider, its arrays at up to 8 MB a second, older ones as small pictures. What
+    they only store is looked at about twice a second, arrays as often as 1 MB a second allows.
+
+    Examples:
+      reem browse
+      reem browse --log run.mcap
+      reem browse --buffer 300 --memory 512
+      reem browse --host 0.0.0.0 --no-open     from another machine: open the address it prints, token and all
+    """
+
+    def work() -> int | None:
+        _check_packages(log)
+        if log is not None and allow_write:
+            raise Refused("a recording is not changed: leave out --allow-write, or --log", USAGE)
+        asyncio.run(_serve(_source(url, namespace, log, buffer, memory), host, port, allow_write, open_))
+        return None
+
+    code = guarded("browse", work, live=True)
+    if code:
+        raise typer.Exit(code)
+
+
+def _check_packages(log: Path | None) -> None:
+    # Looked for before anything is imported, so that all that is missing is named at once.
+    needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
+    absent = [name for module, name in needed.items() if find_spec(module) is None]
+    if absent:
+        raise Refused(f"needs {', '.join(absent)}: pip install 'reem[tools]'")
+
+
+def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int) -> Source:
+    """Return what to show. Made outside of the event loop, in which it is used."""
+    if log is not None:
+        from reem_async.tools.browser.logsource import LogSource
+
+        return LogSource(log)
+    from reem_async.tools.browser import LiveSource
+
+    interface = interface_to(url, namespace)
+    return LiveSource(interface, buffer, memory * _MEGABYTE)
+
+
+async def _serve(source: Source, host: str, port: int, allow_write: bool, open_: bool) -> None:
+    from reem_async.tools.browser import PageServer, create_app, listen
+    from reem_async.tools.browser.guard import LOOPBACK, is_loopback, new_token, own_names
+
+    # Reachable from this machine only: then the name in the request is checked, and no token is needed. From others
+    # a token is, and the name may be any of this machine's.
+    alone = is_loopback(host)
+    token = None if alone else new_token()
+    hosts: Any = LOOPBACK if alone else own_names() | {host.lower()}
+    app = create_app(source, allow_write=allow_write, token=token, hosts=hosts, any_address=not alone)
+    # Before the source starts: that the port is taken is said at once, whatever the server does.
+    sock = listen(host, port)
+    try:
+        await source.start()
+        address = _address(host, sock.getsockname()[1], token)
+        _tell(source, address, alone, allow_write)
+        if open_ and _has_screen():
+            webbrowser.open(address)
+        await PageServer(app, sock).run_until_stopped()
+    finally:
+        sock.close()
+        await source.close()
+
+
+def _has_screen() -> bool:
+    """Return whether a browser would open in a window, and not in this terminal."""
+    # webbrowser would start a text browser in this very terminal.
+    return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _address(host: str, port: int, token: str | None) -> str:
+    from reem_async.tools.browser.guard import own_address
+
+    if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
+        host = own_address(host)
+    name = f"[{host}]" if ":" in host else host
+    return f"http://{name}:{port}/" + (f"?token={token}" if token else "")
+
+
+def _tell(source: Source, address: str, alone: bool, allow_write: bool) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console()
+    console.print(Text.assemble(("REEM's browser is up", "bold green"), f", showing {source.title}"), soft_wrap=True)
+    who = "programs of this machine" if alone else "whoever has this address: it has a token in it"
+    may = "look and write" if allow_write and source.writable else "look"
+    for label, value in (("address", address), ("open to", who), ("they may", may), ("to stop", "Ctrl-C")):
+        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value), soft_wrap=True)

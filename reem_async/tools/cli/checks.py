@@ -1,0 +1,246 @@
+"""What `reem doctor` looks at on the server: facts in, findings out, nothing sent from here."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Iterator, Mapping, Sequence
+from enum import StrEnum
+from statistics import median
+from typing import NamedTuple
+
+from reem_async.tools.cli.output import size_text
+
+__all__ = [
+    "FAIL", "OK", "UNKNOWN", "WARN", "Facts", "Finding", "clock", "eviction", "is_loopback", "json_support", "latency",
+    "memory", "not_allowed", "old_data", "persistence", "subscribers", "version", "who",
+]  # fmt: skip
+
+
+class Status(StrEnum):
+    """How one check went, worst last but for what could not be looked at."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+    UNKNOWN = "unknown"
+
+
+OK, WARN, FAIL, UNKNOWN = Status
+
+# Seconds, of the median. A wired network takes well under a millisecond, a good wireless one 2 to 4.
+_SLOW_READ = 0.005
+# Seconds, for 1 MB: a network of 100 Mbit/s takes 80 ms.
+_SLOW_ARRAY = 0.1
+# Seconds: less does not show in time stamps of a camera at 30 Hz.
+_CLOCK_APART = 0.01
+# Part of the memory.
+_NEARLY_FULL = 0.9
+# Keys that are named before the rest is counted.
+_NAMED = 3
+_SMALL_BUFFER = 8_000_000
+"""Bytes a subscriber should be able to owe: an image of notices while it is busy for a moment."""
+
+
+class Finding(NamedTuple):
+    """One line of the report.
+
+    Attributes:
+        check: What was looked at.
+        status: How it went; unknown if it could not be looked at.
+        message: What was found.
+        remedy: What to do; empty if there is nothing.
+    """
+
+    check: str
+    status: Status
+    message: str
+    remedy: str = ""
+
+
+class Facts(NamedTuple):
+    """What the server said of itself.
+
+    Attributes:
+        info: The reply to INFO; None if this user may not ask.
+        config: The reply to CONFIG GET; None if this user may not ask.
+    """
+
+    info: Mapping[str, str] | None
+    config: Mapping[str, str] | None
+
+    def number(self, name: str) -> int:
+        """Return a number from INFO; 0 if it is not there."""
+        text = (self.info or {}).get(name, "")
+        return int(text) if text.isascii() and text.isdigit() else 0
+
+
+def not_allowed(check: str, command: str) -> Finding:
+    """Return the finding that nothing could be found out."""
+    rule = "+" + command.lower().replace(" ", "|")
+    return Finding(check, UNKNOWN, f"this user may not run {command}", f"ask as an administrator, or allow {rule}")
+
+
+def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
+    """Which server it is; `sharded` if all nodes of a cluster are asked, and not this one alone."""
+    if facts.info is None:
+        return Finding("server", OK, f"answers at {address}; this user may not ask for its version")
+    name = facts.info.get("server_name", "redis")
+    number = facts.info.get(f"{name}_version") or facts.info.get("redis_version", "?")
+    hours = facts.number("uptime_in_seconds") / 3600
+    # Valkey tells its own version beside that of the Redis that it stands in for.
+    mode = facts.info.get("redis_mode") or facts.info.get("server_mode", "standalone")
+    text = f"{name} {number} at {address}, {mode}, up for {hours:.1f} hours"
+    if mode == "cluster" and not sharded:
+        return Finding("server", WARN, text, f"this is one node of several; reach all: redis+cluster://{address}")
+    return Finding("server", OK, text)
+
+
+def json_support(facts: Facts, *, plain: bool) -> Finding:
+    """Whether there is RedisJSON, and which; a `plain` server has none."""
+    if plain:
+        return Finding(
+            "json", OK, "none: documents are kept as text, and a change below their top takes two round trips"
+        )
+    for line in (facts.info or {}).get("module", "").split("\n"):
+        # One line for each module: name=ReJSON,ver=20803,...
+        fields = dict(pair.partition("=")[::2] for pair in line.split(","))
+        if fields.get("name") == "ReJSON" and fields.get("ver", "").isdigit():
+            number = int(fields["ver"])
+            return Finding("json", OK, f"RedisJSON {number // 10000}.{number // 100 % 100}.{number % 100}")
+    return Finding("json", OK, "RedisJSON answers; its version is not told")
+
+
+def who(
+    user: str | None, *, address: str, loopback: bool, by_socket: bool, tls: bool, password: bool
+) -> Iterator[Finding]:
+    """As whom, which way, and how safely, this program is connected."""
+    name = f"as user {user}" if user else "as a user whose name it may not ask"
+    secrets = f"{'with' if password else 'without'} password, {'with' if tls else 'without'} TLS"
+    text = f"connected {name}, {secrets}"
+    if loopback:
+        way = "reached through its Unix socket" if by_socket else "reached by TCP"
+        yield Finding("access", OK, f"{text}; {address} is this machine, {way}")
+        return
+    if not password:
+        yield Finding("access", WARN, f"{text}; {address} is another machine", "set a password on the server")
+    if not tls:
+        remedy = "use rediss:// with TLS on the server, unless the network is the robot's own"
+        yield Finding("access", WARN, f"{text}: what is sent to {address} can be read on the way", remedy)
+    elif password:
+        yield Finding("access", OK, text)
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether a host name means this machine."""
+    try:
+        found = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
+    except OSError:
+        return False
+    return all(ipaddress.ip_address(str(address).partition("%")[0]).is_loopback for address in found)
+
+
+def latency(check: str, what: str, seconds: Sequence[float], *, large: bool) -> Finding:
+    """How long round trips take."""
+    ranked = sorted(seconds)
+    # With fewer than a hundred readings the 99th percentile is the slowest one.
+    middle, late = median(ranked), ranked[min(len(ranked) * 99 // 100, len(ranked) - 1)]
+    text = f"{what}: median {middle * 1000:.2f} ms, p99 {late * 1000:.2f} ms, of {len(ranked)}"
+    if middle > (_SLOW_ARRAY if large else _SLOW_READ):
+        return Finding(check, WARN, text, "use a cable, or run the server on the machine that moves the large values")
+    return Finding(check, OK, text)
+
+
+def clock(ahead: float, within: float) -> Finding:
+    """How far the server's clock is from this machine's."""
+    text = f"the server's clock is {abs(ahead) * 1000:.1f} ms {'ahead' if ahead > 0 else 'behind'}"
+    text += f", give or take {within * 1000:.1f} ms"
+    # Only what cannot be the uncertainty of the measurement itself.
+    if abs(ahead) - within > _CLOCK_APART:
+        remedy = "set both by NTP or chrony; until then `reem delay` and time stamps are off by as much"
+        return Finding("clock", WARN, text, remedy)
+    return Finding("clock", OK, text)
+
+
+def memory(facts: Facts) -> Finding:
+    """How full the server is."""
+    if facts.info is None:
+        return not_allowed("memory", "INFO")
+    used, limit = facts.number("used_memory"), facts.number("maxmemory")
+    machine = facts.number("total_system_memory")
+    bound = limit or machine
+    text = f"{size_text(used)} used"
+    if limit:
+        text += f" of {size_text(limit)} (maxmemory)"
+    elif machine:
+        text += f", no maxmemory; the machine has {size_text(machine)}"
+    if bound and used > _NEARLY_FULL * bound:
+        return Finding("memory", WARN, text, "delete keys (`reem ls` shows sizes), or raise maxmemory")
+    return Finding("memory", OK, text)
+
+
+def eviction(facts: Facts) -> Finding:
+    """Whether the server may throw keys away."""
+    if facts.info is None:
+        return not_allowed("eviction", "INFO")
+    policy = facts.info.get("maxmemory_policy", "noeviction")
+    evicted = facts.number("evicted_keys")
+    remedy = "CONFIG SET maxmemory-policy noeviction, as an administrator"
+    # What is gone is worse than what may go.
+    if evicted:
+        return Finding("eviction", FAIL, f"{evicted} keys were thrown away since the server started ({policy})", remedy)
+    if policy != "noeviction" and facts.number("maxmemory"):
+        return Finding("eviction", WARN, f"{policy}: keys are thrown away when memory is full", remedy)
+    return Finding("eviction", OK, f"none ({policy}, maxmemory {facts.number('maxmemory') or 'not set'})")
+
+
+def subscribers(facts: Facts) -> Finding:
+    """How far a subscriber may fall behind before the server hangs up."""
+    if facts.config is None:
+        return not_allowed("subscribers", "CONFIG GET")
+    # All classes in one line: normal 0 0 0 replica 268435456 67108864 60 pubsub 33554432 8388608 60.
+    words = facts.config.get("client-output-buffer-limit", "").split()
+    if "pubsub" not in words or len(words) < words.index("pubsub") + 4:
+        return Finding("subscribers", UNKNOWN, "the server does not tell client-output-buffer-limit")
+    start = words.index("pubsub") + 1
+    hard, soft, seconds = map(int, words[start : start + 3])
+    if not hard and not soft:
+        return Finding("subscribers", OK, "may fall behind without limit")
+    text = f"are disconnected when they owe {size_text(hard)}" if hard else "are disconnected when they owe"
+    text += f", or {size_text(soft)} for {seconds} s" if soft else ""
+    closed = facts.number("client_output_buffer_limit_disconnections")
+    if closed:
+        return Finding("subscribers", WARN, f"{closed} clients were disconnected as too slow; they {text}", _LARGER)
+    if 0 < hard < _SMALL_BUFFER:
+        return Finding("subscribers", WARN, text, _LARGER)
+    return Finding("subscribers", OK, text)
+
+
+_LARGER = "CONFIG SET client-output-buffer-limit 'pubsub 33554432 8388608 60' or more, as an administrator"
+
+
+def old_data(names: Sequence[str]) -> Finding:
+    """Which keys are of versions before 1.0, and would be read wrong."""
+    if not names:
+        return Finding("old data", OK, "no key was written by REEM 0.1 or older")
+    some = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    keys = "1 key was" if len(names) == 1 else f"{len(names)} keys were"
+    remedy = "`reem migrate` shows what it would convert, `reem migrate --yes` converts it in place"
+    return Finding("old data", FAIL, f"{keys} written by REEM 0.1 or older and cannot be read: {some}", remedy)
+
+
+def persistence(facts: Facts) -> Finding:
+    """Whether the data outlives the server."""
+    if facts.info is None:
+        return not_allowed("persistence", "INFO")
+    if facts.info.get("rdb_last_bgsave_status", "ok") != "ok" or facts.info.get("aof_last_write_status", "ok") != "ok":
+        remedy = "see the server's log; most often the disk is full or the directory is not writable"
+        return Finding("persistence", FAIL, "the last save failed, and writes may be refused", remedy)
+    if facts.number("aof_enabled"):
+        return Finding("persistence", OK, "each write is appended to a file")
+    if facts.config is None:
+        return not_allowed("persistence", "CONFIG GET")
+    if rules := facts.config.get("save", ""):
+        return Finding("persistence", OK, f"snapshots to disk (save {rules})")
+    remedy = "if it must outlive the server: `reem up --directory DIR`, or appendonly yes"
+    return Finding("persistence", WARN, "none: what is stored is gone when the server stops", remedy)

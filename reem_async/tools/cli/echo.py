@@ -1,0 +1,199 @@
+"""`reem echo`: changes as they are published or stored."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.tools.cli.following import Ending, follow
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
+from reem_async.tools.cli.output import (
+    clean,
+    cut,
+    emit,
+    emit_json,
+    is_terminal,
+    json_text,
+    size_text,
+    styled,
+    typed,
+    width,
+)
+from reem_async.tools.cli.running import run
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.plan.patterns import Pattern
+    from reem_async.pubsub.monitor import Event
+
+__all__ = ["echo"]
+
+
+def echo(
+    patterns: Patterns = None,
+    fetch: Annotated[
+        bool,
+        typer.Option("--fetch", help="Fetch values too large for the notice: what is there now, which may be newer."),
+    ] = False,
+    full: Annotated[bool, typer.Option("--full", help="Do not cut lines to the width of the terminal.")] = False,
+    count: Count = None,
+    timeout: Timeout = None,
+    as_json: AsJson = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Print changes as they are published or stored, until Ctrl-C (exit code 0).
+
+    Every update that is published, with the time of the publisher's clock. What is only stored, by whomever, is marked
+    so and printed as what it led to, with the time at which it was found ("stored" in JSON): several changes in a
+    moment may be one line. Of a path that is asked for, only what is there is printed. Values over 16 KB do not
+    travel with the notice: their size is printed; of stored arrays, type and shape. Updates that were lost or
+    skipped are told in a line that begins with #; in JSON they are "missed", "gap" and "skipped".
+
+    Examples:
+        reem echo
+        reem echo processed_info 'robot.*.battery'
+        reem echo set_point --count 1 --timeout 5 --json | jq .value
+        reem echo raw_image --fetch
+    """
+
+    async def work(interface: RedisInterface) -> int:
+        from reem_async.errors import MissingKey
+        from reem_async.plan.patterns import parse_pattern
+        from reem_async.pubsub.monitor import ANNOUNCED
+        from reem_async.store.reader import DocumentReader
+
+        skipped = 0
+
+        asked = [parse_pattern(text) for text in patterns or ()]
+
+        async def take(event: Event, ending: Ending) -> None:
+            nonlocal skipped
+            event = _narrowed(event, asked)
+            value, known = event.value, event.value is not ANNOUNCED
+            # Large values are announced without their bytes: what is read here may be newer than the update.
+            if fetch and not known:
+                try:
+                    value, known = await DocumentReader(interface.session, event.name).read(event.path[1:]), True
+                except MissingKey:
+                    value, known = "gone already", True
+            # How many were skipped since the last line, of a counter that only grows.
+            new, skipped = ending.skipped - skipped, ending.skipped
+            if as_json:
+                emit_json(_for_programs(event, value if known else None, known, new))
+                return
+            for line in _for_people(event, value, known, new, cut_lines=is_terminal() and not full):
+                emit(line)
+            sys.stdout.flush()
+
+        return (await follow(interface, patterns or (), take, count=count, seconds=timeout, stored=True)).tell()
+
+    run("echo", work, url, namespace, live=True)
+
+
+def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
+    """Return what an update of a whole dict says of the one place in it that was asked for."""
+    import dataclasses
+
+    from reem_async.plan.patterns import spelled_out
+    from reem_async.plan.trees import MISSING, get
+    from reem_async.pubsub.monitor import ANNOUNCED
+
+    meant = [pattern for pattern in asked if pattern.concerns(event.path)]
+    if len(meant) != 1 or event.value is ANNOUNCED:
+        return event
+    place = (event.path[0], *spelled_out(meant[0].rest))
+    if len(place) <= len(event.path):
+        return event
+    value = get(event.value, place[len(event.path) :])
+    gone = event.deleted or value is MISSING
+    return dataclasses.replace(event, path=place, value=None if gone else value, deleted=gone)
+
+
+def _for_programs(event: Event, value: Any, known: bool, skipped: int) -> dict[str, Any]:
+    entry = {
+        "path": typed(event.path),
+        "time": event.time,
+        "received": event.received,
+        "size": event.size,
+        "publisher": event.publisher,
+        "sequence": event.sequence,
+    }
+    if event.deleted:
+        entry["deleted"] = True
+    elif known:
+        entry["value"] = _each_leaf(value, _unfetched_as_text) if event.stored else value
+    if event.stored:
+        entry["stored"] = True
+    return entry | {"missed": event.missed, "gap": event.gap, "skipped": skipped}
+
+
+def _for_people(event: Event, value: Any, known: bool, skipped: int, *, cut_lines: bool) -> list[str]:
+    lines = []
+    if event.missed:
+        # In the place where they were lost, so that the order of what is printed is the order of what happened.
+        lines.append(styled(f"# {event.missed} updates were lost before the next line", "yellow"))
+    elif event.gap:
+        lines.append(styled("# a gap: the connection broke, or an update was unreadable", "yellow"))
+    if skipped:
+        lines.append(styled(f"# {skipped} updates were skipped: they came faster than they could be shown", "yellow"))
+    moment, path = _moment(event.time), typed(event.path)
+    if event.deleted:
+        what = "deleted"
+    elif known:
+        what = _one_line(value)
+    else:
+        what = f"<{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
+    # The path has at most half of the line, the value the rest.
+    if cut_lines:
+        room = width() - len(moment) - 4 - 10 * event.stored
+        path = cut(path, max(room // 2, 8))
+        what = cut(what, max(room - len(path), 16))
+    colour = "red" if event.deleted else "" if known else "cyan"
+    mark = f"  {styled('(stored)', 'dim')}" if event.stored else ""
+    lines.append(f"{styled(moment, 'dim')}  {styled(path, 'bold')}  {styled(what, colour) if colour else what}{mark}")
+    return lines
+
+
+def _moment(time: float) -> str:
+    try:
+        return datetime.fromtimestamp(time).strftime("%H:%M:%S.%f")
+    except (ValueError, OverflowError, OSError):  # a publisher's clock may be set to anything
+        return f"{time:g} s"
+
+
+def _one_line(value: Any) -> str:
+    """Return a value in one line; arrays as their type and first and last numbers."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray):
+        body = np.array2string(value, threshold=12, edgeitems=3, max_line_width=10_000, separator=" ")
+        return clean(f"{value.dtype}[{','.join(map(str, value.shape))}] {' '.join(body.split())}")
+    return json_text(_each_leaf(value, _summarised))
+
+
+def _each_leaf(value: Any, change: Callable[[Any], Any]) -> Any:
+    """Return a tree with what a function makes of each leaf."""
+    if isinstance(value, dict):
+        return {key: _each_leaf(item, change) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_each_leaf(item, change) for item in value]
+    return change(value)
+
+
+def _unfetched_as_text(leaf: Any) -> Any:
+    """Return a text in place of what was left at the server."""
+    from reem_async.plan.placeholders import Unfetched
+
+    return f"<{leaf.summary or leaf.label}, {size_text(leaf.size)}>" if isinstance(leaf, Unfetched) else leaf
+
+
+def _summarised(leaf: Any) -> Any:
+    """Return a text in place of an array, of bytes, or of what was left at the server."""
+    if isinstance(leaf, bytes):
+        return f"<bytes, {size_text(len(leaf))}>"
+    return _one_line(leaf) if hasattr(leaf, "dtype") else _unfetched_as_text(leaf)

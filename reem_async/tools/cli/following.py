@@ -1,0 +1,173 @@
+"""Live commands: taking the updates of some patterns until Ctrl-C, a count or a time."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from reem_async.tools.cli.output import note
+from reem_async.tools.cli.running import TIMED_OUT
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.pubsub.monitor import Event, Monitor
+    from reem_async.pubsub.pattern_watch import PatternWatch
+
+__all__ = ["Ending", "follow"]
+
+_WAITING = 100_000
+"""Updates that wait for a slow terminal before the oldest are skipped."""
+
+_NEVER = float("inf")
+
+
+@dataclass(slots=True)
+class Ending:
+    """What there was to hear, for the last line.
+
+    Attributes:
+        taken: How many updates were taken.
+        lost: How many were lost on the way: their publishers counted them.
+        skipped: How many came faster than they were taken, and were dropped here.
+        gaps: How often the connection broke or a message was unreadable.
+        seconds: How long it went on.
+        paths: Where the updates were.
+        timed_out: The time was over before there was enough.
+        stored: What is only stored is heard, too.
+    """
+
+    taken: int = 0
+    lost: int = 0
+    skipped: int = 0
+    gaps: int = 0
+    seconds: float = 0.0
+    paths: set[str] = field(default_factory=set)
+    timed_out: bool = False
+    stored: bool = False
+
+    def tell(self) -> int:
+        """Say in one line how it went; return the exit code."""
+        where = f"{len(self.paths)} path{'' if len(self.paths) == 1 else 's'}"
+        words = [f"{self.taken} updates of {where} in {self.seconds:.1f} s", f"{self.lost} lost"]
+        if self.gaps:
+            words.append(f"{self.gaps} gaps of unknown length")
+        if self.skipped:
+            words.append(f"{self.skipped} skipped here, since they came too fast")
+        if not self.taken and not self.stored:
+            words.append("only what a PublishSpace writes is heard, not what a KeyValueStore writes")
+        if sys.stderr.isatty():
+            sys.stderr.write("\r")  # over the ^C that the terminal has shown
+        note(", ".join(words))
+        return TIMED_OUT if self.timed_out else 0
+
+
+async def follow(
+    interface: RedisInterface,
+    patterns: Sequence[str],
+    take: Callable[[Event, Ending], Awaitable[None] | None],
+    *,
+    count: int | None = None,
+    seconds: float | None = None,
+    every: float | None = None,
+    tick: Callable[[Ending], None] = lambda _: None,
+    stored: bool = False,
+) -> Ending:
+    """Hand each update to `take` until there were `count`, `seconds` are over, or Ctrl-C.
+
+    Args:
+        interface: The server.
+        patterns: Which paths; all if there is none.
+        take: Is called, and awaited if it returns something to await.
+        count: How many to take, None for no end.
+        seconds: How long, None for no end.
+        every: Seconds between calls of `tick`; None to never call it.
+        tick: Shows what there is so far.
+        stored: Also hand on what is only stored; arrays of over 16 KB are not fetched for that.
+    """
+    from reem_async.concurrency.queues import Last
+    from reem_async.pubsub.monitor import Monitor
+
+    ending, start = Ending(), time.monotonic()
+    end = start + seconds if seconds else _NEVER
+    next_tick = start + every if every else _NEVER
+    # A bounded queue: a terminal that is slower than the updates skips the oldest, and the last line says how many.
+    monitor = Monitor(interface, patterns or ("*",), Last(_WAITING))
+    ending.stored = stored
+    try:
+        async with monitor, _stores(interface, patterns, monitor) if stored else contextlib.nullcontext():
+            while ending.taken != count:
+                # Wakes for the next report too, since a table must age while nothing is published.
+                event = await _next(monitor, min(end, next_tick))
+                ending.seconds, ending.skipped = time.monotonic() - start, monitor.dropped
+                if event is not None:
+                    _enter(event, ending)
+                    result = take(event, ending)
+                    if result is not None:
+                        await result
+                now = time.monotonic()
+                if end > now >= next_tick and every:  # at the end the caller shows all there is
+                    tick(ending)
+                    # Reports that a slow terminal has missed are not made up for.
+                    next_tick = max(next_tick + every, time.monotonic())
+                if now >= end and ending.taken != count:
+                    ending.timed_out = count is not None or not ending.taken
+                    break
+    except asyncio.CancelledError:  # Ctrl-C, which is how such a command is ended
+        pass
+    ending.seconds = time.monotonic() - start
+    return ending
+
+
+@contextlib.asynccontextmanager
+async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: Monitor) -> AsyncIterator[None]:
+    """Have what is only stored come out of a monitor, too."""
+    from reem_async.concurrency.queues import Last
+    from reem_async.errors import ReemError
+    from reem_async.plan.notices import LARGEST_INLINE
+    from reem_async.pubsub.pattern_watch import PatternWatch
+
+    watch = PatternWatch(interface.session, patterns, Last(_WAITING), largest=LARGEST_INLINE)
+    try:
+        await watch.listen()
+    except ReemError as error:
+        note(f"what is only stored is not shown: {error}")
+    task = asyncio.ensure_future(_hand_on(watch, monitor))
+    try:
+        yield
+    finally:
+        task.cancel()
+        await watch.close()
+
+
+async def _hand_on(watch: PatternWatch, monitor: Monitor) -> None:
+    from reem_async.plan.paths import parse
+    from reem_async.pubsub.monitor import Event
+
+    async for update in watch:
+        if update.origin == "stored":
+            now = time.time()
+            monitor.queue.put(Event(parse(update.path), update.value, update.deleted, 0, now, now, "", 0, stored=True))
+
+
+def _enter(event: Event, ending: Ending) -> None:
+    ending.taken += 1
+    ending.lost += event.missed
+    # A loss whose number is known is counted as lost, not as a gap as well.
+    ending.gaps += event.gap and not event.missed
+    ending.paths.add(event.shown)
+
+
+async def _next(monitor: Monitor, when: float) -> Event | None:
+    """Return the next update, None if there is none by `when`."""
+    if when == _NEVER:
+        return await anext(monitor)
+    try:
+        async with asyncio.timeout(max(when - time.monotonic(), 0)):
+            return await anext(monitor)
+    except TimeoutError:
+        return None

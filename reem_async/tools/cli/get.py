@@ -1,0 +1,113 @@
+"""`reem get`: print a value, or write it to a file."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Url
+from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width
+from reem_async.tools.cli.running import USAGE, Refused, run
+from reem_async.tools.cli.values import FILES
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.store.catalog import Outline
+
+__all__ = ["get"]
+
+_MOST_AS_TEXT = 200_000
+"""Bytes of arrays that are printed as JSON: one of uint8 is up to four of text."""
+
+_MOST_FOR_PREVIEW = 256_000_000
+"""Bytes of an array that is fetched only to show its corners."""
+
+
+def get(
+    path: PathArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Write it to a file: .npy an array, .npz all arrays below, .json all, .png an image, .bin bytes.",
+        ),
+    ] = None,
+    force: Force = False,
+    raw: Annotated[bool, typer.Option("--raw", "-r", help="Print text as it is, without quotes.")] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print JSON in one line, arrays as nested lists, bytes in base64.")
+    ] = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Print a value, or write it to a file.
+
+    Plain values are printed as JSON. An array is shown as its type and range with its first and last
+    numbers; inside a dict, arrays are named and not fetched.
+
+    Exit code 3 if nothing is there. With --json, not more than 200 kB of arrays; use -o for more.
+
+    Examples:
+        reem get foo.bar.subkey
+        reem get robot.joints[0]
+        reem get robot.name --raw
+        reem get cam.image -o image.png
+        reem get pose --json | jq .x
+    """
+    if raw and (as_json or output):
+        raise typer.BadParameter("--raw goes neither with --json nor with -o")
+    if output is not None and output.suffix not in FILES:
+        raise typer.BadParameter(f"{output}: the name of a file ends in one of {', '.join(FILES)}")
+
+    async def work(interface: RedisInterface) -> None:
+        from reem_async.store.catalog import outline
+        from reem_async.store.store import KeyValueStore
+        from reem_async.tools.cli.values import save
+
+        if output is not None and output.exists() and not force:
+            raise Refused(f"{output} is there already; choose another name, or replace it with --force", USAGE)
+        store = KeyValueStore(interface)
+        if output is not None:
+            note(save(await store.get(path), output, path))
+            return
+        # First what it is, without arrays: then what is too large to be shown is not fetched.
+        node = await outline(interface, store.at(path).full_path)
+        if not as_json:
+            emit(await _shown(lambda: store.get(path), node, raw=raw))
+            return
+        _check_size(node)
+        emit(json_text(await store.get(path)))
+
+    run("get", work, url, namespace)
+
+
+async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
+    """Return a value for people; fetches it only if it is one array."""
+    from reem_async.tools.cli.outlines import as_data
+    from reem_async.tools.cli.values import preview
+
+    # For scripts: the text as it is, without quotes. A terminal is not sent what it would obey.
+    if raw and node.kind == "str":
+        text = str(node.value)
+        return "\n".join(map(clean, text.split("\n"))) if is_terminal() else text
+    if node.plain or node.kind in ("dict", "list"):
+        return json_text(as_data(node), pretty=True)
+    if node.size > _MOST_FOR_PREVIEW:
+        return f"{clean(node.summary)}, {size_text(node.size)}; too large to fetch only to show it: use -o FILE"
+    return preview(await fetch(), width() if is_terminal() else 100)
+
+
+def _check_size(node: Outline) -> None:
+    from reem_async.tools.cli.outlines import below_arrays
+
+    size = below_arrays(node)
+    if size > _MOST_AS_TEXT:
+        raise Refused(
+            f"{typed(node.path)} has {size_text(size)} of arrays, too much to print as JSON; write it to a file: "
+            f"reem get '{typed(node.path)}' -o FILE.npz, or .json"
+        )

@@ -1,0 +1,114 @@
+"""`reem migrate`: data of REEM 0.0 and 0.1 into data of today."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.tools.cli.bar import progress_bar
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
+from reem_async.tools.cli.output import clean, columns, emit, emit_json, note
+from reem_async.tools.cli.running import FAILED, prepared, run
+from reem_async.tools.cli.wording import in_words
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.tools.migration import Migrated, Migration
+
+__all__ = ["migrate"]
+
+
+def migrate(
+    yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only what would be done is shown.")] = False,
+    ships: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--ship",
+            metavar="MODULE:CLASS",
+            show_default=False,
+            help="A ship of your own that stored values; may be given several times. It is imported.",
+        ),
+    ] = None,
+    match: Annotated[
+        str,
+        typer.Option(
+            "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
+        ),
+    ] = "*",
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Convert what REEM 0.1 or older has stored, or a server without JSON, in place.
+
+    Without --yes nothing is changed: all is read and checked, and what would be done is shown. End the
+    programs of old versions first. Each key is one transaction, so this can be broken off at any time and
+    started again; what is new is left alone. An old RDB file is loaded by `reem up --from FILE`.
+
+    Exit code 1 if a key cannot be converted; it is left as it is.
+
+    Examples:
+        reem migrate
+        reem migrate --yes
+        reem migrate --yes --ship my_ships:PoseShip --url redis://robot.local:6379
+    """
+    given = prepared("migrate", lambda: _ships(ships or []))
+
+    async def work(interface: RedisInterface) -> int:
+        from reem_async.tools.migration import migrate as convert
+
+        # Shown at once: how long it takes is not known before all keys were looked at.
+        with progress_bar(after=0.0) as bar:
+            tell = None if as_json else bar("convert" if yes else "check")
+            done = await convert(interface, match, dry_run=not yes, progress=tell)
+        _show(done, as_json)
+        return FAILED if done.problems else 0
+
+    run("migrate", work, url, namespace, ships=given)
+
+
+def _ships(names: list[str]) -> list[Any]:
+    from reem_async.ships.registry import default_ships
+    from reem_async.tools.migration.naming import ship_named
+
+    # The user's own ships first, as in a program: they may take what the default ones would.
+    return [*map(ship_named, names), *default_ships()]
+
+
+def _show(done: Migration, as_json: bool) -> None:
+    if as_json:
+        for key in done.keys:
+            emit_json({**key._asdict(), "dry_run": done.dry_run})
+        return
+    good = [key for key in done.keys if not key.problem]
+    columns([[clean(key.name), clean(_what(key)), _count(len(key.removed))] for key in good], ["cyan", "", "dim"])
+    for key in good:
+        if key.lost:
+            note(f"{', '.join(key.lost)}: kept, but not in the document; REEM 0.1 may have forgotten it by mistake")
+    for key in done.problems:
+        note(f"{key.name} is left as it is: {in_words(key.problem)}")
+    keys = f"{len(good)} key{'' if len(good) == 1 else 's'}"
+    if not done.keys:
+        emit("Nothing to do: no key was written by REEM 0.1 or older.")
+    elif done.dry_run:
+        emit(f"{keys} would be converted. Nothing was changed; `reem migrate --yes` does it.")
+    else:
+        emit(f"{keys} converted.")
+
+
+def _what(key: Migrated) -> str:
+    """Return what is converted, in a few words."""
+    if key.was_text:
+        return "document of a server without JSON"
+    whole = "value taken out of a dict" if key.rooted else ""
+    # Not the marks that old versions put into documents.
+    inner = [place for place in key.places if "%%%%" not in place and place != "."]
+    shipped = ", ".join(inner[:3]) + (f" and {len(inner) - 3} more" if len(inner) > 3 else "")
+    if not inner and key.places:
+        shipped = "the whole value"
+    return "; ".join(filter(None, [shipped, whole])) or "leftovers only"
+
+
+def _count(removed: int) -> str:
+    return f"{removed} old Redis key{'' if removed == 1 else 's'} removed" if removed else ""

@@ -1,0 +1,181 @@
+"""What commands print: lines, columns, JSON; colours only on a terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import typer
+
+__all__ = [
+    "clean", "columns", "cut", "emit", "emit_json", "is_terminal", "json_text", "note", "size_text", "styled", "typed",
+    "width", "write_over",
+]  # fmt: skip
+
+# What moves the cursor, changes colours or breaks lines: keys and values come from anywhere.
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+_NARROWEST = 10  # characters that still say something of a name
+_UNITS = ("B", "kB", "MB", "GB", "TB")
+
+
+def is_terminal() -> bool:
+    """Return whether people read the standard output."""
+    return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+
+
+def width() -> int:
+    """Return how many characters a line of the terminal has."""
+    return shutil.get_terminal_size().columns
+
+
+def styled(text: str, style: str) -> str:
+    """Return `text` in a colour such as "cyan", in "bold" or "dim", if the output is a terminal."""
+    if not is_terminal() or os.environ.get("NO_COLOR"):
+        return text
+    if style in ("bold", "dim"):
+        return typer.style(text, **{style: True})
+    return typer.style(text, fg=style)
+
+
+def clean(text: str) -> str:
+    r"""Return `text` with everything that a terminal would obey written as `\u001b`, as JSON does."""
+    return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def cut(text: str, limit: int) -> str:
+    """Return `text`, cut to `limit` characters."""
+    return text if len(text) <= limit else text[: max(limit - 1, 0)] + "…"
+
+
+def emit(text: str) -> None:
+    """Print a line; what stands in it is clean already."""
+    sys.stdout.write(text + "\n")
+
+
+def note(text: str) -> None:
+    """Say something that is not the result: a line on standard error."""
+    sys.stderr.write(clean(text) + "\n")
+
+
+def write_over(text: str) -> None:
+    """Show how something is getting on: a line on standard error, in place of the last one; only on a terminal."""
+    if sys.stderr.isatty() and os.environ.get("TERM") != "dumb":
+        # Two columns stay free for the ^C of the terminal: in the next line, it would keep this one from being cleared.
+        sys.stderr.write("\r" + clean(cut(text, width() - 3)) + "\x1b[K")
+        sys.stderr.flush()
+
+
+def json_text(value: Any, *, pretty: bool = False) -> str:
+    """Return JSON; arrays as nested lists, bytes in base64, NaN and infinity by name, as Python's json reads them."""
+    import orjson
+
+    options = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if pretty else 0)
+    try:
+        text = orjson.dumps(value, default=_plain, option=options).decode()
+    except orjson.JSONEncodeError:  # nested very deep, or half a surrogate pair
+        text = _by_pythons(_simple(value), pretty)
+    # orjson writes null for NaN and infinity without a word: the slower way, with names, only where there is one.
+    if "null" in text:  # None, or a float that is no number
+        named = _by_pythons(_simple(value), pretty)
+        if "NaN" in named or "Infinity" in named:
+            text = named
+    return "\n".join(map(clean, text.split("\n")))
+
+
+def _by_pythons(value: Any, pretty: bool) -> str:
+    separators = None if pretty else (",", ":")
+    return json.dumps(value, indent=2 if pretty else None, separators=separators, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        import base64
+
+        return base64.b64encode(value).decode()
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return str(value)
+
+
+def _simple(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _simple(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_simple(item) for item in value]
+    return value if value is None or isinstance(value, str | int | float) else _simple(_plain(value))
+
+
+def emit_json(value: Any) -> None:
+    """Print a value as a line of JSON, at once: a program may wait for it."""
+    emit(json_text(value))
+    sys.stdout.flush()
+
+
+def size_text(size: float) -> str:
+    """Return bytes for people: `921.6 kB`."""
+    for unit in _UNITS[:-1]:
+        # So that 999.96 becomes 1.0 of the next unit and not 1000.0 of this one.
+        if abs(size) < 999.95:
+            return f"{size:.0f} B" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} {_UNITS[-1]}"
+
+
+def typed(path: Sequence[str | int]) -> str:
+    """Return a full path as a user can type it, also where the top-level key has a dot: `["a.b"].c`."""
+    return clean("".join(map(_element, path)).removeprefix("."))
+
+
+def _element(key: str | int) -> str:
+    from reem_async.plan.paths import suffix
+
+    # Quoted as JSON if the plain form would show what a terminal obeys.
+    text = suffix((key,))
+    return text if clean(text) == text or text.startswith("[") else f"[{json.dumps(key)}]"
+
+
+def columns(
+    rows: Iterable[Sequence[str]],
+    styles: Sequence[str],
+    right: frozenset[int] = frozenset(),
+    shrink: Sequence[int] = (0,),
+) -> None:
+    """Print rows: aligned and coloured on a terminal, separated by tabs elsewhere.
+
+    Args:
+        rows: The cells, clean.
+        styles: The colour of each column, "" for none.
+        right: Which columns are numbers.
+        shrink: Which columns are cut on a narrow terminal, in this order.
+    """
+    if not is_terminal():
+        for row in rows:
+            emit("\t".join(row))
+        return
+    # Widths in cells of the terminal: Chinese characters take two, accents none.
+    from rich.cells import cell_len, set_cell_size
+
+    kept = [list(row) for row in rows]
+    if not kept:
+        return
+    widths = [max(cell_len(cell) for cell in column) for column in zip(*kept, strict=True)]
+    # Columns are cut in the given order, each down to its least width, until the row fits.
+    excess = sum(widths) + 2 * (len(widths) - 1) - width()
+    for place in shrink:
+        less = min(max(excess, 0), max(widths[place] - _NARROWEST, 0))
+        widths[place] -= less
+        excess -= less
+    for row in kept:
+        cells = []
+        for place, (cell, size, style) in enumerate(zip(row, widths, styles, strict=True)):
+            if cell_len(cell) > size:
+                cell = set_cell_size(cell, size - 1) + "…"
+            blanks = " " * (size - cell_len(cell))
+            text = styled(cell, style) if style else cell
+            cells.append(blanks + text if place in right else text + blanks)
+        emit("  ".join(cells).rstrip())

@@ -1,0 +1,205 @@
+"""`reem record`: updates and samples into an MCAP file."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Patterns, Url, existing
+from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
+from reem_async.tools.cli.running import Refused, prepared, run
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.tools.recording import Recorder, RecorderStatus
+
+__all__ = ["record"]
+
+# Seconds between two lines that say how it is getting on.
+_SHOWN_EVERY = 0.5
+
+
+def record(
+    patterns: Patterns = None,
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The file, MCAP.")] = Path("run.mcap"),
+    sample: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", callback=existing, help="Read paths at given periods too: a line `path, seconds` for each."
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(min=0.001, metavar="SECONDS", help="End after so long; until Ctrl-C otherwise.")
+    ] = None,
+    keyframe: Annotated[
+        float,
+        typer.Option(min=0.05, metavar="SECONDS", help="Write the whole of the keys so often, to be found quickly."),
+    ] = 5.0,
+    compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
+    force: Force = False,
+    background: Annotated[
+        bool, typer.Option("--background", help="Take only processor time that nobody else wants.")
+    ] = False,
+    as_json: AsJson = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Record what is published, and samples, into an MCAP file.
+
+    Everything that is published under the patterns is recorded, arrays too, bit for bit. What is only stored, by
+    whomever, is recorded a moment later as what it led to, and marked so: several changes in a moment are one.
+    Where the server does not tell of it (a user without the right +client|tracking) it is read at each keyframe.
+    With --sample paths are read as often as you like; with it and no pattern, only the samples are recorded.
+    Ctrl-C ends the recording and completes the file; if it is killed, all but the last second can be read.
+
+    Once it has begun it says so: `recording into run.mcap` on standard error, or with --json the first line of JSON.
+    What is published from then on is in the file. Ctrl-C before that leaves no file, and exits with 130.
+
+    The programs that are recorded come first. On the server's own machine it is read through its Unix socket,
+    if it has one: that costs it less than TCP. With --background they notice the recorder least, but where
+    they need every processor wholly, updates are missing from the recording; it says how many.
+
+    Examples:
+        reem record -o run.mcap
+        reem record arm 'cam_*' --duration 60
+        reem record --background            beside a tight control loop
+        reem record --sample keys.csv       its lines: arm.joint, 0.01
+    """
+    wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
+
+    async def work(interface: RedisInterface) -> int:
+        from reem_async.transport.nearby import look_nearby
+
+        # Before the recorder is made: threads that it starts inherit the scheduling.
+        if background:
+            _stand_back()
+        else:
+            come_second()
+        # Frames of a megabyte come and go all the time; giving their pages back and asking for new ones costs more.
+        keep_memory()
+        look_nearby(interface.session.options)
+        recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
+        # Whether there is a recording: Ctrl-C before that ends with 130 and leaves no file.
+        begun = False
+        try:
+            async with recorder:
+                begun = True
+                _begin(recorder, duration, as_json)
+                shown = asyncio.create_task(_show(recorder, as_json))
+                try:
+                    await recorder.wait(duration)
+                finally:
+                    shown.cancel()
+        except asyncio.CancelledError:  # Ctrl-C is how a recording ends; it may have failed all the same
+            if not begun:  # there is no recording
+                raise
+            await recorder.stop()
+        finally:
+            if begun:
+                _end(recorder, as_json)
+                if not recorder.status.messages:
+                    note(_nothing(wanted))
+        return 0
+
+    run("record", work, url, namespace)
+
+
+def _stand_back() -> None:
+    try:
+        stand_back()
+    except (AttributeError, OSError) as error:
+        raise Refused(f"this system has nothing like --background ({error}); leave it out") from None
+
+
+def _recorder(
+    interface: RedisInterface,
+    patterns: list[str],
+    output: Path,
+    sample: Path | None,
+    keyframe: float,
+    compression: str,
+    force: bool,
+) -> Recorder:
+    kind = prepared("record", lambda: tools("Recorder"))
+    # Refused here if the file is there already: nothing was sent for it yet.
+    recorder: Recorder = kind(
+        interface, patterns, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
+    )
+    return recorder
+
+
+def tools(name: str) -> Any:
+    """Return a name of `reem_async.recording`; Refused if what that needs is not installed."""
+    try:
+        from reem_async.tools import recording
+    except ModuleNotFoundError as error:
+        if "reem[tools]" not in str(error):
+            raise
+        raise Refused(str(error)) from None
+    return getattr(recording, name)
+
+
+async def _show(recorder: Recorder, as_json: bool) -> None:
+    """Show how it is getting on: a line that is written over on a terminal, lines of JSON for scripts."""
+    before, then = recorder.status, time.monotonic()
+    while True:
+        await asyncio.sleep(1.0 if as_json else _SHOWN_EVERY)
+        status, now = recorder.status, time.monotonic()
+        rates = (status.messages - before.messages) / (now - then), (status.bytes - before.bytes) / (now - then)
+        # Rates are of the time since the last line, not of the whole recording.
+        before, then = status, now
+        if as_json:
+            emit_json(_fields(status) | {"rate": round(rates[0], 1)})
+        else:
+            text = f"{_clock(status.seconds)}  {status.messages} messages  {rates[0]:.0f}/s  {size_text(rates[1])}/s"
+            text += f"  {size_text(status.file_bytes)} in the file  {_missing(status)}"
+            write_over(text)
+
+
+def _begin(recorder: Recorder, duration: float | None, as_json: bool) -> None:
+    """Say that it has begun: from now on nothing is missed, and Ctrl-C completes the file."""
+    if as_json:
+        emit_json(_fields(recorder.status))
+    else:
+        note(f"recording into {recorder.path} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
+
+
+def _nothing(patterns: list[str]) -> str:
+    if not patterns:
+        return "warning: nothing was recorded: none of the paths of the samples was there"
+    return (
+        f"warning: nothing was recorded: nothing was published, and nothing is stored, under {', '.join(patterns)}; "
+        "`reem ls` lists the keys, `reem top` what is published"
+    )
+
+
+def _end(recorder: Recorder, as_json: bool) -> None:
+    """Say what became of it."""
+    status = recorder.status
+    write_over("")
+    if as_json:
+        emit_json(_fields(status) | {"file": str(recorder.path), "ended": True})
+        return
+    size = recorder.path.stat().st_size if recorder.path.exists() else 0
+    what = f"{status.messages} messages, {size_text(status.bytes)} in {_clock(status.seconds)}"
+    emit(clean(f"{recorder.path}: {what}, {size_text(size)} in the file; {_missing(status)}"))
+
+
+def _fields(status: RecorderStatus) -> dict[str, Any]:
+    names = ("seconds", "messages", "bytes", "file_bytes", "dropped", "skipped", "gaps", "lost", "rate")
+    return {name: round(getattr(status, name), 3) for name in names}
+
+
+def _missing(status: RecorderStatus) -> str:
+    extra = [f"{count} {word}" for count, word in ((status.gaps, "gaps"), (status.lost, "not recordable")) if count]
+    return ", ".join([f"{status.dropped} dropped", f"{status.skipped} skipped", *extra])
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    return f"{int(minutes)}:{rest:04.1f}"

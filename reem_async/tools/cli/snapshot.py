@@ -1,0 +1,301 @@
+"""`reem snapshot`: save what a server holds to files, list them, restore them."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from reem_async.tools.cli.bar import progress_bar
+from reem_async.tools.cli.lazy import help_text
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
+from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, styled
+from reem_async.tools.cli.running import prepared, run
+from reem_async.tools.cli.snapshot_listing import check_there, content, facts, listed, number
+from reem_async.tools.cli.wording import for_users
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.tools.snapshots import Progress, Snapshot
+
+__all__ = ["app"]
+
+app = typer.Typer(rich_markup_mode="rich", help="Save what a server holds to files, list them, restore them.")
+
+# Seconds of each unit.
+_UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+_NAMED = 3
+"""How many names a line of text has."""
+
+Match = Annotated[
+    str,
+    typer.Option(
+        "--match", metavar="PATTERN", help="Only the top-level keys that match; * and ? stand for other characters."
+    ),
+]
+
+
+def period(text: str) -> float:
+    """Return seconds from `90`, `30s`, `10m`, `1.5h` or `1d`; at least one."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd]?)", text.strip())
+    seconds = float(found[1]) * _UNITS[found[2]] if found else 0.0
+    if not 1.0 <= seconds <= 366 * 86400.0:
+        raise typer.BadParameter(f"{text!r} is no period of a second to a year; write it like 30s, 10m, 1.5h or 1d")
+    return seconds
+
+
+def save(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", show_default=False, help="The file to make. Without it, one named by time."),
+    ] = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option("--directory", "-d", metavar="DIR", show_default="here", help="Where to make one named by time."),
+    ] = None,
+    match: Match = "*",
+    rdb: Annotated[
+        bool,
+        typer.Option(
+            "--rdb",
+            help="Have the server save all it holds, foreign keys too, and copy its RDB file; a portable snapshot "
+            "where that cannot be had.",
+        ),
+    ] = False,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            "--every", metavar="PERIOD", parser=period, help="Go on until Ctrl-C: one each 30s, 10m, 1.5h or 1d."
+        ),
+    ] = None,
+    keep: Annotated[
+        int | None,
+        typer.Option(
+            "--keep", min=1, metavar="N", help="Leave the newest N, delete older ones that were saved with --keep."
+        ),
+    ] = None,
+    force: Force = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Save the keys of REEM to a file, or all of the server with --rdb.
+
+    A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant, and any
+    user who may read the keys can take it. Redis keys that are not REEM's are counted and left alone.
+
+    Examples:
+      reem snapshot save before.zip
+      reem snapshot save --match 'arm*' arm.zip
+      reem snapshot save -d /var/backups --every 10m --keep 24
+      reem snapshot save --rdb -d /var/backups
+    """
+    _check_options(file, directory, match, rdb=rdb, periodic=every is not None or keep is not None)
+    saver = _Saver(file, directory or Path(), match, rdb=rdb, keep=keep, overwrite=force, as_json=as_json)
+
+    async def work(interface: RedisInterface) -> None:
+        if every is None:
+            await saver.once(interface)
+        else:
+            await saver.by_period(interface, every)
+
+    run("snapshot save", work, url, namespace, live=every is not None)
+
+
+def _check_options(file: Path | None, directory: Path | None, match: str, *, rdb: bool, periodic: bool) -> None:
+    if file is not None and (directory is not None or periodic):
+        raise typer.BadParameter(
+            "FILE cannot be combined with --directory, --every or --keep, which name files by time"
+        )
+    if rdb and match != "*":
+        raise typer.BadParameter("--rdb saves all of the server: leave out --match")
+
+
+class _Saver:
+    """Takes snapshots and says what it did."""
+
+    def __init__(
+        self,
+        file: Path | None,
+        directory: Path,
+        match: str,
+        *,
+        rdb: bool,
+        keep: int | None,
+        overwrite: bool,
+        as_json: bool,
+    ) -> None:
+        self._file = file
+        self._directory = directory
+        self._match = match
+        self._rdb = rdb
+        self._keep = keep
+        self._overwrite = overwrite
+        self._as_json = as_json
+        self._made: list[Path] = []
+        self._noted: set[str] = set()
+
+    async def once(self, interface: RedisInterface, *, bar: bool = True) -> None:
+        """Take one, delete what is too old, print a line."""
+        started = time.monotonic()
+        it = await self._saved(interface, bar)
+        # Only when the new one is complete and on the disk are old ones deleted.
+        gone = await asyncio.to_thread(self._pruned, it.path)
+        if self._as_json:
+            done = {"seconds": time.monotonic() - started, "deleted": [str(path) for path in gone]}
+            emit_json({**facts(it), "doubt": it.doubt, **done})
+            return
+        deleted = f", deleted {', '.join(path.name for path in gone)}" if gone else ""
+        taken = f"{time.monotonic() - started:.2f} s"
+        emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {taken}{clean(deleted)}")
+        sys.stdout.flush()
+        self._note_foreign(it)
+        if it.doubt:
+            self._note_once(f"Keys may be missing: {it.doubt}.")
+
+    async def by_period(self, interface: RedisInterface, every: float) -> None:
+        """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""
+        from reem_async.errors import RedisError, ReemError
+
+        start, turn = time.monotonic(), 0
+        try:
+            while True:
+                try:
+                    await self.once(interface, bar=False)
+                except BrokenPipeError:  # nobody reads any more
+                    raise
+                except (ReemError, RedisError, OSError) as error:
+                    # If the first one fails, the user is still there to mend it; later ones are tried again by
+                    # themselves.
+                    if not self._made:
+                        raise
+                    note(f"reem snapshot save: not saved, next try in due time: {for_users(error)}")
+                # By the clock of the first one, so that the times do not drift; turns that a long save has missed are
+                # left out.
+                turn = max(turn + 1, int((time.monotonic() - start) / every))
+                await asyncio.sleep(start + turn * every - time.monotonic())
+        except asyncio.CancelledError:
+            note("Stopped; what is listed above is complete.")
+            raise
+
+    async def _saved(self, interface: RedisInterface, bar: bool) -> Snapshot:
+        from reem_async.tools.snapshots import RdbUnavailable, save, save_rdb
+
+        if self._rdb:
+            try:
+                return await save_rdb(interface, self._path("rdb"), overwrite=self._overwrite)
+            # Said once; the next ones by period try again, since rights may have changed.
+            except RdbUnavailable as error:
+                self._note_once(
+                    f"No RDB file: {for_users(error)}. A portable snapshot, of the keys of REEM, is taken instead."
+                )
+        with _progress(shown=bar and not self._as_json) as progress:
+            return await save(
+                interface, self._path("portable"), self._match, overwrite=self._overwrite, progress=progress
+            )
+
+    def _path(self, kind: str) -> Path:
+        from reem_async.tools.snapshots.files import new_name
+
+        return self._file or new_name(self._directory, kind, time.time(), auto=self._keep is not None)
+
+    def _pruned(self, newest: Path) -> list[Path]:
+        from reem_async.tools.snapshots.files import prune
+
+        self._made.append(newest)
+        # Without --keep nothing is ever deleted, so there is nothing to remember.
+        if self._keep is None:
+            del self._made[:-1]
+            return []
+        gone = prune(self._made, self._keep)
+        del self._made[: -self._keep]
+        return gone
+
+    def _note_foreign(self, it: Snapshot) -> None:
+        if it.foreign:
+            more = f" and {it.foreign - _NAMED} more" if it.foreign > _NAMED else ""
+            names = ", ".join(it.foreign_names[:_NAMED])
+            self._note_once(f"Left out, not REEM's: {names}{more}")
+
+    def _note_once(self, text: str) -> None:
+        if text not in self._noted:
+            self._noted.add(text)
+            note(text)
+
+
+def list_(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", show_default="here", help="A directory, or one snapshot to look into.")
+    ] = Path(),
+    check: Annotated[
+        bool, typer.Option("--check", help="Read portable snapshots to their end to find damage; exit code 1 if any.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the snapshots in a directory, oldest first, or the keys in one.
+
+    Examples:
+      reem snapshot list
+      reem snapshot list --check /var/backups
+      reem snapshot list before.zip
+    """
+    code = prepared("snapshot list", lambda: listed(path, check, as_json))
+    if code:
+        raise typer.Exit(code)
+
+
+def restore(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A portable snapshot.")],
+    match: Match = "*",
+    replace: Annotated[bool, typer.Option("--replace", help="Keys that are there may be replaced.")] = False,
+    into: Annotated[str, typer.Option("--into", metavar="PREFIX", help="Goes before the name of each key.")] = "",
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write the keys of a snapshot to a server, and tell their subscribers.
+
+    The file is checked first, and whether keys are in the way: then nothing is changed. Keys that the
+    snapshot does not hold are left alone. An RDB file cannot be restored into a running server; use
+    `reem up --from FILE`, which also shows a portable snapshot beside the live server.
+
+    Examples:
+      reem snapshot restore before.zip
+      reem snapshot restore --replace --match 'arm*' before.zip
+      reem snapshot restore --into old_ before.zip
+    """
+    prepared("snapshot restore", lambda: check_there(file))
+
+    async def work(interface: RedisInterface) -> None:
+        from reem_async.tools.snapshots import describe
+        from reem_async.tools.snapshots import restore as restored
+
+        with _progress(shown=not as_json) as progress:
+            done = await restored(interface, file, match, replace=replace, into=into, progress=progress)
+        if as_json:
+            emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
+            return
+        emit(f"{number(len(done.names), 'key')} restored, {size_text(done.size)}")
+        saved = (await describe(file)).namespace
+        if saved != namespace:
+            note(f"They were saved under the namespace {saved!r} and are now under {namespace!r} (--namespace).")
+
+    run("snapshot restore", work, url, namespace)
+
+
+@contextmanager
+def _progress(*, shown: bool) -> Iterator[Callable[[Progress], None] | None]:
+    """Give what draws a bar, if it is to be shown."""
+    with progress_bar(after=0.0) as bar:
+        yield (lambda progress: bar(progress.doing)(progress.done, progress.total)) if shown else None
+
+
+for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
+    app.command(_name, help=help_text(_command.__doc__ or ""))(_command)

@@ -1,0 +1,183 @@
+"""`reem up`: a private server in the foreground."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+from reem_async.errors import LoginRefused, RedisError, ReemError
+from reem_async.server.embedded import EmbeddedServer
+from reem_async.tools.cli.foreground import LOOK_SECONDS, Stop, fail, print_rows
+from reem_async.tools.cli.options import existing
+from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, interface_to
+from reem_async.tools.cli.wording import for_users
+
+DEFAULT_PORT = 6379
+
+
+def up(
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=65535,
+            show_default="6379; a free one with --from",
+            help="TCP port on 127.0.0.1; 0 takes a free one.",
+        ),
+    ] = None,
+    directory: Annotated[
+        Path | None,
+        typer.Option(file_okay=False, help="Keep the data here; without it, it is gone with the server."),
+    ] = None,
+    password_from_env: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help=f"Environment variable that holds the password; {PASSWORD_VARIABLE} is used if it is set.",
+        ),
+    ] = None,
+    snapshot: Annotated[
+        Path | None,
+        typer.Option(
+            "--from",
+            metavar="FILE",
+            callback=existing,
+            dir_okay=False,
+            help="Begin with what this snapshot holds, portable or RDB. A --directory must have no data yet.",
+        ),
+    ] = None,
+    cluster: Annotated[
+        bool,
+        typer.Option(
+            "--cluster", help="A cluster of three primaries and three replicas, in memory, on free ports; to try it."
+        ),
+    ] = False,
+    plain: Annotated[
+        bool,
+        typer.Option("--plain", help="Without the JSON module: documents are kept as text, as on arm64 and macOS."),
+    ] = False,
+) -> None:
+    """Start a private server and keep it up until Ctrl-C.
+
+    With --from, a past state can be looked at beside the live one, which is not touched.
+
+    Examples:
+      reem up
+      reem up --directory /var/lib/robot --port 6400
+      reem up --from reem-20260801T120000Z.zip
+      reem up --cluster
+      reem up --plain
+    """
+    if cluster:
+        if any(given is not None for given in (port, directory, password_from_env, snapshot)):
+            fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
+        from reem_async.tools.cli.up_cluster import up_cluster
+
+        up_cluster(Stop(), plain=plain)
+        return
+    variable = _password_variable(password_from_env)
+    if port is None:
+        port = 0 if snapshot else DEFAULT_PORT
+    if snapshot is not None and snapshot.exists() and not snapshot.is_file():
+        fail(f"{snapshot} is no file; give a snapshot")
+    try:
+        server = EmbeddedServer(port, directory, os.environ[variable] if variable else None, snapshot, json=not plain)
+        with server:  # until it is up, Ctrl-C ends the loading at once
+            stop = Stop()
+            _describe(server, directory, variable, snapshot)
+            while not stop.wait(LOOK_SECONDS):
+                # A server that ends by itself has said why in its log, which goes with its directory.
+                if not server.running:
+                    fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")
+    except (ReemError, RedisError, OSError) as error:
+        # Most often the port is taken by the server that the user wants: it is looked at before it is complained of.
+        there = _who_is_there(port) if "is taken" in str(error) else ""
+        fail(for_users(error) + there)
+    except KeyboardInterrupt:
+        raise typer.Exit(INTERRUPTED) from None
+    with suppress(OSError):  # the terminal may have closed
+        Console().print(f"Stopped. The data is {'kept' if directory else 'gone'}.")
+
+
+def _who_is_there(port: int) -> str:
+    """Return what to do about a server that answers at the port already, empty if it is no server."""
+
+    async def ask() -> None:
+        async with interface_to(f"127.0.0.1:{port}", "", timeout=1.0):
+            pass
+
+    try:
+        asyncio.run(ask())
+    except LoginRefused:
+        what = "a server that wants a password"
+    except (ReemError, RedisError, OSError):
+        return ""
+    else:
+        what = "a server that REEM can use already"
+    return (
+        f". It is {what}: connect to redis://localhost:{port}, `reem doctor --url redis://localhost:{port}` looks at it"
+    )
+
+
+def _password_variable(name: str | None) -> str | None:
+    """The variable to read, None for no password. An empty one is an error, not a server without password."""
+    if name is None and PASSWORD_VARIABLE not in os.environ:
+        return None
+    name = name or PASSWORD_VARIABLE
+    if not os.environ.get(name):
+        fail(f"the environment variable {name} is {'empty' if name in os.environ else 'not set'}")
+    return name
+
+
+def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None, snapshot: Path | None) -> None:
+    password = f', password=os.environ["{variable}"]' if variable else ""
+    # localhost and not 127.0.0.1: this way clients find the Unix socket, which is quicker.
+    url = f"redis://localhost:{server.port}"
+    connect = f'KeyValueStore(RedisInterface("{url}"{password}))'
+    imports = "import os; from" if variable else "from"
+    console = Console()
+    console.print(Text("REEM's server is up.", style="bold green"), f"(process {server.pid})")
+    rows = [
+        *((("snapshot", _summary(snapshot)),) if snapshot else ()),
+        ("address", url),
+        ("socket", f"unix://{server.socket_path}"),
+        (
+            "password",
+            f"the value of {variable}" if variable else "none: any user of this machine can connect",
+        ),
+        ("documents", kept_as(server.json)),
+        ("data", f"{server.directory}, kept" if directory else "in memory, gone when the server stops"),
+        ("blocking", f"{imports} reem import KeyValueStore, RedisInterface; kvs = {connect}"),
+        ("asyncio", f"{imports} reem_async import KeyValueStore, RedisInterface; kvs = {connect}"),
+        ("to stop", "Ctrl-C"),
+    ]
+    print_rows(console, rows)
+
+
+def kept_as(json: bool) -> str:
+    """Return how a server keeps documents."""
+    return "by its JSON module" if json else "as text: the server has no JSON module"
+
+
+def _summary(path: Path) -> str:
+    """What the server has begun with, and when that was."""
+    from reem_async.tools.snapshots import described
+
+    it = described(path)
+    taken = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
+    count = "" if it.count is None else f", {it.count} {'keys' if it.kind == 'portable' else 'Redis keys'}"
+    under = f", under the namespace {it.namespace}" if it.namespace else ""
+    return f"{path}, taken {taken}{count}{under}"
+
+
+def _log_end(server: EmbeddedServer) -> str:
+    """The last lines of the log, read now since a temporary directory goes with the server."""
+    return "\n".join((server.directory / "server.log").read_text(errors="replace").splitlines()[-5:])

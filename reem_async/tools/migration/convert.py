@@ -1,0 +1,299 @@
+"""Old keys into keys of today, in place."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+from ...connection import RedisInterface
+from ...errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
+from ...plan import Command, Plan, Reply
+from ...plan.changes import EncodedAttachment, Telling
+from ...plan.olddata import METADATA, special_paths
+from ...plan.paths import Path, check_top_key
+from ...plan.patterns import Pattern
+from ...plan.placeholders import Placeholder, Slot
+from ...plan.reads import RawRead, get_command, read
+from ...plan.writes import exchange, set_change
+from ...session import Session
+from ...ships.registry import Registered
+from ...store.document import Turn
+from ...store.publish import DocumentPublisher
+from ...store.reader import opened
+from .finding import OldKey, find
+from .text import TextConverter, texts
+from .values import ARRAY_LABEL, Tree, array_of
+
+__all__ = ["Migrated", "Migration", "migrate"]
+
+# A key that is written each millisecond can be converted in between; one that never is has a program to be ended.
+_TRIES = 50
+
+
+class Migrated(NamedTuple):
+    """What became of one old key, or would.
+
+    Attributes:
+        name: The top-level key.
+        places: Where a ship's value was put into its document, as `.image`.
+        rooted: Its value, which is no dict, was taken out of one.
+        removed: The Redis keys of the old layout that are removed, those of arrays left behind too.
+        lost: The Redis keys of arrays that are nowhere in the document, but may not have been left behind on purpose:
+            writing `foo.image` made old programs forget `foo.image2`. They stay where they are.
+        problem: Why it was left as it is; empty if it was not.
+        was_text: Its document was text, of a server without JSON, and is one of this server's JSON now.
+    """
+
+    name: str
+    places: tuple[str, ...] = ()
+    rooted: bool = False
+    removed: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
+    problem: str = ""
+    was_text: bool = False
+
+
+@dataclass(frozen=True)
+class Migration:
+    """What `migrate` did, or would do.
+
+    Attributes:
+        keys: The old keys, sorted by name.
+        dry_run: Nothing was changed.
+    """
+
+    keys: tuple[Migrated, ...]
+    dry_run: bool
+
+    @property
+    def problems(self) -> tuple[Migrated, ...]:
+        """The keys that were left as they are."""
+        return tuple(key for key in self.keys if key.problem)
+
+
+async def migrate(
+    interface: RedisInterface,
+    match: str = "*",
+    *,
+    dry_run: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Migration:
+    """Convert what REEM 0.0 and 0.1 have stored, in place, so that it reads as it did there.
+
+    Arrays and other values of ships are put into their documents, values that are no dict are taken out of the dict
+    they were stored in, and the Redis keys of the old layout are removed, those too that old programs have left
+    behind. What is new is left alone, so a second run finds nothing to do. Each key is one transaction: it is old or
+    new, never half, whenever this is broken off; then run it again. In a cluster, whose nodes share no transaction,
+    what is old is removed right after it. Subscribers are told. A key that cannot be converted is left as it is, and
+    the result says why. End the programs of old versions first.
+
+    So are documents that are text, from a server without JSON (an RDB file that has moved), on a server that has it.
+
+    Two round trips for about 1000 keys of the server to find the old ones, three times; then six for each of these.
+    Arrays are read twice. In memory there is one top-level key at a time.
+
+    Args:
+        interface: The server; its namespace is what is converted, and its ships read and write what was stored by
+            ships with their labels.
+        match: Which top-level keys: a name in which `*` and `?` stand for other characters.
+        dry_run: Change nothing; read and check all the same.
+        progress: Called with how many keys are done, and of how many.
+
+    Raises:
+        ClusterNode: The server is one node of several.
+        BadKey: `match` is no pattern.
+    """
+    session = interface.session
+    await session.ships.ready()
+    wanted = Pattern(check_top_key(match))
+    # Texts first: only then are they documents that the search for old keys sees.
+    text = [name for name in await texts(session) if wanted.concerns((name,))]
+    old = [key for key in await find(session) if wanted.concerns((key.name,))]
+    conversions: list[Callable[[], Awaitable[Migrated]]] = [
+        *(partial(_given_to_json, session, name, dry_run) for name in text),
+        *(partial(_migrated, session, key, dry_run) for key in old),
+    ]
+    done: list[Migrated] = []
+    for convert in conversions:
+        if progress is not None:
+            progress(len(done), len(conversions))
+        done.append(await convert())
+    if progress is not None and done:
+        progress(len(done), len(done))
+    return Migration(tuple(done), dry_run)
+
+
+async def _given_to_json(session: Session, name: str, dry_run: bool) -> Migrated:
+    """Convert one document that is text."""
+    try:
+        await TextConverter(session, name).run(dry_run=dry_run)
+    except (BadData, WrongKind) as error:
+        return Migrated(name, problem=str(error), was_text=True)
+    return Migrated(name, was_text=True)
+
+
+async def _migrated(session: Session, key: OldKey, dry_run: bool) -> Migrated:
+    """Convert one key; again if anybody writes to it meanwhile."""
+    for _ in range(_TRIES):
+        try:
+            return await _Converter(session, key).run(dry_run=dry_run)
+        except Conflict:
+            continue
+        except (BadData, BadInput, PartialWrite, WrongKind) as error:
+            return Migrated(key.name, problem=str(error))
+    return Migrated(key.name, problem=f"it was changed {_TRIES} times meanwhile; end the programs that write to it")
+
+
+class _RemovingFirst:
+    """Tells subscribers as `telling` does, behind the command that removes what is old.
+
+    Args:
+        removal: The command; none where what is old may be on another node.
+        telling: What tells them.
+    """
+
+    def __init__(self, removal: Sequence[Command], telling: Telling) -> None:
+        self._removal = removal
+        self._telling = telling
+        self.take_back, self.retract = telling.take_back, telling.retract
+
+    def make(self, path: Path) -> Sequence[Command]:
+        # In the order in which it happens: whoever hears of the update finds nothing old any more.
+        return [*self._removal, *self._telling.make(path)]
+
+
+class _Converter:
+    """Converts one top-level key.
+
+    Looks at everything without a lock, makes the value of it, then writes it and removes what is old in one
+    transaction, if all is still as it was seen.
+    """
+
+    def __init__(self, session: Session, key: OldKey) -> None:
+        self.session = session
+        self.keys = session.keys(key.name)
+        self.name = self.keys.name
+        self._writer = DocumentPublisher(session, key.name)
+        self._second = self.keys.document + METADATA
+        self._key = key
+        self._old: dict[str, tuple[Command, Reply]] = {}  # by place: what was asked of the ship's value, and the reply
+
+    async def run(self, *, dry_run: bool) -> Migrated:
+        """Convert it, or see whether that can be done."""
+        (second,) = await self._replies([("JSON.GET", self._second, "$")])
+        found = special_paths(second)
+        labels = found or {}
+        raw_read = await self._sealed()
+        tree = Tree(raw_read.holder, [(slot.container, slot.key) for slot, _, _ in raw_read.slots])
+        # A ship of today holds something there: written since, so it is newer than what the old one has.
+        missing = {place: label for place, label in labels.items() if not tree.holds(place)}
+        await self._look(missing)
+        # Whole values first: one of an old ship above others hides them, as it did.
+        put = [place for place in sorted(missing) if tree.put(place, await self._value(place, missing[place]))]
+        if raw_read.slots:
+            await opened(raw_read)
+        root = tree.root()
+        rooted = root is not raw_read.holder
+        # The second document last: while it is there, another run knows what there is to remove.
+        gone = [*(self.keys.document + place for place in labels), *self._key.stale]
+        gone += [self._second] if found is not None else []
+        if put or rooted:
+            await self._write(root[0], raw_read, second, gone, dry_run=dry_run)
+        removed_with_it = (put or rooted) and not self.session.transport.sharded
+        if gone and not dry_run and not removed_with_it:
+            await self._remove(gone)
+        return Migrated(self.name, tuple(put), rooted, tuple(gone), tuple(self._key.lost))
+
+    async def _replies(self, commands: Sequence[Command]) -> Sequence[Reply]:
+        if not commands:
+            return ()
+        replies: Sequence[Reply] = await self.session.run(Plan(commands, lambda replies: replies, bulk=True))
+        for reply in replies:
+            # WRONGTYPE is an answer here: somebody has put something else in the place of a ship's value.
+            if isinstance(reply, Exception) and not str(reply).startswith("WRONGTYPE"):
+                raise reply
+        return replies
+
+    async def _sealed(self) -> RawRead:
+        """Return the document as programs of today see it; an empty one if there is none."""
+        plan = read(self.keys, (), self.session.ships, self.session.cache)
+        try:
+            raw_read: RawRead = await self.session.run(plan)
+        except MissingKey:
+            return RawRead([], self.name, [], (get_command(self.keys, ()),), (None,))
+        return raw_read
+
+    async def _look(self, labels: dict[str, str]) -> None:
+        """Fetch what the ships hold."""
+        commands = [self._ask(place, label) for place, label in labels.items()]
+        self._old = dict(zip(labels, zip(commands, await self._replies(commands), strict=True), strict=True))
+
+    def _ask(self, place: str, label: str) -> Command:
+        ship = self._ship(place, label)
+        key = self.keys.document + place
+        return ("HGETALL", key) if ship is None else ship.read_command(key)
+
+    def _ship(self, place: str, label: str) -> Registered | None:
+        """Return the user's ship with a label, None for the arrays of REEM 0.1; raises BadData."""
+        ships = self.session.ships
+        try:
+            return ships.labelled(label, self.name + place.removesuffix("."))
+        except BadData as error:
+            if label == ARRAY_LABEL:
+                return None
+            raise BadData(f"{error}; `reem migrate --ship MODULE:CLASS` converts it with the ship") from None
+
+    async def _value(self, place: str, label: str) -> Any:
+        ship, (command, reply) = self._ship(place, label), self._old[place]
+        where = self.name + place.removesuffix(".")
+        if reply is None or reply == {} or reply == [] or isinstance(reply, Exception):
+            raise BadData(
+                f"{where}: what the ship {label!r} stored is gone from {command[1]!r}; to convert the rest without it: "
+                f"redis-cli JSON.DEL '{self._second}' '$.special_paths[\"{place}\"]'"
+            )
+        if ship is not None:
+            return await self._opened(place, ship, reply)
+        try:
+            return array_of(reply)
+        except BadData as error:
+            raise BadData(f"{where}: {error}") from None
+
+    async def _opened(self, place: str, ship: Registered, reply: Reply) -> Any:
+        """Return what a user's ship makes of what it stored."""
+        holder: list[Any] = [None]
+        slot = Slot(Placeholder(ship.label, place), holder, 0)
+        return await opened(RawRead(holder, self.name, [(slot, ship, reply)], (), ()))
+
+    async def _write(self, value: Any, raw_read: RawRead, second: Reply, gone: list[str], *, dry_run: bool) -> None:
+        """Store the value, remove what is old and tell subscribers, if all is as it was seen; raises Conflict."""
+        # In a dry run too, which is to find what would be refused.
+        encoded = await self._writer.encoder.encoded((), value)
+        if dry_run:
+            return
+        # All that was looked at is read again under WATCH and compared, the values of the ships as well: nothing that
+        # an old program writes meanwhile is lost.
+        reads, seen = raw_read.commands, raw_read.raw
+        removal: list[Command] = []
+        if not self.session.transport.sharded:
+            asked = self._old.values()
+            old = [("WATCH", self._second, *gone), ("JSON.GET", self._second, "$"), *(command for command, _ in asked)]
+            reads, seen = (*old, *reads), (b"OK", second, *(reply for _, reply in asked), *seen)
+            removal = [("UNLINK", *gone)] if gone else []
+
+        async def send(turn: Turn, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> None:
+            telling = _RemovingFirst(removal, turn.without_value())
+            it = set_change(self.keys, (), text, attachments, notices=telling)
+            await self.session.run(exchange(it, reads, seen, self.session.cache))
+
+        await self._writer.in_turn(send, *encoded)
+        self.session.cache.forget_shapes(self.keys.document)
+
+    async def _remove(self, gone: list[str]) -> None:
+        """Remove what is old and was not removed with the write; where it is on one server, it is one command."""
+        if not self.session.transport.sharded:
+            await self._replies([("UNLINK", *gone)])
+            return
+        for key in gone:
+            await self._replies([("UNLINK", key)])

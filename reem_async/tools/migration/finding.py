@@ -1,0 +1,154 @@
+"""Which keys of a server are old: one look through all keys."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ...errors import BadData, NotAllowed
+from ...plan import Plan, Reply
+from ...plan.olddata import METADATA, candidates, is_rooted, root_command, special_paths
+from ...plan.patterns import escaped
+from ...plan.scan import DOCUMENT
+from ...session import Session
+from ...transport.scan import scanned
+from .values import is_array
+
+__all__ = ["OldKey", "find"]
+
+_SECOND = METADATA.encode()
+
+
+@dataclass
+class OldKey:
+    """One top-level key of which something old was found.
+
+    Attributes:
+        name: The key, without namespace.
+        places: Where values of ships are, and the ships' labels; None if there is no second document.
+        rooted: Its value is no dict and was stored in one.
+        stale: Redis keys of arrays that old programs have replaced, and left there.
+        lost: Redis keys of arrays that may be none of these: writing `foo.image` made old programs forget `foo.image2`.
+    """
+
+    name: str
+    places: dict[str, str] | None = None
+    rooted: bool = False
+    stale: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+
+    @property
+    def misread(self) -> bool:
+        """Whether programs of today would read something else than what was written."""
+        return self.rooted or bool(self.places)
+
+
+async def find(session: Session, *, stale: bool = True) -> list[OldKey]:
+    """Return the old keys of a session's namespace, sorted.
+
+    Two round trips for about 1000 keys of the server.
+
+    Args:
+        session: The server.
+        stale: Look for what was left behind too, which takes another look through the keys.
+
+    Raises:
+        ClusterNode: The server is one node of several.
+        NotAllowed: This user may not look for what was left behind.
+    """
+    found: dict[str, OldKey] = {}
+    async for names in _pages(session, DOCUMENT):
+        for name, reply in zip(names, await _asked(session, [_question(name) for name in names]), strict=True):
+            _note(session, found, name, reply)
+    if stale and any(each.places is not None for each in found.values()):
+        async for names in _pages(session, "hash"):
+            await _add_stale(session, found, names)
+    return [found[name] for name in sorted(found)]
+
+
+async def _pages(session: Session, kind: str) -> AsyncIterator[list[str]]:
+    # SCAN may name a key several times, and there is a question about each.
+    seen: set[bytes] = set()
+    async for page in scanned(session.transport, escaped(session.namespace) + "*", kind):
+        fresh = [key for key in dict.fromkeys(map(bytes, page)) if key not in seen]
+        seen.update(fresh)
+        yield [name for key in fresh if (name := _decoded(key)) is not None]
+
+
+def _decoded(key: bytes) -> str | None:
+    try:
+        return key.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+async def _asked(session: Session, commands: Sequence[tuple[Any, ...]]) -> Sequence[Reply]:
+    if not commands:
+        return []
+    replies: Sequence[Reply] = await session.run(Plan(commands, lambda replies: replies))
+    return replies
+
+
+def _question(document: str) -> tuple[Any, ...]:
+    # Second documents say themselves where ships have values; of others only one entry matters, which costs less to
+    # ask.
+    return ("JSON.GET", document, "$") if document.endswith(METADATA) else root_command(document)
+
+
+def _note(session: Session, found: dict[str, OldKey], document: str, reply: Reply) -> None:
+    """Take note of one document, by the reply to the question about it."""
+    second = document.endswith(METADATA)
+    places = special_paths(reply) if second else None
+    if places is None and (second or not is_rooted(reply)):
+        return
+    name = document[len(session.namespace) :].removesuffix(METADATA if second else "")
+    key = found.setdefault(name, OldKey(name))
+    if second:
+        key.places = places
+    else:
+        key.rooted = True
+
+
+async def _add_stale(session: Session, found: dict[str, OldKey], names: Sequence[str]) -> None:
+    """Add the hashes that are arrays of old keys, but nowhere in their documents."""
+    owned = [(name, owner) for name in names if (owner := _owner(session, found, name)) is not None]
+    replies = await _asked(session, [("HKEYS", name) for name, _ in owned])
+    for (name, owner), fields in zip(owned, replies, strict=True):
+        if isinstance(fields, NotAllowed):  # what is left behind would stay for ever, without a word
+            raise fields
+        if isinstance(fields, list | set) and is_array(frozenset(map(bytes, fields))):
+            place = name[len(session.namespace) + len(owner.name) :]
+            (owner.lost if _may_be_lost(place, owner.places or ()) else owner.stale).append(name)
+
+
+def _may_be_lost(place: str, places: Iterable[str]) -> bool:
+    """Return whether the name of another place begins this one, which is not inside of it."""
+    return any(place.startswith(each) and place[len(each) :][:1] not in ("", ".", "[") for each in places)
+
+
+def _owner(session: Session, found: dict[str, OldKey], name: str) -> OldKey | None:
+    """Return the old key below whose second document a hash belongs, though that does not name it."""
+    for top in _tops(name[len(session.namespace) :]):
+        key = found.get(top)
+        if key is None or key.places is None:
+            continue
+        place = name[len(session.namespace) + len(top) :]
+        # Named by the second document, so it is no leftover; or the second document itself.
+        if place in key.places or place.startswith("&"):
+            return None
+        try:
+            candidates(place)
+        except BadData:
+            return None
+        return key
+    return None
+
+
+def _tops(name: str) -> Iterator[str]:
+    """Yield what may be the top-level key in `foo.bar` or `foo[0].bar`; none has a dot in it."""
+    top = name.partition(".")[0]
+    yield top
+    while top.endswith("]") and "[" in top:
+        top = top[: top.rindex("[")]
+        yield top

@@ -1,0 +1,103 @@
+"""Documents of a server without JSON, found as text on one that has it: an RDB file, or a directory, that has moved."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+
+from ...errors import BadData, BadKey
+from ...plain.documents import is_document
+from ...plan import Command, Plan, Reply
+from ...plan.changes import Telling
+from ...plan.orphans import permitted
+from ...plan.patterns import escaped
+from ...plan.staging import STAGED
+from ...session import Session
+from ...store.document import Turn
+from ...store.publish import DocumentPublisher
+from ...transport.scan import scanned
+from ..snapshots.values import settable
+
+__all__ = ["TextConverter", "texts"]
+
+# As `convert.py` has it.
+_TRIES = 50
+
+
+async def texts(session: Session) -> list[str]:
+    """Return the top-level keys of a session's namespace whose documents are text that the server takes for a string.
+
+    Where there is no JSON, that is no key. One round trip for about 1000 keys of the server, and one for the strings.
+    """
+    found: set[str] = set()
+    async for page in scanned(session.transport, escaped(session.namespace) + "*", "string"):
+        names = [name for name in page if b"{" not in name]
+        looks: list[Command] = [look for name in names for look in (("TYPE", name), ("GETRANGE", name, "0", "0"))]
+        replies: Sequence[Reply] = await session.run(Plan(looks, list)) if looks else []
+        for name, kind, begins in zip(names, replies[::2], replies[1::2], strict=True):
+            # On a server without JSON the transport answers for TYPE what the module would, so nothing is found there.
+            if kind == b"string" and isinstance(begins, bytes) and is_document(begins):
+                found |= _named(session, name)
+    return sorted(found)
+
+
+def _named(session: Session, document: bytes) -> set[str]:
+    try:
+        return {session.keys(document.decode()[len(session.namespace) :]).name}
+    except (UnicodeDecodeError, BadKey):
+        return set()
+
+
+class TextConverter:
+    """Gives one document to the server's JSON: what its text says, floats to the last bit. Arrays stay."""
+
+    def __init__(self, session: Session, name: str) -> None:
+        self.session = session
+        self._writer = DocumentPublisher(session, name)
+        self.keys = self._writer.keys
+
+    async def run(self, *, dry_run: bool) -> None:
+        """Convert it, in one transaction, or see whether that can be done; two round trips.
+
+        Raises:
+            BadData: It is no JSON, or the server's JSON does not take it. It is left as it is.
+        """
+        await self._writer.in_turn(self._send, dry_run)
+        self.session.cache.forget_shapes(self.keys.document)
+
+    async def _send(self, turn: Turn, dry_run: bool) -> None:
+        await self.session.run(self._look(turn.without_value(), dry_run, _TRIES))
+
+    def _look(self, telling: Telling, dry_run: bool, tries: int) -> Plan:
+        def decode(replies: Sequence[Reply]) -> Plan:
+            permitted(replies[0], self.keys.document)
+            text = replies[1] if isinstance(replies[1], bytes | bytearray) else b""  # deleted, or replaced, meanwhile
+            ready = settable(bytes(text[1:])) if is_document(text) else b""
+            if dry_run or not ready:
+                return Plan([("UNWATCH",)], lambda _: None, held=True)
+            return self._change(telling, ready, tries)
+
+        return Plan([("WATCH", self.keys.document), ("GET", self.keys.document)], decode, held=True)
+
+    def _change(self, telling: Telling, text: bytes, tries: int) -> Plan:
+        # Under another name first, since JSON.SET refuses a key that holds a string, and a DEL before it could not be
+        # undone if the text turned out not to be JSON: EXEC goes on behind an error.
+        coming = f"{self.keys.tag}{STAGED}{secrets.token_hex(5)}"
+        commands: list[Command] = [
+            ("JSON.SET", coming, "$", text),
+            ("RENAME", coming, self.keys.document),  # refused if that was: then all stays as it is
+            *telling.make(()),
+        ]
+
+        def decode(replies: Sequence[Reply] | None) -> Plan | None:
+            if replies is not None:
+                for reply in replies[:2]:
+                    if isinstance(reply, Exception):
+                        raise BadData(f"{self.keys.name}: the server does not take its text as JSON: {reply}")
+                return None
+            telling.take_back()
+            if not tries:
+                raise BadData(f"{self.keys.name}: it was changed {_TRIES} times meanwhile; end what writes to it")
+            return self._look(telling, False, tries - 1)
+
+        return Plan(commands, decode, atomic=True, held=True)

@@ -1,0 +1,170 @@
+"""From the parts of an old key to its value. Pure; nothing that was read is evaluated."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ...errors import BadData
+from ...plan.olddata import ROOT, candidates
+from ...plan.paths import Path, shorten
+from ...ships.numpy import NumpyShip
+
+__all__ = ["ARRAY_FIELDS", "ARRAY_LABEL", "Tree", "array_of", "is_array"]
+
+ARRAY_LABEL = "default_numpy_handler"
+"""The label of the ship for arrays."""
+
+ARRAY_FIELDS = frozenset({b"arr", b"dtype", b"shape"})
+_MORE_FIELDS = frozenset({b"strides"})
+
+_NAMED = re.compile(r"bool|u?int(?:8|16|32|64)|float(?:16|32|64)|complex(?:64|128)")
+_TIME = re.compile(r"(datetime64|timedelta64)(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
+_SHAPE = re.compile(r"\((?:\d{1,15}L?(?:, ?\d{1,15}L?)*,?)?\)")
+# Bytes of the text of a dtype or a shape that are looked at: more is none.
+_LONGEST = 1 << 15
+
+
+def is_array(fields: frozenset[bytes]) -> bool:
+    """Return whether a hash with these fields is an array."""
+    return fields >= ARRAY_FIELDS and fields <= ARRAY_FIELDS | _MORE_FIELDS
+
+
+def array_of(fields: Any) -> np.ndarray[Any, Any]:
+    """Return the array in an old hash, checked as the ship for arrays checks what it reads.
+
+    The bytes are in C order whatever the strides say, which were those in the memory of who wrote it.
+
+    Raises:
+        BadData: Not an array of plain data.
+    """
+    if not isinstance(fields, Mapping) or not fields.keys() >= ARRAY_FIELDS:
+        raise BadData("the array is gone from the server, or something else is in its place")
+    # Old programs stored repr() of both: texts that look like Python, and are matched, never evaluated.
+    dtype, shape = _text(fields[b"dtype"]), _text(fields[b"shape"])
+    if not _SHAPE.fullmatch(shape):
+        raise BadData(f"an array has the shape {shorten(shape)}, which is none")
+    header = f"{{'descr': {_description(dtype)}, 'fortran_order': False, 'shape': {shape.replace('L', '')}, }}".encode()
+    # It is read as the .npy file that it might have been, by the reader that checks everything.
+    start = b"\x93NUMPY\x03\x00" + len(header).to_bytes(4, "little")
+    try:
+        return NumpyShip().unpack(start + header + bytes(fields[b"arr"]))
+    except BadData as error:
+        raise BadData(f"the array of dtype {shorten(dtype)} and shape {shape} cannot be converted: {error}") from None
+
+
+def _text(value: Any) -> str:
+    try:
+        return bytes(value[:_LONGEST]).decode()
+    except UnicodeDecodeError:
+        return repr(value[:20])
+
+
+def _description(dtype: str) -> str:
+    """Return the text of a dtype as it stands in the header of an .npy file, whose reader checks it."""
+    if _NAMED.fullmatch(dtype):
+        return repr(np.dtype(dtype).str)
+    if found := _TIME.fullmatch(dtype):
+        return repr(f"<{'M' if found[1] == 'datetime64' else 'm'}8{found[2] or ''}")
+    return dtype if dtype.startswith("[") else repr(dtype)
+
+
+class Tree:
+    """A document, while the values of its ships are put into it.
+
+    Args:
+        holder: The document in a list of one, an empty list if there is none.
+        kept: Container and key of what ships of today hold there: it is newer, and stays.
+    """
+
+    def __init__(self, holder: list[Any], kept: list[tuple[Any, Any]]) -> None:
+        self._holder = holder
+        # By identity: containers are compared by value otherwise, and equal ones may stand in several places.
+        self._kept = {(id(container), key) for container, key in kept}
+
+    def put(self, place: str, value: Any) -> bool:
+        """Put a ship's value at an old place, as old programs read it: in place of what JSON holds there.
+
+        Returns whether it was put: not if a ship of today holds something there.
+
+        Raises:
+            BadData: The place is inside of something that has no entries.
+        """
+        found = self._slot(place)
+        if (id(found[0]), found[1]) in self._kept:
+            return False
+        container, key = found
+        if key == len(container) and isinstance(container, list):
+            container.append(value)
+        else:
+            container[key] = value
+        return True
+
+    def holds(self, place: str) -> bool:
+        """Return whether a ship of today holds something at an old place; changes nothing."""
+        for path in candidates(place):
+            found = self._find(path)
+            if found is not None and (id(found[0]), found[1]) in self._kept:
+                return True
+        return False
+
+    def root(self) -> list[Any]:
+        """Return the whole value in a list of one, empty if there is none; taken out of the dict made for it.
+
+        Raises:
+            BadData: There are entries beside it, which old programs read by path only.
+        """
+        if not self._holder or not isinstance(self._holder[0], dict) or ROOT not in self._holder[0]:
+            return self._holder
+        others = sorted(self._holder[0].keys() - {ROOT})
+        if others:
+            raise BadData(
+                f"it holds both a value and, beside it, {', '.join(map(shorten, others[:3]))}, which no key can any "
+                f"more; delete one: redis-cli JSON.DEL KEY '$[\"{ROOT}\"]' or JSON.DEL KEY '$[\"{others[0]}\"]'"
+            )
+        return [self._holder[0][ROOT]]
+
+    def _find(self, path: Path) -> tuple[Any, Any] | None:
+        """Return container and key of a path that is there."""
+        if path and path[0] == ROOT and self._holder and not isinstance(self._holder[0], dict):
+            path = path[1:]  # it was taken out of its dict already
+        container: Any = self._holder
+        key: Any = 0
+        for step in path:
+            if not _has(container, key):
+                return None
+            container, key = container[key], step
+        if not _has(container, key):
+            return None
+        return container, key + len(container) if isinstance(key, int) and key < 0 else key
+
+    def _slot(self, place: str) -> tuple[Any, Any]:
+        """Return the container and the key to set; makes missing dicts on the way, as old programs did in reading."""
+        found = candidates(place)
+        for path in found:
+            slot = self._find(path)
+            if slot is not None:
+                return slot
+        container: Any = self._holder
+        key: Any = 0
+        for step in found[-1]:
+            if not _has(container, key):
+                if isinstance(container, list):
+                    container.append({})
+                else:
+                    container[key] = {}
+            container, key = container[key], step
+            if not isinstance(container, dict):
+                raise BadData(f"{place} is inside of a value of type {type(container).__name__}, which has no entries")
+        return container, key
+
+
+def _has(container: Any, key: Any) -> bool:
+    if isinstance(container, dict):
+        return key in container
+    if isinstance(container, list) and isinstance(key, int):
+        return -len(container) <= key < len(container)
+    return False

@@ -1,0 +1,76 @@
+"""What the values in the tree are made of, to tell later whether another one is the same.
+
+A value that is read again is compared by a digest. Most are never read again: a frame of a camera is replaced
+long before. So the bytes are kept for a moment, and a digest is made only of what stays.
+"""
+
+from __future__ import annotations
+
+import collections
+import time
+import weakref
+from typing import Any
+
+from .yielding import digest
+
+__all__ = ["Content", "Recent"]
+
+_MOMENT = 1.0
+"""Seconds for which bytes are kept."""
+# Bytes that are kept at most: a second of two cameras.
+_MOST_KEPT = 64 << 20
+
+
+class Content:
+    """The bytes of one value, later only a digest of them.
+
+    Args:
+        head, body: The bytes; nobody changes them.
+
+    Attributes:
+        size: How many bytes of memory are kept for it.
+    """
+
+    __slots__ = ("__weakref__", "_digest", "_pieces", "size")
+
+    def __init__(self, head: bytes, body: Any = b"") -> None:
+        self._pieces: tuple[bytes, Any] = head, body
+        self._digest = b""
+        self.size = len(head) + len(body)
+
+    def digest(self) -> bytes:
+        """Return 16 bytes that tell it from any other, and let go of its own."""
+        if not self._digest:
+            # The digest takes the place of the bytes, which may be a frame of a camera.
+            self._digest = digest(*self._pieces)
+            self._pieces = b"", b""
+            self.size = 0
+        return self._digest
+
+
+class Recent:
+    """The contents of the last moment. Does not keep them: those of values that were replaced are gone."""
+
+    def __init__(self) -> None:
+        self._queue: collections.deque[tuple[float, int, weakref.ref[Content]]] = collections.deque()
+        self._kept = 0
+
+    def add(self, content: Content) -> None:
+        """Take note of a content; if too many bytes are kept, the oldest are let go of."""
+        self._queue.append((time.monotonic(), content.size, weakref.ref(content)))
+        self._kept += content.size
+        while self._kept > _MOST_KEPT:
+            self._settle()
+
+    def tick(self) -> None:
+        """Let go of bytes that have been kept for a moment."""
+        late = time.monotonic() - _MOMENT
+        while self._queue and self._queue[0][0] < late:
+            self._settle()
+
+    def _settle(self) -> None:
+        _, size, reference = self._queue.popleft()
+        self._kept -= size
+        content = reference()
+        if content is not None:
+            content.digest()

@@ -1,0 +1,333 @@
+"""Recordings as CSV, npz or Parquet."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from ...errors import BadData, BadValue
+from ...plan.paths import Path, suffix
+from ...plan.trees import MISSING
+from ..partfile import PartFile
+from .history import EXACT, numbers
+from .log import Log
+from .roles import Kind
+from .stored import Stored, is_inline
+
+__all__ = ["FORMATS", "Export", "export"]
+
+# Rows of a group in a Parquet file, and those that are in memory at once.
+_ROWS = 10_000
+_DELETED, _STORED = "", "."
+"""What stands for the columns of what was deleted and what was only stored until their names are known: no path has
+these names."""
+
+
+class Export:
+    """What became of an export.
+
+    Attributes:
+        rows: Rows written, or instants of all paths together.
+        columns: What was written, by name.
+        left_out: What this format cannot hold, by path, and why.
+        time: The name of the column of instants: "time", unless there is a path of this name.
+        deleted: The name of the column of paths that were deleted, "" if there is none.
+        stored: The name of the column of paths that were only stored, "" if there is none.
+        unreadable: How many updates were left out, since they are damaged or of a type that was not recorded.
+    """
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.columns: list[str] = []
+        self.left_out: dict[str, str] = {}
+        self.time = "time"
+        self.deleted = ""
+        self.stored = ""
+        self.unreadable = 0
+
+    def begin(self, columns: Iterable[str]) -> None:
+        """Take the names of the columns, with those for what was deleted or only stored; BadValue if there is no other.
+
+        These two come last, so that tables of recordings without them are as they always were.
+        """
+        given = list(columns)
+        self.columns = [name for name in given if name not in (_DELETED, _STORED)]
+        if not self.columns:
+            raise BadValue("nothing of this can be exported so: no number or text was recorded under these patterns")
+        while self.time in self.columns:
+            self.time = f"_{self.time}"
+        if _DELETED in given:
+            self.deleted = self._add("deleted")
+        if _STORED in given:
+            self.stored = self._add("stored")
+
+    def _add(self, name: str) -> str:
+        while name in self.columns:
+            name = f"_{name}"
+        self.columns.append(name)
+        return name
+
+    def named(self, cells: dict[str, Any]) -> dict[str, Any]:
+        """Return a row by the names of its columns."""
+        return cells | {self.deleted: cells.get(_DELETED), self.stored: cells.get(_STORED)}
+
+
+def export(
+    log: Log, kind: str, target: str | FilePath, patterns: Sequence[str] = ("*",), *, overwrite: bool = False
+) -> Export:
+    """Write what was recorded into a file that other programs read.
+
+    Args:
+        log: The recording.
+        kind: "csv" or "parquet": a row for each update, a column for each number or text, empty where it
+            was not updated; an empty dict or list is the text "{}" or "[]". What was deleted is in the column
+            "deleted" of a row of its own; the column "stored" has the path where a row is not of an update that was
+            published but of a change of what is stored. Both are there only if something is in them. Arrays of more
+            than 64 numbers are left out and named in the result; an update of nothing else has no row. "npz": for
+            each path an array of all its values, time
+            first, and `path.time`; deletions and empty dicts are left out and named.
+        target: The file. It appears once it is complete.
+        patterns: Which paths.
+        overwrite: Replace the file if it exists.
+
+    Raises:
+        BadValue: Another kind, the file exists, or there is nothing to write.
+        OSError: It cannot be written.
+    """
+    if kind not in FORMATS:
+        raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
+    target = FilePath(target)
+    if target.exists() and not overwrite:
+        raise BadValue(f"{target} is there already; choose another name, or replace it with overwrite=True")
+    result = Export()
+    try:
+        part = PartFile(target)
+        try:
+            # Under a hidden name: a program that waits for the file never sees a half one.
+            FORMATS[kind](log, part.path, patterns, result)
+            part.finish()
+        finally:
+            part.close()
+    except OSError as error:
+        file = str(log.path if error.filename == str(log.path) else target)
+        raise OSError(error.errno, error.strerror or str(error), file) from error
+    result.unreadable = log.unreadable
+    return result
+
+
+def _rows(log: Log, patterns: Sequence[str], result: Export) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield the time of each update and its numbers and texts by name.
+
+    Of a deletion the path is under _DELETED, of what was only stored under _STORED.
+    """
+    for time, path, value, kind in log.outlines_of(patterns):
+        cells = {_DELETED: _name(path)} if value is MISSING else dict(_leaves(path, value, result))
+        if cells:
+            yield time, cells | ({_STORED: _name(path)} if kind == Kind.STORED else {})
+
+
+def _leaves(path: Path, value: Any, result: Export) -> Iterator[tuple[str, Any]]:
+    """Yield everything that fits into a cell, by the text of its path."""
+    if isinstance(value, np.ndarray) and is_inline(value):
+        value = value.tolist()
+    if isinstance(value, dict | list):
+        if not value:
+            yield _name(path), str(value)
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves((*path, key), item, result)
+    elif value is None or isinstance(value, bool | int | float | str):
+        yield _name(path), value
+    else:
+        result.left_out.setdefault(_name(path), "an array, a long list, or bytes; npz has arrays")
+
+
+def _name(path: Path) -> str:
+    return suffix(path).removeprefix(".")
+
+
+def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    """Write rows; the columns must be known first, so it is read twice."""
+    columns: dict[str, None] = {}
+    for _, cells in _rows(log, patterns, result):
+        columns.update(dict.fromkeys(cells))
+    result.begin(columns)
+    with target.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        # Another Export below: what is left out was counted by the first pass.
+        writer.writerow([result.time, *result.columns])
+        for time, cells in _rows(log, patterns, Export()):
+            result.rows += 1
+            row = result.named(cells)
+            writer.writerow([f"{time:.6f}", *[row.get(name) for name in result.columns]])
+
+
+def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    try:
+        pyarrow: Any = import_module("pyarrow")
+        parquet: Any = import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
+    kinds: dict[str, set[type]] = {}
+    for _, cells in _rows(log, patterns, result):
+        for name, value in cells.items():
+            kinds.setdefault(name, set()).add(_kind(value))
+    result.begin(kinds)
+    kinds |= {result.deleted: {str}, result.stored: {str}}
+    # None stands for an empty cell in every type.
+    forms = {name: _form(found - {type(None)}) for name, found in kinds.items()}
+    arrow = {
+        bool: pyarrow.bool_(),
+        int: pyarrow.int64(),
+        float: pyarrow.float64(),
+        str: pyarrow.string(),
+    }
+    fields = [(result.time, pyarrow.timestamp("us", "UTC")), *[(name, arrow[forms[name]]) for name in result.columns]]
+    schema = pyarrow.schema(fields)
+    rows = _rows(log, patterns, Export())
+    with parquet.ParquetWriter(target, schema) as writer:
+        while batch := list(itertools.islice(rows, _ROWS)):
+            data: dict[str, list[Any]] = {result.time: [round(time * 1e6) for time, _ in batch]}
+            lines = [result.named(cells) for _, cells in batch]
+            for name in result.columns:
+                data[name] = [_cell(line.get(name), forms[name]) for line in lines]
+            writer.write_table(pyarrow.table(data, schema=schema))
+            result.rows += len(batch)
+
+
+class _Long(int):
+    """The kind of ints that floats would round."""
+
+
+def _kind(value: Any) -> type:
+    """Return the type of a cell; ints that no column of integers holds are text."""
+    if type(value) is not int or -EXACT <= value <= EXACT:
+        return type(value)
+    # Text for what no 64-bit integer holds.
+    return _Long if -(2**63) <= value < 2**63 else str
+
+
+def _form(kinds: set[type]) -> type:
+    """Return the one type that holds values of all these exactly."""
+    if kinds and kinds <= {int, _Long}:
+        return int
+    if len(kinds) == 1:
+        return next(iter(kinds))
+    return float if kinds == {int, float} else str
+
+
+def _cell(value: Any, form: type) -> Any:
+    if value is None:
+        return None
+    return value if type(value) is form else form(value)
+
+
+def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    """Write each path as it is read, array by array: a recording may be larger than memory."""
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for path in _array_paths(log, patterns, result):
+            try:
+                times, form, count = _shape(log, path)
+            except BadData as error:
+                result.left_out[_name(path)] = str(error)
+                continue
+            if form is None:
+                result.left_out[_name(path)] = "its type or shape changes, or no dtype holds it exactly"
+                continue
+            result.rows += count
+            result.columns.append(_name(path))
+            _write(archive, f"{_name(path)}.time", times)
+            # The header says how many there are, so they were counted first; then each is written as it is read.
+            dtype, shape = form
+            with archive.open(f"{_name(path)}.npy", "w", force_zip64=True) as file:
+                header = {
+                    "descr": np.lib.format.dtype_to_descr(dtype),
+                    "fortran_order": False,
+                    "shape": (count, *shape),
+                }
+                np.lib.format.write_array_header_2_0(file, header)
+                for _, value in itertools.islice(log[path].values(), count):
+                    file.write(np.ascontiguousarray(np.asarray(value, dtype)).tobytes())
+    result.begin(result.columns)
+
+
+def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, allow_pickle=False)
+    archive.writestr(f"{name}.npy", buffer.getvalue())
+
+
+def _array_paths(log: Log, patterns: Sequence[str], result: Export) -> list[Path]:
+    """Return the paths of everything in any update that may be stacked."""
+    found: dict[Path, None] = {}
+    for _, path, tree, _ in log.outlines_of(patterns):
+        if tree is MISSING:
+            result.left_out.setdefault(f"{_name(path)} (deleted)", "npz has values only; csv and parquet have a row")
+        else:
+            found.update(dict.fromkeys(_places(path, tree, result)))
+    return sorted(found, key=_name)
+
+
+def _places(path: Path, value: Any, result: Export) -> Iterator[Path]:
+    if isinstance(value, dict):
+        if not value:
+            result.left_out.setdefault(_name(path), "an empty dict; csv and parquet have it")
+        for key, item in value.items():
+            yield from _places((*path, key), item, result)
+    elif isinstance(value, list) and not all(isinstance(item, bool | int | float) for item in value):
+        for index, item in enumerate(value):
+            yield from _places((*path, index), item, result)
+    elif isinstance(value, Stored) and value.label not in ("numpy", "list"):
+        result.left_out[_name(path)] = f"{value.label}, not an array"
+    elif value is not None:
+        yield path
+
+
+Form = tuple[np.dtype[Any], tuple[int, ...]]
+
+
+def _shape(log: Log, path: Path) -> tuple[np.ndarray[Any, Any], Form | None, int]:
+    """Return the times of a path's values, the dtype and shape that fit all (None if none does), and how many."""
+    times: list[float] = []
+    forms: set[Form] = set()
+    largest = 0
+    for time, value in log[path].values():
+        times.append(time)
+        array = _array(value)
+        if array is None or array.dtype.hasobject:
+            return np.array(times), None, 0
+        forms.add((array.dtype, array.shape))
+        if array.dtype.kind in "iu" and array.size:
+            largest = max(largest, int(array.max()), -int(array.min()))
+    # Numbers may be mixed if a wider type holds them all; texts of different lengths too.
+    kinds = {dtype.kind for dtype, _ in forms}
+    if len({shape for _, shape in forms}) != 1 or not (len(forms) == 1 or kinds <= set("iuf") or kinds == {"U"}):
+        return np.array(times), None, 0
+    dtype = np.result_type(*[dtype for dtype, _ in forms])
+    # Integers beside floats, too large to be floats without loss.
+    if dtype.kind == "f" and largest > EXACT:
+        return np.array(times), None, 0
+    return np.array(times), (dtype, next(iter(forms))[1]), len(times)
+
+
+def _array(value: Any) -> np.ndarray[Any, Any] | None:
+    """Return one value as an array that holds it exactly, None if there is none."""
+    if isinstance(value, list):
+        return numbers(value) if value else np.empty(0)
+    if isinstance(value, str) and value.endswith("\0"):  # numpy would take that for padding
+        return None
+    return np.asarray(value) if isinstance(value, bool | int | float | str | np.ndarray) else None
+
+
+FORMATS: dict[str, Callable[[Log, FilePath, Sequence[str], Export], None]] = {
+    "csv": _csv,
+    "npz": _npz,
+    "parquet": _parquet,
+}

@@ -1,0 +1,250 @@
+"""One top-level key while it is recorded: its updates in order, those that are only announced fetched.
+
+While a value is on its way the updates behind it wait (`key_queue.py`), so that what is written is in the order in
+which it was published. When the server says that something was changed, the whole is read a moment later: what
+differs then from all that was published was only stored.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from functools import partial
+from typing import Any, Protocol
+
+from ...concurrency.tasks import started
+from ...errors import BadData, Conflict, RedisError, WrongKind
+from ...plan.paths import Path, show
+from ...plan.patterns import Pattern
+from ...plan.trees import MISSING
+from ...pubsub.looks import Looks
+from ...pubsub.monitor import ANNOUNCED, Event
+from ...session import Session
+from .fetch import Fetched
+from .key_queue import KeyQueue
+from .key_reader import KeyReader
+from .order import Item, skipped
+from .roles import Kind, Role
+from .state import pruned
+from .times import Arrivals, Clock, published
+from .writer_thread import Operation, WriterThread
+
+__all__ = ["Collector", "KeyRecorder"]
+
+logger = logging.getLogger("reem.recording")
+
+_PAUSE = 0.1
+"""Seconds after a read that failed."""
+_LET_PASS = 0.004
+"""Seconds, at most, from a large update to reading it. The server is busy with its publisher, others wait behind
+that: reading it in the same moment would make them wait twice as long. A recorder has time."""
+_FAST = 20_000_000
+"""Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
+_READ_RATE = 8e6
+"""Bytes a second of each key that are read for what is only stored."""
+_QUICKEST, _SLOWEST = 0.02, 0.5
+"""Seconds from a change that a notice came with to the look for what was stored besides; see `Looks`."""
+_PATIENCE = 0.015
+"""Seconds in which the notice of a change is taken: longer than those for which updates wait for each other."""
+
+
+class Collector(Protocol):
+    """What a feed needs of the recorder."""
+
+    session: Session
+    writer_thread: WriterThread
+    clock: Clock
+    arrivals: Arrivals
+    patterns: list[Pattern]
+    fetching: asyncio.Semaphore
+
+    async def fence(self) -> None:
+        """Wait until everything published before now has been handed to the feeds."""
+
+    def hurry(self) -> None:
+        """Look more often at what was published: large updates come fast."""
+
+    def failed(self, error: Exception) -> None:
+        """End the recording: something went wrong that should not."""
+
+    @property
+    def hears_of_changes(self) -> bool:
+        """Whether the server tells which keys are changed."""
+
+
+class KeyRecorder:
+    """The updates of one top-level key.
+
+    Args:
+        collector: The recorder.
+        name: The key.
+
+    Attributes:
+        busy: The task that fetches, None if there is nothing to fetch.
+        news: The whole was published since the last keyframe.
+        absent: The key is not on the server, as far as is known here.
+        looks: When to look for what was only stored.
+    """
+
+    def __init__(self, collector: Collector, name: str) -> None:
+        self._collector = collector
+        self._name = name
+        self._queue = KeyQueue()
+        keys = collector.session.keys(name)
+        self._reader = KeyReader(collector.session, keys, self._queue, collector.fence, collector.fetching)
+        self._known = False
+        self._complaint = ""  # why it could not be read the last time
+        self._last_large = 0  # the log time of the last update that was fetched
+        self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
+        self.busy: asyncio.Task[None] | None = None
+        self.news = False
+        self.absent = False
+        self.looks = Looks(self, KeyRecorder._look, _QUICKEST, _SLOWEST, _PATIENCE)
+
+    def on_event(self, event: Event) -> None:
+        """Take one update."""
+        arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
+        stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
+        self.news = self.news or len(event.path) == 1
+        self.looks.heard += 1
+        if event.missed:  # a broken connection is noticed by the recorder, for all keys
+            self.lost(event.missed)
+        elif not self._known and len(event.path) > 1:
+            self.read()
+        self._known = self._known or len(event.path) == 1
+        self.follow()
+        if not self._queue.hear(event):
+            return
+        if self._whole or any(pattern.concerns(event.path) for pattern in self._collector.patterns):
+            role = Role.DELETE if event.deleted else Role.UPDATE
+            self._add(Item(role, event.path, event.value, stamp, self._queue.order, event.size))
+
+    def lost(self, missed: int | None) -> None:
+        """Note that updates were lost, and read the key anew."""
+        self._reader.forget()
+        self._queue.order += 1
+        self._add(self._item(Role.GAP, missed))
+        self.read()
+
+    def read(self) -> None:
+        """Read the whole key from the server, if that is not about to happen anyway."""
+        self._known = True
+        self._queue.doubt()
+        if not self._queue.will_read(Role.STATE):
+            self._add(self._item(Role.STATE, ANNOUNCED))
+
+    def follow(self) -> None:
+        """See to it that the server tells what is changed; what was stored until then is looked for."""
+        if not self._reader.told and self._collector.hears_of_changes:
+            self.looks.ask()
+
+    def changed(self, key: str | None) -> None:
+        """Take the server's word that a key was changed, the document's or an attachment's; None for every key."""
+        if self._reader.changed(key):
+            self.looks.ask()
+
+    def _look(self) -> None:
+        """See what was changed."""
+        written = self._collector.writer_thread.stored
+        if self._name in written:  # by the last look
+            written.discard(self._name)
+            self.looks.found()
+        if not self._queue.will_read(Role.STATE, Role.STORED):
+            now = self._collector.clock.stamp()
+            self._add(Item(Role.STORED, (self._name,), ANNOUNCED, (now, now, 0), self._queue.order))
+
+    def keyframe(self, number: int) -> None:
+        """Write the whole key as the recording has it."""
+        self._add(self._item(Role.KEYFRAME, None, number))
+
+    def sampled(self, path: Path, value: Any, size: int) -> None:
+        """Take what was read at a path: MISSING if there was nothing."""
+        now = self._collector.clock.stamp()
+        self._add(Item(Role.SAMPLE, path, value, (now, now, 0), self._queue.order, size))
+
+    def _item(self, role: Role, value: Any, number: int = 0) -> Item:
+        return Item(role, (self._name,), value, (self._collector.clock.stamp(), 0, number), self._queue.order)
+
+    def _add(self, item: Item) -> None:
+        if not self._queue.items and item.value is not ANNOUNCED:
+            self._emit(item)
+            return
+        self._queue.items.append(item)
+        if self.busy is None:
+            self.busy = started(self._drain(), f"reem record {self._name}")
+
+    def _emit(self, item: Item) -> None:
+        """Hand an item to the writing thread."""
+        role, value = item.role, item.value
+        if not self._whole and role in (Role.STATE, Role.STORED, Role.UPDATE, Role.FOUND):
+            value = value if value is MISSING else pruned(value, item.path, self._collector.patterns)
+        if role in (Role.UPDATE, Role.SAMPLE, Role.FOUND):
+            role = Role.DELETE if value is MISSING else Role.UPDATE
+        elif role == Role.SKIP:
+            self._collector.writer_thread.counts.skip(item.path)
+        if role in (Role.STATE, Role.STORED, Role.UPDATE, Role.DELETE) and (role != Role.DELETE or len(item.path) == 1):
+            self.absent = role == Role.DELETE or value is MISSING
+        kind = Kind.STORED if role == Role.STORED else Kind.READ  # read: nobody knows who wrote it
+        kind = Kind.PUBLISHED if item.changes else kind
+        if not self._collector.writer_thread.put(Operation(role, item.path, value, item.stamp, kind), item.size):
+            self._reader.forget()
+
+    async def _drain(self) -> None:
+        """Emit what waits, in order, fetching what has to be."""
+        try:
+            while self._queue.items:
+                for item in self._queue.ready():
+                    self._emit(item)
+                if self._queue.items and not await self._fetched(self._queue.items[0]):
+                    await asyncio.sleep(_PAUSE)
+        except Exception as error:  # nobody waits for this task: the recording must not go on as if nothing were
+            self._collector.failed(error)
+        finally:
+            self.busy = None
+
+    async def _fetched(self, head: Item) -> bool:
+        """Fetch what the first item announces, and give it and those that came meanwhile their values.
+
+        Returns whether that worked.
+        """
+        try:
+            found = await self._read(head)
+        except (RedisError, OSError, BadData, Conflict) as error:
+            self._give_up(head, error)
+            return False
+        self._complaint = ""
+        if head.is_whole:
+            self.looks.earliest = asyncio.get_running_loop().time() + found.size / _READ_RATE
+        if self._queue.settle(found.value, found.size):
+            self.read()
+        return True
+
+    async def _read(self, head: Item) -> Fetched:
+        """Read what the first item announces."""
+        if head.role == Role.STATE:
+            self._reader.forget()
+        if head.is_whole:
+            return await self._reader.whole()
+        return await self._reader.part(head.path[1:], partial(self._let_pass, head))
+
+    async def _let_pass(self, head: Item) -> None:
+        """Wait until the server is done with the publisher of a large update, unless they come fast."""
+        collector = self._collector
+        since, self._last_large = head.stamp[0] - self._last_large, head.stamp[0]
+        if since < _FAST:
+            collector.hurry()
+        let_pass = min(_LET_PASS, since / 1e9 / 5)  # none should be missed
+        await asyncio.sleep(let_pass - collector.clock.since(head.stamp[0]))
+
+    def _give_up(self, head: Item, error: Exception) -> None:
+        """Leave out what cannot be fetched; the key is read anew later: soon, or at a keyframe if it is no value."""
+        if self._complaint != str(error):
+            logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
+        counts, first, self._complaint = self._collector.writer_thread.counts, not self._complaint, str(error)
+        self._queue.items.popleft()
+        if head.role == Role.UPDATE:
+            self._emit(skipped(head))
+        elif first:
+            counts.lose(head.path)
+        if not isinstance(error, BadData | WrongKind):
+            self._collector.writer_thread.behind.add(self._name)

@@ -1,0 +1,340 @@
+"""Recordings, read: what was anywhere at any instant."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path as FilePath
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from ...errors import MissingKey
+from ...plan.differences import same
+from ...plan.paths import Path, parse, show
+from ...plan.patterns import parse_pattern
+from ...plan.trees import MISSING
+from ...ships.base import SpecialDatatypeShip
+from ...ships.registry import Ships, default_ships
+from ...store.catalog import Outline
+from ...transport.recorder import CommandRecorder
+from .container import Container
+from .entries import ArrayHandle, ChannelSummary, LogUpdate
+from .history import stacked
+from .log_reader import Past, Stream
+from .outlines import outlined
+from .roles import Role
+from .state import pruned
+from .stored import Stored, resolve
+from .timeline import Ref, Totals
+from .times import Instant, nanoseconds, seconds
+
+__all__ = ["ArrayHandle", "ChannelSummary", "Log", "LogPath", "LogUpdate", "open_log"]
+
+# Whole keys as they were at some instant: who goes through time, or draws a slider, asks for neighbours again and
+# again.
+_CACHED_TREES = 256
+_END = 2**63 - 1
+
+
+def open_log(
+    path: str | FilePath,
+    ships: Sequence[SpecialDatatypeShip] | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> Log:
+    """Open a recording; one whose recorder was killed, or that was damaged, opens too.
+
+    If somebody replaces the file while it is open, the old one is read on. If somebody cuts it short, whatever
+    reads beyond its new end raises OSError.
+
+    Args:
+        path: The file.
+        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
+        progress: Is told the bytes done and all of them, where the file must be gone through: its recorder was
+            killed, or its index is damaged.
+
+    Raises:
+        DamagedRecording: Not a recording of REEM.
+        OSError: The file cannot be read.
+    """
+    return Log(path, ships, progress=progress)
+
+
+class Log:
+    """A recording. `log["foo.bar"].at(t)` is what was at foo.bar at the instant t.
+
+    Instants are seconds since 1970 as float, on the clock of the recorder, or numpy datetime64.
+    Any thread may use it; nothing here waits for a server.
+
+    Args:
+        path: The file.
+        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
+        progress: See `open_log`.
+    """
+
+    def __init__(
+        self,
+        path: str | FilePath,
+        ships: Sequence[SpecialDatatypeShip] | None = None,
+        *,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.path = FilePath(path)
+        self._container = Container(self.path, progress)
+        try:
+            self._past = Past(self._container, Ships(default_ships() if ships is None else ships, CommandRecorder))
+        except BaseException:
+            self._container.close()
+            raise
+        self._trees: OrderedDict[tuple[str, int], Any] = OrderedDict()
+        self._lock = threading.RLock()
+
+    @property
+    def start(self) -> float:
+        """The instant of the first message; 0 if there is none."""
+        return seconds(min((info.start for info in self._container.chunks), default=0))
+
+    @property
+    def end(self) -> float:
+        """The instant of the last message; 0 if there is none."""
+        return seconds(max((info.end for info in self._container.chunks), default=0))
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first message to the last."""
+        return self.end - self.start
+
+    @property
+    def indexed(self) -> bool:
+        """Whether the recording was ended properly; if not, its end may be missing."""
+        return self._container.indexed
+
+    @property
+    def damaged(self) -> int:
+        """How many records of the file were found to be damaged until now; they are skipped."""
+        return self._container.damaged
+
+    @property
+    def unreadable(self) -> int:
+        """How many updates were left out until now, since they are damaged, or of a type that was not recorded."""
+        return max(self._past.unreadable, self._container.left_out)
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the recorder says of itself: who, when, versions, patterns, and at the end its counts."""
+        said: dict[str, str] = {}
+        for record in self._container.metadata:
+            if record.name == "reem":
+                said.update(record.metadata)
+        return said
+
+    def names(self) -> list[str]:
+        """Return the top-level keys of which anything was recorded, sorted."""
+        return sorted(self._past.names)
+
+    def paths(self) -> list[Path]:
+        """Return the paths that were updated while it was recorded, sorted as text."""
+        return sorted({stream.path for stream in self._past.streams if stream.role == Role.UPDATE}, key=show)
+
+    def __getitem__(self, path: str | Path) -> LogPath:
+        return LogPath(self, parse(path) if isinstance(path, str) else tuple(path))
+
+    def value_at(self, path: str | Path, instant: Instant) -> Any:
+        """Return what was at a path at an instant, arrays included; the root path "" is the whole tree.
+
+        Raises:
+            MissingKey: Nothing was there.
+            DamagedRecording: What was there cannot be read any more.
+        """
+        place = parse(path) if isinstance(path, str) else tuple(path)
+        if not place:
+            trees = self._trees_at(nanoseconds(instant))
+            return {name: resolve(tree, self._past.value) for name, tree in trees.items()}
+        found = self._at(place, nanoseconds(instant))
+        if found is MISSING:
+            raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
+        return resolve(found, self._past.value)
+
+    def tree_at(self, instant: Instant) -> dict[str, Any]:
+        """Return all that there was at an instant: a dict by top-level key; longer arrays as `ArrayHandle`."""
+        trees = self._trees_at(nanoseconds(instant))
+        return {name: resolve(tree, self._handle) for name, tree in trees.items()}
+
+    def _handle(self, it: Stored) -> ArrayHandle:
+        return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._past)
+
+    def outline_at(self, instant: Instant) -> dict[str, Outline]:
+        """Return what there was at an instant by top-level key: types and sizes; arrays are not read."""
+        return {name: outlined(tree, (name,)) for name, tree in self._trees_at(nanoseconds(instant)).items()}
+
+    def _trees_at(self, ns: int) -> dict[str, Any]:
+        found = [(name, self._tree(name, ns)) for name in self.names()]
+        return {name: tree for name, tree in found if tree is not MISSING}
+
+    def _tree(self, name: str, ns: int) -> Any:
+        """Return a whole key; the last few hundred are kept, as neighbours in time share them."""
+        with self._lock:
+            changed = self._past.changed(name, ns)
+            tree = self._trees.pop((name, changed), None)
+            tree = self._past.tree((name,), ns) if tree is None else tree
+            self._trees[name, changed] = tree
+            while len(self._trees) > max(_CACHED_TREES, 2 * len(self._past.names)):
+                self._trees.popitem(last=False)
+            return tree
+
+    def _at(self, path: Path, ns: int) -> Any:
+        with self._lock:
+            return self._past.tree(path, ns)
+
+    def changes(self, after: Instant, until: Instant) -> set[Path]:
+        """Return the paths that were updated after one instant and not after another."""
+        return self._past.changes(nanoseconds(after), nanoseconds(until))
+
+    def news_times(self, path: Path) -> np.ndarray[Any, Any]:
+        """Return when there was an update of a path, or of what is above or below it, in seconds, sorted: float64."""
+        times: np.ndarray[Any, Any] = self._past.news_times(path).astype(np.float64) / 1e9
+        return times
+
+    def news_count(self, path: Path, after: Instant, until: Instant) -> int:
+        """Return how many such updates there were after one instant and not after another."""
+        return self._past.news_count(path, nanoseconds(after), nanoseconds(until))
+
+    def last_news(self, path: Path, instant: Instant) -> float | None:
+        """Return when the last such update before an instant was, None if there was none."""
+        found = self._past.last_news(path, nanoseconds(instant))
+        return None if found is None else seconds(found)
+
+    def gaps(self) -> list[tuple[float, str, int | None]]:
+        """Return where updates were lost: when this was noticed, of which path, and how many (None: unknown)."""
+        return [(seconds(ref.time), show(stream.path), missed) for ref, stream, missed in self._past.gaps()]
+
+    def skipped(self) -> list[tuple[float, str, int]]:
+        """Return which updates could not be recorded: when they came, their paths, and their publishers' numbers.
+
+        Each was so large that it was only announced, and others replaced or changed it before it could be read.
+        """
+        return [(seconds(ref.time), show(it.path), self._past.stamp(ref)[1]) for ref, it in self._past.skips()]
+
+    def updates(
+        self, start: Instant | None = None, end: Instant | None = None, patterns: Sequence[str] = ("*",)
+    ) -> Iterator[LogUpdate]:
+        """Yield what was recorded in order, from `start` to `end`, both included.
+
+        Of an update of a whole dict, only what the patterns name is in the value.
+        """
+        after = -1 if start is None else nanoseconds(start) - 1
+        until = _END if end is None else nanoseconds(end)
+        for ref, stream, value in self._news(after, until, patterns):
+            try:
+                whole = resolve(value, self._past.value)
+            except ValueError:  # damaged, or never recorded
+                self._past.unreadable += 1
+            else:
+                yield self._update(ref, stream, None if whole is MISSING else whole, whole is MISSING)
+
+    def outlines_of(self, patterns: Sequence[str] = ("*",)) -> Iterator[tuple[float, Path, Any, str]]:
+        """Yield time, path, value and kind of each update; arrays that are not short are `Stored`, and not read.
+
+        The value is MISSING where the path was deleted.
+        """
+        for ref, stream, value in self._news(-1, _END, patterns):
+            yield seconds(ref.time), stream.path, value, stream.kind.value
+
+    def _news(self, after: int, until: int, patterns: Sequence[str]) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield the updates that patterns name, with what they name of the value; MISSING for a deletion."""
+        wanted = [parse_pattern(text) for text in patterns]
+        for ref, stream, value in self._past.updates(after, until, wanted):
+            left = value if value is MISSING else pruned(value, stream.path, wanted)
+            if left is not MISSING or value is MISSING:
+                yield ref, stream, left
+
+    def _update(self, ref: Ref, stream: Stream, value: Any, deleted: bool) -> LogUpdate:
+        published, sequence = self._past.stamp(ref)
+        return LogUpdate(
+            seconds(ref.time), stream.path, value, deleted, seconds(published), sequence, stream.kind.value
+        )
+
+    def channels(self, progress: Callable[[int, int], None] | None = None) -> list[ChannelSummary]:
+        """Return what each channel of the file holds, by topic.
+
+        The recorder writes that down at the end. Where it was killed, or something is damaged, the indexes of all
+        chunks are read, and `progress` is told the chunks done and all of them.
+        """
+        found, totals = [], self._past.totals(progress)
+        for channel, stream, schema in self._past.channels():
+            messages, size, first, last = totals.get(channel.id, Totals())
+            path, role, kind = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
+            times = seconds(first), seconds(last)
+            found.append(ChannelSummary(channel.topic, path, role, kind, schema, messages, size, *times))
+        return sorted(found, key=lambda it: (it.topic, it.role, it.path))
+
+    def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
+        """Read all of the file; return how many records are damaged. `progress` is told the chunks done and all."""
+        return self._container.verify(progress)
+
+    def close(self) -> None:
+        """Close the file. Idempotent."""
+        self._container.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<reem recording {self.path}, {self.duration:.1f} s>"
+
+
+class LogPath:
+    """One path of a recording."""
+
+    def __init__(self, log: Log, path: Path) -> None:
+        self._log = log
+        self.path = path
+
+    def __getitem__(self, key: str | int) -> LogPath:
+        return LogPath(self._log, (*self.path, key))
+
+    def at(self, instant: Instant) -> Any:
+        """Return the value at an instant; raises MissingKey, DamagedRecording. See `Log.value_at`."""
+        return self._log.value_at(self.path, instant)
+
+    def history(
+        self, start: Instant | None = None, end: Instant | None = None
+    ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any] | list[Any]]:
+        """Return when the value was updated and what it was then.
+
+        Args:
+            start: The first instant; the beginning of the recording if not given.
+            end: The last instant; the end of the recording if not given.
+
+        Returns:
+            The times, in seconds since 1970: float64, (N,). The values: one array, the first axis being
+            time, if they are all numbers, all arrays of one shape and dtype, or all lists of as many
+            numbers; else a list. Instants at which nothing was there are left out.
+        """
+        pairs = list(self.values(start, end))
+        times = np.array([time for time, _ in pairs], np.float64)
+        return times, stacked([value for _, value in pairs])
+
+    def values(self, start: Instant | None = None, end: Instant | None = None) -> Iterator[tuple[float, Any]]:
+        """Yield what `history` returns one by one, for what is larger than memory."""
+        after = -1 if start is None else nanoseconds(start) - 1
+        until = _END if end is None else nanoseconds(end)
+        last: Any = MISSING
+        for ref, stream, value in self._log._past.following(self.path, after, until):
+            repeats = stream.role in (Role.STATE, Role.KEYFRAME) and last is not MISSING and same(value, last)
+            if value is MISSING or repeats:
+                last = value
+                continue
+            last = value
+            yield seconds(ref.time), resolve(value, self._log._past.value)
+
+    def __repr__(self) -> str:
+        return f"<{show(self.path)} of {self._log!r}>"

@@ -1,0 +1,334 @@
+"""What was recorded of each key, and what it held at an instant, arrays left where they are."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import orjson
+from mcap.records import Channel
+
+from ...errors import BadData
+from ...plan.paths import Path, below
+from ...plan.patterns import Pattern
+from ...plan.trees import MISSING, get
+from ...ships.numpy import NumpyShip
+from ...ships.registry import Ships
+from .container import Container, Told
+from .errors import DamagedRecording
+from .index import Numbers
+from .layout import from_json
+from .messages import decode
+from .roles import NEWS, Kind, Role
+from .state import applied
+from .stored import LOST, Stored, opened
+from .timeline import Ref, Timeline, Totals
+
+__all__ = ["Past", "Stream"]
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """What was recorded of one path in one role; several channels if its type changed.
+
+    Attributes:
+        path: The full path.
+        role: What its messages say.
+        kind: Where they came from.
+        channels: The channels, by number.
+    """
+
+    path: Path
+    role: Role
+    kind: Kind
+    channels: list[int] = field(compare=False)
+
+
+class Past:
+    """The contents of a recording.
+
+    Args:
+        container: The file.
+        ships: What makes values of what is not JSON.
+
+    Attributes:
+        streams: All streams, by no order.
+        names: The streams of each top-level key.
+        unreadable: How many updates were skipped since a part of them is damaged.
+
+    Raises:
+        DamagedRecording: Not a recording of REEM.
+    """
+
+    def __init__(self, container: Container, ships: Ships) -> None:
+        self._container = container
+        self._ships = ships
+        self._timeline = Timeline(container)
+        self.unreadable = 0
+        by_place: dict[tuple[Path, str, str], Stream] = {}
+        self._of_channel: dict[int, Stream] = {}
+        # A path has several channels in one role if its type changed: for users they are one stream.
+        for channel in container.channels.values():
+            place = _place(channel)
+            if place is not None:
+                stream = by_place.setdefault(place, Stream(*place, []))
+                stream.channels.append(channel.id)
+                self._of_channel[channel.id] = stream
+        if not by_place and not any(record.name == "reem" for record in container.metadata):
+            raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
+        self.streams = list(by_place.values())
+        self.names: dict[str, list[Stream]] = {}
+        self._parts: dict[Path, list[int]] = {}
+        for stream in self.streams:
+            # These say what is missing, not what was there.
+            if stream.role not in (Role.GAP, Role.SKIP):
+                self.names.setdefault(str(stream.path[0]), []).append(stream)
+            if stream.role in (Role.PART, Role.UPDATE):
+                self._parts.setdefault(stream.path, []).extend(stream.channels)
+
+    def tree(self, path: Path, until: int) -> Any:
+        """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
+        streams = self.names.get(str(path[0]), [])
+        # Where a list lost items, only the list as a whole can be rebuilt; the path is looked up in it afterwards.
+        anchor = _anchor(path, streams)
+        while True:
+            # Each try that fails has taken a damaged chunk out, so this ends.
+            found = self._rebuilt(anchor, streams, until)
+            if found is not None:
+                return self._inside(found[0], path[len(anchor) :])
+
+    def _rebuilt(self, path: Path, streams: list[Stream], until: int) -> list[Any] | None:
+        """Return a list of what was at `path`; None if something turned out to be damaged: try again."""
+        base, tree = -1, MISSING
+        # First the newest message that has all of the path in it, then what was updated inside it since then.
+        bases = [it for it in streams if it.role in (*NEWS, Role.KEYFRAME) and below(path, it.path)]
+        newest = self._newest(bases, until, -1)
+        if newest is not None:
+            ref, stream = newest
+            loaded = self._load(ref, stream)
+            if loaded is None:
+                return None
+            base = ref.time
+            tree = self._inside(loaded[0], path[len(stream.path) :])
+        # Roles that only repeat are left out here: they say nothing that is not in the updates.
+        inner = [it for it in streams if it.role in NEWS and len(it.path) > len(path) and below(it.path, path)]
+        for ref, stream in self._later(inner, base, until):
+            loaded = self._load(ref, stream)
+            if loaded is None:
+                return None
+            tree = self._applied(tree, path, stream, loaded[0])
+        return [tree]
+
+    def _applied(self, tree: Any, anchor: Path, stream: Stream, value: Any) -> Any:
+        """Return what is at `anchor` after an update of a stream below it."""
+        path = stream.path[len(anchor) :]
+        return applied(opened(tree, path, self._list), path, stream.role, stream.kind, value)
+
+    def _inside(self, tree: Any, path: Path) -> Any:
+        return get(opened(tree, path, self._list), path)
+
+    def _list(self, it: Stored) -> Any:
+        """Return a long list; what stands for it, if it is damaged."""
+        try:
+            return self.value(it)
+        except BadData:
+            return it
+
+    def _newest(self, streams: Iterable[Stream], until: int, after: int) -> tuple[Ref, Stream] | None:
+        best: tuple[Ref, Stream] | None = None
+        for stream in streams:
+            # What is older than the best one so far is not even looked for.
+            for channel in stream.channels:
+                ref = self._timeline.latest(channel, until, best[0].time if best else after)
+                if ref is not None:
+                    best = ref, stream
+        return best
+
+    def _later(self, streams: list[Stream], after: int, until: int) -> Iterable[tuple[Ref, Stream]]:
+        """Return the updates that matter between two instants, in order.
+
+        That is the last one of each path, since it covers those before it, unless an item was deleted from
+        a list: then other paths moved, and all are needed.
+        """
+        if any(it.role == Role.DELETE and isinstance(it.path[-1], int) for it in streams):
+            channels = [channel for stream in streams for channel in stream.channels]
+            return [(ref, self._of_channel[ref.channel]) for ref in self._between(channels, after, until)]
+        # One message for each path, however often it was updated: this is what makes going back in time quick.
+        lasts = [self._newest([stream], until, after) for stream in streams]
+        return sorted([it for it in lasts if it is not None], key=lambda it: it[0].time)
+
+    def _between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
+        """Yield the messages between two instants in order: what was found behind an update has the same instant."""
+        for _, refs in itertools.groupby(self._timeline.between(channels, after, until), key=lambda ref: ref.time):
+            # At one instant, what was published comes before what a read found behind it.
+            yield from sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
+
+    def _load(self, ref: Ref, stream: Stream) -> list[Any] | None:
+        """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
+        if stream.role == Role.DELETE:
+            return [MISSING]
+        message = self._timeline.message(ref)
+        if message is None:
+            return None
+        channel = self._container.channels[ref.channel]
+        if channel.message_encoding == "json":
+            return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
+        return [self._stored(channel, ref.time, stream.path, message.data)]
+
+    def _readable(self, ref: Ref, stream: Stream) -> list[Any] | None:
+        """Return a list of the value of a message; None, and it is counted, if it is damaged."""
+        with contextlib.suppress(BadData):
+            loaded = self._load(ref, stream)
+            if loaded is not None:
+                return loaded
+        self.unreadable += 1
+        return None
+
+    def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Stored:
+        """Return what stands for a value that is a message of its own and not a part of another."""
+        label = channel.metadata.get("reem.ship", "")
+        value = self._decoded(channel, data)
+        if label == "numpy":
+            size, summary = NumpyShip().describe(value)
+            return Stored(label, path, at, size, summary, summary.partition("[")[0], value.shape)
+        return Stored(label, path, at, len(value) if isinstance(value, bytes) else len(data), label)
+
+    def _decoded(self, channel: Channel, data: bytes) -> Any:
+        schema = self._container.schemas.get(channel.schema_id)
+        label, channels = channel.metadata.get("reem.ship", ""), channel.metadata.get("reem.channels", "")
+        return decode(schema.name if schema else "", channels, label, data, self._ships)
+
+    def value(self, it: Stored) -> Any:
+        """Return the value that something stands for; raises DamagedRecording."""
+        if it.label == LOST:
+            raise DamagedRecording(f"{it.shown}: {it.summary}")
+        for channel in self._parts.get(it.path, ()):
+            # Again after each damaged index that was made anew; without one the loop ends at once.
+            while (ref := self._timeline.exactly(channel, it.at)) is not None:
+                message = self._timeline.message(ref)
+                if message is not None and self._container.channels[channel].message_encoding == "protobuf":
+                    return self._decoded(self._container.channels[channel], message.data)
+                if message is not None:
+                    break
+        raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
+
+    def changed(self, name: str, until: int) -> int:
+        """Return the log time of the last message on a key until an instant, -1 if there is none."""
+        newest = self._newest(self.names.get(name, []), until, -1)
+        return -1 if newest is None else newest[0].time
+
+    def changes(self, after: int, until: int) -> set[Path]:
+        """Return the paths with news between two instants."""
+        found = self._timeline.channels_between(after, until)
+        streams = [self._of_channel[channel] for channel in found if channel in self._of_channel]
+        return {stream.path for stream in streams if stream.role in NEWS}
+
+    def news_times(self, path: Path) -> Numbers:
+        """Return the log times of all news on what is at, above or below a path, sorted; uint64."""
+        return self._timeline.times(self._news_channels(path))
+
+    def news_count(self, path: Path, after: int, until: int) -> int:
+        """Return how much news there was on a path between two instants."""
+        return sum(1 for _ in self._timeline.between(self._news_channels(path), after, until))
+
+    def last_news(self, path: Path, until: int) -> int | None:
+        """Return the log time of the last news on a path until an instant, None if there was none."""
+        newest = self._newest(self._concerning(path), until, -1)
+        return None if newest is None else newest[0].time
+
+    def _news_channels(self, path: Path) -> list[int]:
+        return [channel for stream in self._concerning(path) for channel in stream.channels]
+
+    def _concerning(self, path: Path) -> list[Stream]:
+        """Return the streams with news on what is at, above or below a path."""
+        streams = self.names.get(str(path[0]), []) if path else self.streams
+        return [it for it in streams if it.role in NEWS and (below(it.path, path) or below(path, it.path))]
+
+    def updates(self, after: int, until: int, patterns: Sequence[Pattern]) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield all news that patterns name between two instants; what is damaged is skipped."""
+        streams = [
+            it for it in self.streams if it.role in NEWS and any(pattern.concerns(it.path) for pattern in patterns)
+        ]
+        channels = [channel for stream in streams for channel in stream.channels]
+        for ref in self._between(channels, after, until):
+            stream = self._of_channel[ref.channel]
+            loaded = self._readable(ref, stream)
+            if loaded is not None:
+                yield ref, stream, loaded[0]
+
+    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
+        """Yield what was at a full path after each piece of news on it between two instants.
+
+        If a part of the file is damaged, what keyframes tell is news too.
+        """
+        streams = self.names.get(str(path[0]), []) if path else []
+        anchor = _anchor(path, streams)
+        roles = (*NEWS, Role.KEYFRAME)
+        related = [it for it in streams if it.role in roles and (below(it.path, anchor) or below(anchor, it.path))]
+        tree = self.tree(anchor, after) if related and after >= 0 else MISSING
+        for ref in self._between([each for it in related for each in it.channels], after, until):
+            stream = self._of_channel[ref.channel]
+            # Keyframes repeat what is known, unless something is damaged: then they are what mends it.
+            if stream.role == Role.KEYFRAME and not (self._container.damaged or self.unreadable):
+                continue
+            loaded = self._readable(ref, stream)
+            if loaded is None:
+                continue
+            # An update of the path itself or of what is around it brings all of it; one from inside changes a part.
+            if len(stream.path) <= len(anchor):
+                tree = self._inside(loaded[0], anchor[len(stream.path) :])
+            else:
+                tree = self._applied(tree, anchor, stream, loaded[0])
+            yield ref, stream, self._inside(tree, path[len(anchor) :])
+
+    def gaps(self) -> Iterator[tuple[Ref, Stream, int | None]]:
+        """Yield where updates were lost, and how many."""
+        # A gap says how many were lost if their publisher's numbers told it.
+        channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.GAP]
+        for ref in self._timeline.between(channels, -1, 2**63 - 1):
+            message = self._timeline.message(ref)
+            said = orjson.loads(message.data) if message is not None else {}
+            yield ref, self._of_channel[ref.channel], said.get("missed") if type(said) is dict else None
+
+    def skips(self) -> Iterator[tuple[Ref, Stream]]:
+        """Yield the updates whose values could not be had any more."""
+        channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.SKIP]
+        for ref in self._timeline.between(channels, -1, 2**63 - 1):
+            yield ref, self._of_channel[ref.channel]
+
+    def stamp(self, ref: Ref) -> tuple[int, int]:
+        """Return when a message was published (ns), and its number."""
+        message = self._timeline.message(ref)
+        return (message.publish_time, message.sequence) if message is not None else (0, 0)
+
+    def totals(self, progress: Told | None = None) -> dict[int, Totals]:
+        """Return how much each channel has; see `Timeline.totals`."""
+        return self._timeline.totals(progress)
+
+    def channels(self) -> Iterator[tuple[Channel, Stream | None, str]]:
+        """Yield the channels, what they are for (None for none of REEM's), and the names of their schemas."""
+        for channel in list(self._container.channels.values()):  # reading an index may find more of them
+            schema = self._container.schemas.get(channel.schema_id)
+            yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
+
+
+def _place(channel: Channel) -> tuple[Path, Role, Kind] | None:
+    """Return path, role and kind of a channel; None if it is none of REEM's."""
+    try:
+        path = orjson.loads(channel.metadata["reem.path"])
+        role, kind = Role(channel.metadata["reem.role"]), Kind(channel.metadata["reem.kind"])
+    except (KeyError, ValueError):  # also what orjson raises, and a role of a later REEM
+        return None
+    if type(path) is not list or not path or not all(type(key) in (str, int) for key in path):
+        return None
+    return tuple(path), role, kind
+
+
+def _anchor(path: Path, streams: Iterable[Stream]) -> Path:
+    """Return the part of `path` that never moves: up to an index from the end, or a list that lost an item."""
+    lists = [it.path[:-1] for it in streams if it.role == Role.DELETE and isinstance(it.path[-1], int)]
+    lists += [path[:place] for place, key in enumerate(path) if isinstance(key, int) and key < 0]
+    return min([place for place in lists if len(place) < len(path) and below(path, place)], key=len, default=path)

@@ -1,0 +1,128 @@
+"""The keys of a recording: which there are, what each of them waits for, and which are looked at."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Sequence
+
+from ...connection import RedisInterface
+from ...plan.patterns import Pattern
+from ...store.catalog import names
+from .key_recorder import Collector, KeyRecorder
+
+__all__ = ["RecordedKeys"]
+
+_MOST_SILENT_READS = 500
+"""Keys that are read again at one keyframe, if the server does not tell which were changed."""
+
+
+class RecordedKeys:
+    """One `KeyRecorder` for each key that was met.
+
+    Args:
+        collector: The recorder.
+        interface: The server.
+        patterns: What is recorded of all that is published.
+    """
+
+    def __init__(self, collector: Collector, interface: RedisInterface, patterns: Sequence[Pattern]) -> None:
+        self._collector = collector
+        self._interface = interface
+        self._patterns = patterns
+        self.tops = list(dict.fromkeys(pattern.top for pattern in patterns))
+        self._recorders: dict[str, KeyRecorder] = {}
+
+    def of(self, name: str) -> KeyRecorder:
+        """Return what records a key; made when first asked for."""
+        recorder = self._recorders.get(name)
+        if recorder is None:
+            recorder = self._recorders[name] = KeyRecorder(self._collector, name)
+        return recorder
+
+    def concerns(self, name: str) -> bool:
+        """Return whether the key is recorded, or a part of it."""
+        return any(pattern.concerns((name,)) for pattern in self._patterns)
+
+    async def present(self) -> set[str]:
+        """Return the keys there are, of those that are recorded."""
+        found: set[str] = set()
+        for top in self.tops:
+            if "*" in top or "?" in top:
+                found.update([name async for name in names(self._interface, top)])
+            else:
+                found.add(top)
+        return found
+
+    def changed(self, key: str | None) -> None:
+        """Take the server's word that a key was changed, by its name there; None for every key."""
+        if key is None:
+            for recorder in self._recorders.values():
+                recorder.changed(None)
+            return
+        document = key[1:].partition("}")[0] if key.startswith("{") else key
+        name = document.removeprefix(self._collector.session.namespace)
+        if name in self._recorders:
+            self._recorders[name].changed(key)
+
+    def follow(self, present: set[str]) -> None:
+        """Have the server tell of keys that are there and that it does not tell of yet: they have come to be."""
+        for name in present:
+            if self.concerns(name):
+                self.of(name).follow()
+
+    def be_due(self) -> None:
+        """Have every key be read when somebody looks next, however much was read of it of late."""
+        for recorder in self._recorders.values():
+            recorder.looks.earliest = 0.0
+
+    def look_at_once(self) -> None:
+        """Look now where a look is due."""
+        for recorder in self._recorders.values():
+            recorder.looks.now()
+
+    def lost(self) -> None:
+        """Note that updates of any key may be lost, and read all keys anew."""
+        for recorder in self._recorders.values():
+            recorder.lost(None)
+
+    async def settled(self, patience: float) -> None:
+        """Wait until nothing is being fetched, but not for ever."""
+        deadline = time.monotonic() + patience
+        while (
+            busy := [recorder.busy for recorder in self._recorders.values() if recorder.busy]
+        ) and time.monotonic() < deadline:
+            await asyncio.wait(busy, timeout=deadline - time.monotonic())
+
+    def cancel(self) -> None:
+        """Fetch nothing more."""
+        for recorder in self._recorders.values():
+            recorder.looks.cancel()
+            if recorder.busy is not None:
+                recorder.busy.cancel()
+
+    def read_silent(self, present: set[str]) -> None:
+        """Read keys that were not published as a whole since the last keyframe: somebody may have stored something.
+
+        Args:
+            present: The keys there are.
+        """
+        now, reads = asyncio.get_running_loop().time(), 0
+        for name in sorted(present | self._recorders.keys(), key=lambda name: self.of(name).looks.earliest):
+            recorder = self.of(name)
+            if recorder.news or not self.concerns(name) or (name not in present and recorder.absent):
+                continue
+            if recorder.looks.earliest <= now and reads < _MOST_SILENT_READS:
+                reads += 1
+                recorder.read()
+
+    def forget_news(self) -> None:
+        """Take all keys for ones of which nothing was published."""
+        for recorder in self._recorders.values():
+            recorder.news = False
+
+    def keyframe(self, number: int) -> None:
+        """Write the whole of all keys as the recording has it."""
+        for recorder in self._recorders.values():
+            recorder.keyframe(number)
+        self.forget_news()

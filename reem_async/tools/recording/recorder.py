@@ -1,0 +1,431 @@
+"""Recorder: every update of some keys into an MCAP file."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from types import TracebackType
+from typing import Any, Self
+
+from ...concurrency.queues import Last
+from ...concurrency.scheduling import give_way
+from ...concurrency.streams import arrived
+from ...connection import RedisInterface
+from ...errors import BadType, BadValue, InterfaceClosed, RedisError
+from ...plan.paths import Path
+from ...plan.patterns import Pattern, parse_pattern
+from ...pubsub.manager import manager_of
+from ...pubsub.monitor import Monitor
+from .description import description
+from .errors import RecordingFailed
+from .key_recorder import KeyRecorder
+from .output import FileGone
+from .recorded_keys import RecordedKeys
+from .roles import Role
+from .sample import Sampler, samples_of
+from .sink import Sink
+from .subscription import HURRIED, PATIENCE, Subscription
+from .times import Arrivals, Clock
+from .writer_thread import Operation, WriterThread
+
+__all__ = ["Recorder", "RecorderStatus"]
+
+# Seconds between looks at keyframes that are due, the disk, and keys that must be read anew.
+_TICK = 0.1
+# Updates that may wait for the event loop: 25 seconds at 2 kHz.
+_WAITING = 50_000
+_FIND_SECONDS = 1.0
+"""Seconds between looks for keys that somebody has stored."""
+_FIND_PAUSE = 10
+"""Times what such a look took, at least, until the next: a server with a million keys is asked for a thousand pages."""
+# Large values that are fetched at the same time: more would not be faster, and be more memory.
+_FETCHES = 8
+_PATIENCE = 3.0
+"""Seconds in which what was announced before the end is still fetched."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderStatus:
+    """How a recording is getting on.
+
+    Attributes:
+        seconds: Since it began.
+        messages: Written.
+        bytes: Written, before compression.
+        file_bytes: In the file.
+        dropped: Updates left out since the disk or this program could not keep up.
+        skipped: Updates that were announced, and that a newer one replaced, or changed inside, before they could be
+            fetched: what they wrote cannot be had any more.
+        gaps: How often updates were lost on the way from the server.
+        lost: Values that cannot be recorded: of custom types that are not made of bytes.
+        rate: Messages a second, on average.
+    """
+
+    seconds: float
+    messages: int
+    bytes: int
+    file_bytes: int
+    dropped: int
+    skipped: int
+    gaps: int
+    lost: int
+    rate: float
+
+
+class Recorder:
+    """Records what is published under some patterns of paths, and samples of others, into an MCAP file.
+
+    An asynchronous context manager: inside of the block it records. Small values come with their
+    notices, large ones are fetched, the newest only; both are as they were published, bit for bit, and in this order.
+    A large one that others changed inside before it was fetched is skipped, and counted; what is left of it is
+    recorded as found, so that the updates inside of it have their place. At the
+    beginning, every `keyframe` seconds and after each gap the whole of the keys is written, so that any
+    instant can be rebuilt quickly. Nobody who publishes waits for the recorder. What it cannot keep up with it drops,
+    and counts.
+
+    What is only stored, by whomever, is recorded a moment after the server has told that something was changed, as
+    what it led to (`LogUpdate.kind` is "stored"): several changes in a moment are one. The moment is some
+    hundredths of a second; of a key that is published all the time half a second, and as long as 8 MB a second
+    take to read it. A key that is only stored is found within a second of its making. Where the user may not use
+    CLIENT TRACKING, a warning says so, and what is only stored is read at the keyframes.
+
+    The file can be read while it grows, and after the recorder was killed but for the last second. It
+    is not synchronised to the disk: a power cut costs what the system had not written yet.
+
+    Args:
+        interface: The server.
+        patterns: Globs such as "arm", "cam_*" or "robot.*.battery"; everything if not given. An empty
+            list records samples only.
+        path: The file; it must not exist.
+        sample: Paths to read at given periods, in seconds: a dict, or a key file (lines `path, seconds`).
+        keyframe: Seconds from one keyframe to the next.
+        overwrite: Replace the file if it exists; it stays as it is until recording has begun.
+        compression: "zstd", "lz4" or "none".
+        queue_bytes: What may wait for the disk.
+
+    Raises:
+        BadValue: The file exists, is being recorded or cannot be made, or an argument that means nothing.
+        BadKey: A pattern or path that cannot be.
+    """
+
+    def __init__(
+        self,
+        interface: RedisInterface,
+        patterns: Sequence[str] = ("*",),
+        path: str | FilePath = "run.mcap",
+        *,
+        sample: dict[str, float] | str | FilePath | None = None,
+        keyframe: float = 5.0,
+        overwrite: bool = False,
+        compression: str = "zstd",
+        queue_bytes: int = 256 << 20,
+    ) -> None:
+        if isinstance(patterns, str):
+            raise BadType(f"patterns is a list of patterns; use [{patterns!r}]")
+        if not keyframe > 0:
+            raise BadValue(f"keyframe={keyframe!r} cannot be; give seconds over 0")
+        self.path = FilePath(path)
+        self.patterns: list[Pattern] = [parse_pattern(text) for text in patterns]
+        self.session = interface.session
+        self.clock = Clock()
+        self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes nobody at the very moment
+        self.fetching = asyncio.Semaphore(_FETCHES)
+        self._samples = samples_of(sample)
+        if not self.patterns and not self._samples:
+            raise BadValue("nothing to record: give a pattern such as '*', or sample=")
+        described = description(self.session, patterns, self._samples, keyframe)
+        self._sink = Sink(self.path, compression, described, overwrite=overwrite)
+        self.writer_thread = WriterThread(self._sink, self.session.ships, queue_bytes, self.patterns)
+        self._keyframe_seconds = keyframe
+        self._keyframes = 0
+        self._keys = RecordedKeys(self, interface, self.patterns)
+        tops = self._keys.tops
+        self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
+        if self._monitor is not None:
+            self._monitor.doubted = lambda name: self._key_recorder(name).lost(None)
+        self._subscription = Subscription(self) if tops else None
+        self._sampler = Sampler(self.session, self._samples, self._sampled)
+        self._tasks: list[asyncio.Task[None]] = []
+        self._begun = self._ended = 0.0
+        self._dropped = 0
+        self._failure: Exception | None = None
+        self._done = asyncio.Event()
+
+    # Lifetime.
+
+    async def start(self) -> None:
+        """Begin to record. When this returns, what is there is recorded and no later update is missed.
+
+        One round trip for each pattern, one or two for each key. If it fails or is cancelled, there is no file, or
+        the one that was to be replaced is still there.
+        """
+        self.writer_thread.start()
+        self._begun = time.monotonic()
+        try:
+            if self._monitor is not None and self._subscription is not None:
+                await self._monitor.listen()
+                manager = manager_of(self.session)
+                await manager.follow(self._subscription)
+                await manager.watch(self._subscription)
+                self._begin(self._listen)
+                for name in await self._keys.present():
+                    self._key_recorder(name).read()
+                await self._settled(_PATIENCE)
+            self._sampler.start()
+            self._begin(self._tick)
+            self._begin(self._go_on_finding)
+            await self._appear()
+        except BaseException:
+            await self._end()
+            self._sink.output.discard()
+            raise
+
+    async def _appear(self) -> None:
+        """Take the place of the recording that is to be replaced, as soon as this one is worth more than nothing."""
+        if self._sink.output.replaces:
+            await asyncio.to_thread(self.writer_thread.flush)
+            failure = self.writer_thread.failure
+            if failure is not None:
+                raise RecordingFailed(f"{self.path} cannot be replaced: {failure}; it is as it was") from failure
+            self._sink.output.appear()
+
+    def _begin(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
+        """Do something beside the recorded program; if it goes wrong, the recording ends."""
+
+        async def watched() -> None:
+            try:
+                await work()
+            except Exception as error:
+                self.failed(error)
+
+        self._tasks.append(asyncio.create_task(watched()))
+
+    async def stop(self) -> None:
+        """End the recording: take what was published until now, write the index, close the file. Idempotent.
+
+        Raises:
+            RecordingFailed: Writing ended before, for want of space or another reason.
+        """
+        if self._begun and not self._ended:
+            with contextlib.suppress(RedisError, OSError):  # no connection: what has arrived is all there is
+                await self.fence()
+            self._pump()
+            await self._settled(_PATIENCE)
+            await self._complete(time.monotonic() + _PATIENCE)
+            await self._look_once_more()
+            self._keyframe_of_all()
+        await self._end()
+        self._check()
+
+    async def _end(self) -> None:
+        self._ended = self._ended or time.monotonic()
+        self._done.set()
+        await self._sampler.stop()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._keys.cancel()
+        with contextlib.suppress(InterfaceClosed):
+            if self._subscription is not None:
+                manager_of(self.session).unwatch(self._subscription)
+                await manager_of(self.session).unfollow(self._subscription)
+            if self._monitor is not None:
+                await self._monitor.close()
+        ended = {"ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "seconds": f"{self.status.seconds:.3f}"}
+        late = {"samples late": str(self._sampler.late), "samples failed": str(self._sampler.failed)}
+        await asyncio.to_thread(self.writer_thread.stop, ended | (late if self._samples else {}))
+
+    async def wait(self, seconds: float | None = None) -> None:
+        """Return after so many seconds, or never; raises RecordingFailed as soon as it cannot go on."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await self._done.wait()
+        self._check()
+
+    def _check(self) -> None:
+        failure = self.writer_thread.failure or self._failure
+        if failure is not None:
+            reason = failure.strerror if isinstance(failure, OSError) and failure.strerror else repr(failure)
+            left = "" if isinstance(failure, FileGone) else "; what is in the file by now can be read"
+            raise RecordingFailed(f"{self.path} could not be written any further ({reason}){left}") from failure
+
+    async def __aenter__(self) -> Self:
+        await self.start()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            await self.stop()
+            return
+        try:
+            await self.stop()
+        except RecordingFailed as failure:
+            error.add_note(str(failure))
+
+    @property
+    def status(self) -> RecorderStatus:
+        """How the recording is getting on. Any thread may ask."""
+        counts, now = self.writer_thread.counts, self._ended or time.monotonic()
+        seconds = max(now - self._begun, 0.0) if self._begun else 0.0
+        return RecorderStatus(
+            seconds,
+            counts.messages,
+            counts.bytes,
+            self._sink.output.tell(),
+            counts.dropped,
+            counts.skipped,
+            counts.gaps,
+            counts.lost,
+            counts.messages / seconds if seconds else 0.0,
+        )
+
+    # What comes in.
+
+    async def _listen(self) -> None:
+        assert self._monitor is not None
+        async for event in self._monitor:
+            self._key_recorder(event.name).on_event(event)
+            if self._subscription is not None and self._subscription.leisurely:
+                give_way()
+
+    def _pump(self) -> None:
+        """Take what has arrived already."""
+        for event in arrived(self._monitor) if self._monitor is not None else ():
+            self._key_recorder(event.name).on_event(event)
+
+    def _key_recorder(self, name: str) -> KeyRecorder:
+        return self._keys.of(name)
+
+    def _sampled(self, path: Path, value: Any, size: int) -> None:
+        self._key_recorder(str(path[0])).sampled(path, value, size)
+
+    async def fence(self) -> None:
+        """Wait until everything published before now has been handed to the feeds."""
+        if self._subscription is not None:
+            with contextlib.suppress(InterfaceClosed):
+                await manager_of(self.session).fence()
+        self._pump()
+
+    @property
+    def hears_of_changes(self) -> bool:
+        """Whether the server tells which keys are changed."""
+        return manager_of(self.session).hears_of_changes
+
+    def changed(self, key: str | None) -> None:
+        """Take the server's word that a key was changed, None for every key."""
+        self._keys.changed(key)
+
+    def hurry(self) -> None:
+        """Look more often at what was published: large updates come fast."""
+        manager_of(self.session).hurry(HURRIED)
+
+    def failed(self, error: Exception) -> None:
+        """End the recording: something went wrong that should not."""
+        self._failure = error
+        self._done.set()
+
+    async def _settled(self, patience: float) -> None:
+        """Wait until nothing is being fetched, but not for ever."""
+        await self._keys.settled(patience)
+
+    async def _complete(self, deadline: float) -> None:
+        """Read anew what was dropped at the last moment: the file is to end with what is there."""
+        while self._subscription is not None and self._subscription.wire is not None:
+            await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
+            if not self.writer_thread.behind or self.writer_thread.failure is not None or time.monotonic() > deadline:
+                return
+            self._catch_up()
+            await asyncio.sleep(_TICK / 10)
+
+    # What is done from time to time.
+
+    async def _tick(self) -> None:
+        """Keep the recording complete: read anew what is behind, write keyframes, end if the disk is full."""
+        due = time.monotonic() + self._keyframe_seconds
+        while True:
+            await asyncio.sleep(_TICK)
+            if self.writer_thread.failure is not None:
+                self._done.set()
+                return
+            self._catch_up()
+            if time.monotonic() >= due:
+                due += self._keyframe_seconds * max(1, (time.monotonic() - due) // self._keyframe_seconds + 1)
+                if not self.hears_of_changes:
+                    with contextlib.suppress(RedisError, OSError):
+                        await self._look()
+                self._keyframe_of_all()
+
+    async def _go_on_finding(self) -> None:
+        """Look for new keys every second, and among very many less often: a server has other things to do, too."""
+        while True:
+            await asyncio.sleep(_FIND_SECONDS)
+            begun = time.monotonic()
+            with contextlib.suppress(RedisError, OSError):  # no connection now: it is made again
+                if self.hears_of_changes:
+                    await self._find()
+            await asyncio.sleep(_FIND_PAUSE * (time.monotonic() - begun))
+
+    async def _find(self) -> None:
+        """Follow the keys that somebody has stored since: nothing else tells of them."""
+        if self._monitor is not None:
+            self._keys.follow(await self._keys.present())
+
+    def _catch_up(self) -> None:
+        """Read the keys anew of which something is missing, if there is room for it."""
+        if self._monitor is not None and self._monitor.dropped > self._dropped:
+            self.writer_thread.counts.dropped += self._monitor.dropped - self._dropped
+            self._dropped = self._monitor.dropped
+            self.lost()
+        if (
+            self._subscription is not None
+            and self._subscription.wire is not None
+            and self.writer_thread.waiting < (1 << 20)
+        ):
+            for name in list(self.writer_thread.behind):
+                self.writer_thread.behind.discard(name)
+                if self._monitor is not None and self._keys.concerns(name):
+                    self._key_recorder(name).read()
+
+    def lost(self) -> None:
+        """Note that updates of any key may be lost, and read all keys anew."""
+        self._keys.lost()
+
+    async def _look_once_more(self) -> None:
+        """Read what is there at the end: somebody may have stored something since the last keyframe."""
+        self._keys.forget_news()
+        if (
+            self._subscription is not None
+            and self._subscription.wire is not None
+            and self.writer_thread.failure is None
+        ):
+            with contextlib.suppress(RedisError, OSError):
+                if self.hears_of_changes:
+                    await self._find()
+                    self._keys.look_at_once()
+                    await self._settled(_PATIENCE)
+                else:
+                    self._keys.be_due()
+                    await self._look()
+
+    async def _look(self) -> None:
+        """Read keys of which nobody tells whether somebody has stored something since the last keyframe."""
+        if self._monitor is None:
+            return
+        self._keys.read_silent(await self._keys.present())
+        await self._settled(_PATIENCE)
+
+    def _keyframe_of_all(self) -> None:
+        self._keyframes += 1
+        self._keys.keyframe(self._keyframes)
+        status = self.status
+        figures = {name: getattr(status, name) for name in ("messages", "bytes", "dropped", "skipped", "gaps", "lost")}
+        stamp = self.clock.stamp(), self.clock.stamp(), self._keyframes
+        self.writer_thread.put(
+            Operation(Role.STATISTICS, ("",), figures | {"waiting": self.writer_thread.waiting}, stamp), 0
+        )

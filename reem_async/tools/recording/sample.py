@@ -1,0 +1,131 @@
+"""Sampling: paths that are read at given periods, as the manual's key file says them."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path as FilePath
+from typing import NamedTuple
+
+from ...errors import BadInput, BadValue, RedisError
+from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
+from ...session import Session
+from .fetch import fetch
+
+__all__ = ["Sample", "Sampler", "read_key_file", "samples_of"]
+
+
+class Sample(NamedTuple):
+    """A path that is read every so many seconds."""
+
+    path: Path
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"{show(self.path)} every {self.seconds:g} s"
+
+
+def samples_of(given: dict[str, float] | str | FilePath | None) -> list[Sample]:
+    """Return the samples that a dict of periods or a key file asks for."""
+    if given is None:
+        return []
+    if isinstance(given, dict):
+        return [sample(path, period) for path, period in given.items()]
+    return read_key_file(given)
+
+
+def read_key_file(file: str | FilePath) -> list[Sample]:
+    """Return the samples that a key file asks for: a line `path, seconds` for each; `#` begins a comment.
+
+    Raises:
+        BadValue: The file cannot be read, or a line is not of this form; says which.
+    """
+    try:
+        # utf-8-sig: spreadsheets put a byte order mark at the beginning.
+        text = FilePath(file).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise BadValue(f"the key file {file} cannot be read: {why}") from None
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
+    samples = [_sample(file, number, line) for number, line in lines if not _is_title(line)]
+    if not samples:
+        raise BadValue(f"the key file {file} names no path; write a line like: foo.bar, 0.1")
+    return samples
+
+
+def _is_title(line: str) -> bool:
+    return [word.strip().lower() for word in line.split(",")[:1]] == ["path"]
+
+
+def _sample(file: str | FilePath, number: int, line: str) -> Sample:
+    try:
+        cells = [cell.strip() for cell in next(csv.reader([line.split("#")[0]], skipinitialspace=True))]
+        name, period = cells
+        return sample(name, float(period))
+    except BadInput as error:
+        raise BadValue(f"{file}, line {number}: {error}") from None
+    except (ValueError, csv.Error):
+        raise BadValue(f"{file}, line {number}: {line.strip()[:60]!r} is not of the form: foo.bar, 0.1") from None
+
+
+def sample(path: str, period: float) -> Sample:
+    """Return a checked sample; raises BadKey or BadValue."""
+    place = parse(path)
+    check_top_key(place[0] if place else "")
+    if counts_from_end(place):
+        raise BadValue(f"{path}: an index from the end names another item from one time to the next; count from 0")
+    if not math.isfinite(period) or period <= 0:
+        raise BadValue(f"{path}: a period of {period} s cannot be; give seconds over 0")
+    return Sample(place, period)
+
+
+class Sampler:
+    """Reads paths at their periods, counted from one beginning, so that they do not drift.
+
+    Args:
+        session: The server.
+        samples: What to read.
+        take: Called with each path, what was there (MISSING if nothing was) and its bytes.
+
+    Attributes:
+        late: How many readings were left out since the one before took too long.
+        failed: How many failed.
+    """
+
+    def __init__(self, session: Session, samples: Iterable[Sample], take: Callable[[Path, object, int], None]) -> None:
+        self._session = session
+        self._samples = list(samples)
+        self._take = take
+        self._tasks: list[asyncio.Task[None]] = []
+        self.late = 0
+        self.failed = 0
+
+    def start(self) -> None:
+        """Begin to read."""
+        begin = asyncio.get_running_loop().time()
+        self._tasks = [asyncio.create_task(self._follow(each, begin)) for each in self._samples]
+
+    async def stop(self) -> None:
+        """Stop reading. Idempotent."""
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _follow(self, each: Sample, begin: float) -> None:
+        loop, count = asyncio.get_running_loop(), 0
+        keys = self._session.keys(each.path[0])
+        while True:
+            await asyncio.sleep(begin + count * each.seconds - loop.time())
+            try:
+                value, size, _ = await fetch(self._session, keys, each.path[1:])
+            except (RedisError, OSError, ValueError):
+                self.failed += 1
+            else:
+                self._take(each.path, value, size)
+            # Periods that have passed meanwhile are left out and counted, so that a slow server is not asked ever
+            # faster.
+            due = math.floor((loop.time() - begin) / each.seconds) + 1
+            self.late += max(due - count - 1, 0)
+            count = max(due, count + 1)

@@ -1,0 +1,214 @@
+"""The MCAP file that a recording is written to: its channels, and chunks that are closed in time.
+
+One channel per path, role and shape of message. A channel's metadata says what it holds:
+
+    reem.path     the path, top-level key first, as a JSON list
+    reem.role     what its messages say, see `Role`
+    reem.kind     where they came from, see `Kind`
+    reem.ship     the label of the ship, for what is not JSON
+    reem.wrapped  1: the JSON message is {"value": ...}
+    reem.channels the last axis of a picture that has three
+"""
+
+from __future__ import annotations
+
+import time
+import zlib
+from collections.abc import Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+import orjson
+
+from ...errors import BadValue
+from ...plan.paths import Path, show
+from .errors import RecordingFailed
+from .layout import Document, topic_of
+from .mcap_writer import COMPRESSIONS, MESSAGE_HEAD, Writer
+from .messages import Encoded, schema_bytes
+from .output import Output
+from .roles import Kind, Role
+from .schema import OPEN, Signature, fits, schema_text, signature
+
+__all__ = ["CHANNELS", "FLUSH_SECONDS", "FORMAT", "TOTALS", "FullError", "Sink"]
+
+FORMAT = "1"
+FLUSH_SECONDS = 0.25
+"""Seconds after which a chunk is closed and given to the operating system, however small it is."""
+
+_MOST_CHANNELS = 60_000
+"""MCAP numbers them with 16 bits."""
+_MOST_SCHEMAS = 8
+"""Schemas a path may have before it gets one that fits everything."""
+
+KEYFRAMES = "/_reem/keyframe"
+OPERATIONS = "/_reem/ops"
+STATISTICS = "/_reem/stats"
+CHANNELS = "reem.channels"
+"""The name of the metadata records that list channels."""
+TOTALS = "reem.totals"
+"""The name of the metadata record at the end that says of each channel how many messages it has, their bytes (with
+a few of framing), and the first and last log time: to count them by the indexes would take minutes."""
+_SHARED_TOPICS = {
+    **dict.fromkeys((Role.STATE, Role.KEYFRAME), KEYFRAMES),
+    **dict.fromkeys((Role.DELETE, Role.GAP, Role.SKIP), OPERATIONS),
+}
+
+
+class FullError(Exception):
+    """There are as many channels as MCAP can have."""
+
+
+class Sink:
+    """Writes messages of a recording. Belongs to one thread.
+
+    Args:
+        path: The file.
+        compression: "zstd", "lz4" or "none".
+        overwrite: Replace a file of that name.
+        metadata: What is said of the recording at its beginning.
+
+    Raises:
+        BadValue: The file is there already or cannot be made; an unknown compression.
+        RecordingFailed: It cannot be written.
+    """
+
+    def __init__(self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool) -> None:
+        if compression not in COMPRESSIONS:
+            raise BadValue(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
+        self.output = Output(path, overwrite=overwrite)
+        self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
+        self._writer.add_metadata("reem", dict(metadata))
+        try:
+            self.output.flush()
+        except OSError as error:
+            self.close()
+            raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
+        self._schemas: dict[Any, int] = {}
+        self._channels: dict[Any, int] = {}
+        self._matched: dict[Any, int] = {}  # which channel messages of a signature go to: found once
+        self._known: dict[Any, list[tuple[Signature, int]]] = {}
+        self._count = 0
+        self._new: list[Any] = []
+        self._totals: dict[int, list[int]] = {}
+        # When the last chunk was closed, and how many messages wait in the open one.
+        self._closed_at = time.monotonic()
+        self._open = 0
+
+    def json(self, path: Path, role: Role, kind: Kind, document: Document, stamp: tuple[int, int, int]) -> int:
+        """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
+        found = signature(document.tree) if role == Role.UPDATE else OPEN
+        key = path, role, kind, document.wrapped, found
+        channel = self._matched.get(key)
+        if channel is None:
+            # Only to be quick: what is forgotten is found again by `fits`.
+            if len(self._matched) >= _MOST_CHANNELS:
+                self._matched.clear()
+            channel = self._matched[key] = self._json_channel(path, role, kind, document.wrapped, found)
+        return self._message(channel, [document.text], stamp)
+
+    def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Signature) -> int:
+        known = self._known.setdefault((path, role, kind, wrapped), [])
+        for types, channel in known:
+            if fits(found, types):
+                return channel
+        # A path that changes its type all the time gets a schema without types.
+        if len(known) == _MOST_SCHEMAS:
+            found = OPEN
+        name = f"reem.{show(path)}" if role == Role.UPDATE else f"reem.{role}"
+        # All channels of a shared topic have one schema: viewers want that.
+        schema = self._schema(name if role == Role.UPDATE else "reem.event", "jsonschema", found)
+        extra = {"reem.wrapped": "1"} if wrapped else {}
+        channel = self._channel(path, role, kind, "json", schema, **extra)
+        known.append((found, channel))
+        return channel
+
+    def part(
+        self, path: Path, role: Role, kind: Kind, label: str, encoded: Encoded, stamp: tuple[int, int, int]
+    ) -> int:
+        """Write a protobuf message; returns its bytes."""
+        key = path, role, kind, label, encoded.schema, encoded.channels
+        channel = self._channels.get(key)
+        if channel is None:
+            schema = self._schema(encoded.schema, "protobuf", None)
+            extra = {"reem.ship": label, **({"reem.channels": encoded.channels} if encoded.channels else {})}
+            channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
+        return self._message(channel, encoded.pieces, stamp)
+
+    def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
+        """Write figures on the recording itself."""
+        document = Document(dict(figures), wrapped=False)
+        if "statistics" not in self._channels:
+            schema = self._schema("reem.stats", "jsonschema", signature(document.tree))
+            self._channels["statistics"] = self._register(STATISTICS, "json", schema, {})
+        self._message(self._channels["statistics"], [document.text], stamp)
+
+    def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
+        """Return the number and the name of a schema."""
+        key = name, encoding, known
+        if key not in self._schemas:
+            text = schema_bytes(name) if encoding == "protobuf" else schema_text(name, known)
+            self._schemas[key] = self._writer.register_schema(name, encoding, text)
+        return self._schemas[key], name
+
+    def _channel(self, path: Path, role: Role, kind: Kind, encoding: str, schema: tuple[int, str], **extra: str) -> int:
+        if self._count >= _MOST_CHANNELS:
+            raise FullError
+        self._count += 1
+        metadata = {"reem.path": orjson.dumps(path).decode(), "reem.role": role.value, "reem.kind": kind.value, **extra}
+        return self._register(_SHARED_TOPICS.get(role) or topic_of(path), encoding, schema, metadata)
+
+    def _register(self, topic: str, encoding: str, schema: tuple[int, str], metadata: dict[str, str]) -> int:
+        metadata["reem.version"] = FORMAT
+        number = self._writer.register_channel(topic, encoding, schema[0], metadata)
+        self._new.append([number, topic, encoding, schema[1], metadata])
+        return number
+
+    def _message(self, channel: int, pieces: list[Any], stamp: tuple[int, int, int]) -> int:
+        log_time, publish_time, number = stamp
+        self._open += 1
+        size = self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
+        totals = self._totals.get(channel)
+        if totals is None:
+            totals = self._totals[channel] = [0, 0, log_time, log_time]
+        totals[0] += 1
+        # As a reader counts them by the index: from one message to the next.
+        totals[1] += size + MESSAGE_HEAD
+        totals[3] = log_time
+        return size
+
+    def tick(self, *, now: bool = False) -> None:
+        """Close the chunk if it is time, so that it can be read whatever happens."""
+        late = time.monotonic() - self._closed_at >= FLUSH_SECONDS
+        if now or late:
+            self._closed_at = time.monotonic()
+            if self._open:
+                self._open = 0
+                self._writer.flush()
+                self._tell_channels()
+
+    def _tell_channels(self) -> None:
+        """Say outside of the chunks too what new channels are for: the chunk that says so may be damaged."""
+        if self._new:
+            self._about_channels(CHANNELS, self._new)
+            self._new = []
+            self.output.flush()
+
+    def _about_channels(self, name: str, rows: list[list[Any]]) -> None:
+        text = orjson.dumps(rows)
+        self._writer.add_metadata(name, {"channels": text.decode(), "crc32": str(zlib.crc32(text))})
+
+    def finish(self, metadata: Mapping[str, str]) -> None:
+        """Write the last chunk, what is said of the recording at its end, and the index; close the file."""
+        self._writer.flush()
+        self._tell_channels()
+        # Only when it is complete: readers take a second record of totals for damage.
+        self._about_channels(TOTALS, [[channel, *figures] for channel, figures in self._totals.items()])
+        self._writer.add_metadata("reem", dict(metadata))
+        self._writer.finish()
+        self.close()
+
+    def close(self) -> None:
+        """Close the file as it is. Idempotent."""
+        self._writer.close()
+        self.output.close()

@@ -1,0 +1,386 @@
+"""The thread that writes: takes what was received from a bounded queue, and keeps the tree as it was recorded.
+
+Nothing waits for it. What does not fit into the queue is dropped and counted, and the key is read anew.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import os
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...concurrency.scheduling import give_way
+from ...plan.differences import same
+from ...plan.paths import Path, show
+from ...plan.patterns import Pattern
+from ...plan.trees import MISSING, CannotApply, get, replaced
+from ...ships.numpy import NumpyShip
+from ...ships.registry import Ships
+from .contents import Content, Recent
+from .layout import WRAPPER, Document, to_json
+from .messages import encode
+from .roles import Kind, Role
+from .sink import FullError, Sink
+from .state import differing, planted, pruned, without
+from .stored import LOST, NotWritten, Stored, Unchanged, extract, opened
+
+__all__ = ["Counts", "Operation", "WriterThread"]
+
+# For which small operations are collected: waking for each would cost as much as writing it.
+_BATCH_SECONDS = 0.04
+# Added to the thread's niceness: it may lag behind, the recorded programs may not.
+_NICER = 10
+_LARGE = (Role.UPDATE, Role.DELETE, Role.STATE, Role.STORED)
+"""Roles that are dropped if the queue is full; the others hold nothing."""
+_HURRY = 1 << 20
+"""Bytes in the queue from which the thread is woken at once."""
+
+_NUMPY = NumpyShip()
+
+
+class Operation(NamedTuple):
+    """One thing to write.
+
+    Attributes:
+        role: What it says.
+        path: The full path.
+        value: What is there now; for a gap, how many updates were lost, None if nobody knows.
+        stamp: Log time and publish time in ns, and a number.
+        kind: Where it came from.
+    """
+
+    role: Role
+    path: Path
+    value: Any
+    stamp: tuple[int, int, int]
+    kind: Kind = Kind.PUBLISHED
+
+
+class Counts:
+    """What was written, and what was not."""
+
+    def __init__(self) -> None:
+        self.messages = 0
+        self.bytes = 0
+        self.dropped = 0
+        self.skipped = 0
+        self.gaps = 0
+        self.lost = 0
+        self.by_path: collections.Counter[str] = collections.Counter()
+
+    def drop(self, path: Path, number: int = 1) -> None:
+        """Count updates that did not fit into the queue."""
+        self.dropped += number
+        self._by_path(path, number)
+
+    def skip(self, path: Path, number: int = 1) -> None:
+        """Count updates that were announced, and of which nobody can tell any more what they wrote."""
+        self.skipped += number
+        self._by_path(path, number)
+
+    def lose(self, path: Path) -> None:
+        """Count a value that cannot be recorded."""
+        self.lost += 1
+        self._by_path(path, 1)
+
+    def _by_path(self, path: Path, number: int) -> None:
+        # Named are the first thousand; a program may publish under ever new names.
+        if len(self.by_path) < 1000 or show(path) in self.by_path:
+            self.by_path[show(path)] += number
+
+
+class WriterThread:
+    """Writes operations to a file on a thread of its own.
+
+    Args:
+        sink: The file.
+        ships: What makes bytes of custom types.
+        limit: Bytes that may wait.
+        patterns: What is recorded of each key, other than samples.
+
+    Attributes:
+        counts: What was written and what was not.
+        failure: Why writing ended, None while it goes on.
+        behind: Keys of which the tree kept here is not what the server has.
+        stored: Keys of which something was written that was only stored; whoever takes note takes them out.
+    """
+
+    def __init__(self, sink: Sink, ships: Ships, limit: int, patterns: Sequence[Pattern] = ()) -> None:
+        self.counts = Counts()
+        self.failure: Exception | None = None
+        self.behind: set[str] = set()
+        self.stored: set[str] = set()
+        self._patterns = patterns
+        self._sink = sink
+        self._ships = ships
+        self._limit = limit
+        self._queue: collections.deque[tuple[Operation, int]] = collections.deque()
+        self._size = 0
+        # Guards the queue and its size. The event loop holds it for a few steps only, never while something is written.
+        self._changed = threading.Condition()
+        self._ending = False
+        self._flushed = threading.Event()
+        # What each key held after the last operation: keyframes are made of it, and reads are compared with it.
+        self._trees: dict[str, Any] = {}
+        self._recent = Recent()
+        self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
+
+    def start(self) -> None:
+        """Begin to write."""
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait to be written."""
+        return self._size
+
+    def put(self, operation: Operation, size: int) -> bool:
+        """Hand over an operation of about `size` bytes; returns whether there was room. Never waits for the disk."""
+        # What an operation costs besides its value: so many small ones are bounded too.
+        size += 200
+        with self._changed:
+            if self.failure is not None or self._ending:
+                return False
+            # What is small always fits: gaps, deletions and skips must be told most of all when the disk is slow. One
+            # operation
+            # fits into an empty queue whatever its size.
+            if operation.role in _LARGE and self._size and self._size + size > self._limit:
+                self.counts.drop(operation.path)
+                # The tree lacks this update, so the key has to be read again.
+                self.behind.add(str(operation.path[0]))
+                return False
+            self._queue.append((operation, size))
+            self._size += size
+            # Else the thread wakes by itself in a moment, and takes many at once.
+            if self._size >= _HURRY:
+                self._changed.notify()
+        return True
+
+    def flush(self) -> None:
+        """Have what was handed over before now in the file, whatever happens from now on. Blocks; once only."""
+        self.put(Operation(Role.FLUSH, ("",), None, (0, 0, 0)), 0)
+        self._flushed.wait()
+
+    def stop(self, metadata: Mapping[str, str]) -> None:
+        """Write what waits and the index, and end the thread. Blocks; idempotent."""
+        with self._changed:
+            self._metadata = metadata
+            self._ending = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # it must never keep the recorded programs waiting
+            # On Linux a thread has a nice value of its own.
+            mine = threading.get_native_id() if sys.platform == "linux" else 0  # elsewhere no thread has a priority
+            if mine:
+                os.setpriority(os.PRIO_PROCESS, mine, min(os.getpriority(os.PRIO_PROCESS, mine) + _NICER, 19))
+        try:
+            # States: taking what waits, until `stop`; then all that is left, the index, and the end. An error ends it
+            # at once.
+            while not self._take():
+                self._sink.tick()
+                self._recent.tick()
+            self._sink.finish({**self._metadata, **self._summary()})
+        except Exception as error:
+            with self._changed:
+                self.failure = error
+                self._queue.clear()
+                self._size = 0
+        finally:
+            self._sink.close()
+            self._flushed.set()
+
+    def _summary(self) -> dict[str, str]:
+        counts = self.counts
+        names = ("messages", "bytes", "dropped", "skipped", "gaps", "lost")
+        figures = {name: str(getattr(counts, name)) for name in names}
+        return figures | {f"not recorded: {path}": str(number) for path, number in counts.by_path.most_common(100)}
+
+    def _take(self) -> bool:
+        """Write what waits; return whether that was the end."""
+        with self._changed:
+            if not self._ending and self._size < _HURRY:
+                self._changed.wait(_BATCH_SECONDS)
+            ending = self._ending
+        while True:
+            with self._changed:
+                if not self._queue:
+                    return ending
+                operation, size = self._queue.popleft()
+            self._write(operation)
+            # Else a frame would stay in memory while the next one is waited for.
+            del operation
+            give_way()
+            self._sink.tick()
+            with self._changed:
+                self._size -= size
+
+    def _write(self, it: Operation) -> None:
+        if it.role == "statistics":
+            self._sink.statistics(it.value, it.stamp)
+            return
+        if it.role == Role.FLUSH:
+            self._sink.tick(now=True)
+            self._flushed.set()
+            return
+        try:
+            # A method for each role that is written.
+            getattr(self, f"_write_{it.role}")(it)
+        except FullError:  # reading it again would not help
+            self.counts.lose(it.path)
+        except NotWritten:
+            self.behind.add(str(it.path[0]))
+
+    def _write_update(self, it: Operation) -> None:
+        name, rest = str(it.path[0]), it.path[1:]
+        tree = self._extracted(it)
+        if type(tree) is not Stored or type(it.value) in (Stored, Unchanged):  # else its message is the update
+            self._count(self._sink.json(it.path, Role.UPDATE, it.kind, to_json(tree), it.stamp))
+        # A long list is a message of its own: to change one of its items, it becomes a list again.
+        before = opened(self._trees.get(name, MISSING), rest, _as_list)
+        if it.kind == Kind.READ:
+            self._trees[name] = planted(before, rest, tree)
+            return
+        try:
+            self._trees[name] = replaced(before, rest, tree)
+        except CannotApply:  # the server has refused it too, or an update is missing here
+            self.behind.add(name)
+
+    def _write_delete(self, it: Operation) -> None:
+        name, rest = str(it.path[0]), it.path[1:]
+        before = opened(self._trees.get(name, MISSING), rest, _as_list)
+        # A read that finds nothing where nothing was known is no news.
+        if it.kind == Kind.READ and get(before, rest) is MISSING:
+            return
+        self._event(it, {"op": "delete", "path": show(it.path)})
+        self._trees[name] = without(before, rest, it.kind)
+
+    def _write_skip(self, it: Operation) -> None:
+        self._event(it, {"op": "skip", "path": show(it.path)})
+
+    def _write_gap(self, it: Operation) -> None:
+        self.counts.gaps += 1
+        self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
+
+    def _event(self, it: Operation, text: dict[str, Any]) -> None:
+        self._count(self._sink.json(it.path, it.role, it.kind, Document(text, wrapped=False), it.stamp))
+
+    def _write_state(self, it: Operation) -> None:
+        name = str(it.path[0])
+        before = self._trees.get(name, MISSING)
+        if it.value is MISSING:
+            if before is not MISSING:
+                self._write_delete(it._replace(role=Role.DELETE))
+            return
+        before = self._settled(it, before)
+        tree = self._extracted(it, before)
+        # A state that is what is known already says nothing: no keyframe.
+        if before is MISSING or not same(tree, before):
+            self._trees[name] = tree
+            self._keyframe(it, tree)
+
+    def _write_stored(self, it: Operation) -> None:
+        name = str(it.path[0])
+        if name in self.behind:  # it may differ in what was published
+            self._write_state(it._replace(role=Role.STATE, kind=Kind.READ))
+            return
+        before = self._trees.get(name, MISSING)
+        before = before if before is MISSING else self._settled(it, before)
+        tree = it.value if it.value is MISSING else self._extracted(it, before)
+        known = before if before is MISSING else pruned(before, it.path, self._patterns)  # without what is sampled
+        for inner in differing(known, tree, before):
+            self.stored.add(name)
+            value, place = get(tree, inner), it.path + inner
+            if value is MISSING:
+                self._write_delete(it._replace(role=Role.DELETE, path=place))
+            else:
+                self._write_update(it._replace(role=Role.UPDATE, path=place, value=value))
+
+    def _write_keyframe(self, it: Operation) -> None:
+        tree = self._settled(it, self._trees.get(str(it.path[0]), MISSING))
+        if tree is not MISSING:
+            self._trees[str(it.path[0])] = tree
+            self._keyframe(it, tree)
+
+    def _settled(self, it: Operation, tree: Any) -> Any:
+        """Return a tree with the long lists in it, of which items were updated, as messages of their own again."""
+        return tree if tree is MISSING else self._extracted(it._replace(value=tree, kind=Kind.READ))
+
+    def _keyframe(self, it: Operation, tree: Any) -> None:
+        document = to_json(tree)
+        if not document.wrapped:
+            notes = {key: document.tree.pop(key) for key in ("$ship",) if key in document.tree}
+            document = Document({WRAPPER: document.tree, **notes}, wrapped=True)
+        document.tree["key"] = str(it.path[0])
+        self._count(self._sink.json(it.path, it.role, Kind.READ, document, it.stamp))
+
+    def _extracted(self, it: Operation, before: Any = None) -> Any:
+        """Return the value with everything long written as a message of its own, unless `before` has it unchanged."""
+
+        def store(label: str, path: Path, value: Any) -> Stored:
+            data, label = self._packed(label, value)
+            # A state that was read again: what has not changed need not be written again.
+            old = get(before, path[len(it.path) :]) if it.role in (Role.STATE, Role.STORED) else None
+            if data is None:
+                lost = Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
+                # Counted once, not at each read.
+                if type(old) is Stored and (old.label, old.summary) == (LOST, lost.summary):
+                    return old
+                self.counts.lose(path)
+                return lost
+            content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", data)
+            stored = _described(label, path, it.stamp[0], data, content)
+            if type(old) is Stored and _is_same(stored, old):
+                return old
+            if stored.numbers is None:
+                self._recent.add(content)
+            # A part belongs to an update or a state; an array that was published by itself is an update.
+            role = Role.UPDATE if path == it.path and it.role == Role.UPDATE else Role.PART
+            encoded = encode(label, data, show(path), it.stamp[1] or it.stamp[0])
+            try:
+                self._count(self._sink.part(path, role, it.kind, label, encoded, it.stamp))
+            except FullError:
+                self.counts.lose(path)
+                return Stored(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
+            return stored
+
+        return extract(it.value, it.path, store)
+
+    def _packed(self, label: str, value: Any) -> tuple[Any, str]:
+        """Return an array or bytes, and the label; None if there is no way to make bytes of the value."""
+        if label:
+            return value, label
+        ship = None if self._ships.asynchronous else self._ships.fits(value)
+        if ship is None or ship.blob is None:
+            return None, LOST
+        return b"".join(ship.blob.pack(value)), ship.label
+
+    def _count(self, size: int) -> None:
+        self.counts.messages += 1
+        self.counts.bytes += size
+
+
+def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Stored:
+    if isinstance(data, np.ndarray):
+        size, summary = _NUMPY.describe(data)
+        numbers = data if label == "list" else None
+        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
+    return Stored(label, path, at, len(data), label, content=content)
+
+
+def _as_list(it: Stored) -> Any:
+    return it if it.numbers is None else it.numbers.tolist()
+
+
+def _is_same(one: Stored, other: Stored) -> bool:
+    if one.content is None or other.content is None or one.label != other.label:
+        return False
+    return one.content.digest() == other.content.digest()

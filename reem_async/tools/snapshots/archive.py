@@ -1,0 +1,279 @@
+"""The portable snapshot: a zip file that any unzip opens, whose end vouches for every byte before it.
+
+    reem-snapshot.json        what this is, and when and where it was taken
+    keys/1/document.json      a document, as the server sent it
+    keys/1/values/1.npy       what a ship holds: an array, for numpy.load
+    keys/1/values/2.bin       other bytes
+    keys/1/values/3.hash      the parts of another Redis type, each after its length and a colon
+    keys/2/...
+    index.json                the names that belong to these
+
+The comment of the zip file ends in the SHA-256 of the whole file (with zeros in the place of that
+digest), so that a file that was cut or changed is recognised before anything is done with it. It is
+written and read one top-level key at a time. Nothing here talks to a server.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO, Self
+
+import orjson
+
+from ...errors import BadData
+from ...plan.paths import check_top_key, parse_suffix
+from .files import FIRST_MEMBER, NewFile, SavedKey, Snapshot
+from .values import KINDS, Entry, Value, joined, split
+
+__all__ = ["Archive", "ArchiveWriter", "header", "verify"]
+
+# Of the format: it grows when older programs would misread a file, not when something is added that they may ignore.
+VERSION = 1
+_HEADER = FIRST_MEMBER.decode()
+_INDEX = "index.json"
+_COMMENT = b"reem-snapshot sha256 "
+# As long as a SHA-256 in hexadecimal digits.
+_ZEROS = b"0" * 64
+# Bytes read at a time.
+_BLOCK = 1 << 20
+_NUMPY = b"\x93NUMPY"
+_SHOWN = 20
+"""Foreign keys that are named."""
+
+
+class _Hashed:
+    """A file for zipfile that cannot seek: every byte passes once, and is counted in the digest."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.digest = hashlib.sha256()
+
+    def write(self, data: Any) -> int:
+        self.digest.update(data)
+        return self._file.write(data)
+
+    def flush(self) -> None:
+        self._file.flush()
+
+    def close(self) -> None:
+        """Leave closing to the owner."""
+
+
+# Bytes of an index after decompression; a small file may claim to unpack to any size.
+_LARGEST_INDEX = 1 << 29
+_LATEST = 1 << 37
+"""A time in seconds since 1970 that no snapshot has been taken at."""
+
+
+class ArchiveWriter:
+    """Makes one portable snapshot, which has its name when `finish` has returned, or never.
+
+    Args:
+        path: The file.
+        header: What `header` returned.
+    """
+
+    def __init__(self, path: Path, header: dict[str, Any]) -> None:
+        self._new = NewFile(path)
+        # A file that cannot seek makes zipfile write sizes behind each member rather than going back to its head, which
+        # would change bytes that are in the digest already.
+        self._hashed = _Hashed(self._new.file)
+        self._zip = zipfile.ZipFile(self._hashed, "w")
+        self._keys: list[dict[str, Any]] = []
+        try:
+            self._put(_HEADER, orjson.dumps({"format": "reem-snapshot", "version": VERSION, **header}))
+        except BaseException:
+            self.abandon()
+            raise
+
+    def add(self, entry: Entry) -> None:
+        """Write one top-level key."""
+        folder = f"keys/{len(self._keys) + 1}"
+        # Text is compressed at the fastest level; arrays are not: they hardly shrink, and this is about as fast as
+        # the disk.
+        self._put(f"{folder}/document.json", entry.text, zipfile.ZIP_DEFLATED)
+        values = []
+        for number, value in enumerate(entry.values, 1):
+            blob = value.pieces[0] if value.kind == "string" else joined(value.pieces)
+            member = f"{folder}/values/{number}.{_ending(value.kind, blob)}"
+            self._put(member, blob)
+            values.append({"suffix": value.suffix, "type": value.kind, "size": value.size, "file": member})
+        row = {"name": entry.name, "size": len(entry.text), "file": f"{folder}/document.json"}
+        self._keys.append({**row, "registry": entry.registry, "values": values})
+
+    def finish(self, foreign: list[str]) -> None:
+        """Write the index and the digest, see to it that all is on the disk, and give the file its name."""
+        index = {"keys": self._keys, "foreign": len(foreign), "foreign_names": foreign[:_SHOWN]}
+        self._put(_INDEX, orjson.dumps(index), zipfile.ZIP_DEFLATED)
+        # The comment is the end of the file. It is written with zeros, which the digest covers, and then the digest
+        # takes
+        # their place: so a reader can compute the same digest from the file alone.
+        self._zip.comment = _COMMENT + _ZEROS
+        self._zip.close()
+        # Behind the back of `_hashed`: these bytes are not counted once more.
+        self._new.file.seek(-len(_ZEROS), 2)
+        self._new.file.write(self._hashed.digest.hexdigest().encode())
+        self._new.commit()
+
+    def abandon(self) -> None:
+        """Remove the file; a thread that is still writing to it gets an error."""
+        self._zip.fp = None  # else its finalizer would write an index at some later time
+        self._new.discard()
+
+    def _put(self, name: str, data: Any, method: int = zipfile.ZIP_STORED) -> None:
+        # A zip file's own times are local and begin in 1980: every member has the same, the header has the real one.
+        self._zip.writestr(zipfile.ZipInfo(name), data, method, 1)
+
+
+def _ending(kind: str, blob: Any) -> str:
+    if kind == "string":
+        return "npy" if blob[:6] == _NUMPY else "bin"
+    return {"ReJSON-RL": "json"}.get(kind, kind)
+
+
+def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> None:
+    """Read the whole file and compare its digest; `progress` is told the bytes done and all of them.
+
+    Raises:
+        BadData: The file was cut or changed, or is no portable snapshot.
+    """
+    total = path.stat().st_size
+    # All but the digest itself, then zeros in its place: what the writer has counted.
+    digest, left = hashlib.sha256(), total - len(_ZEROS)
+    with path.open("rb") as file:
+        while left > 0 and (block := file.read(min(_BLOCK, left))):
+            digest.update(block)
+            left -= len(block)
+            if progress is not None:
+                progress(total - left, total)
+        end = file.read()
+    digest.update(_ZEROS)
+    if digest.hexdigest().encode() != end:
+        raise BadData(
+            f"{path}: the snapshot is damaged or not complete (its {total} bytes do not have the digest at their end); "
+            "nothing was done with it: use another one"
+        )
+
+
+class Archive:
+    """A portable snapshot open for reading; use it in a `with` block.
+
+    Args:
+        path: The file.
+
+    Attributes:
+        summary: What is in it.
+
+    Raises:
+        BadData: It is none, or damaged where it was looked at; `verify` looks everywhere.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        with _believed(path):
+            self._zip = zipfile.ZipFile(path)
+        try:
+            with _believed(path):
+                self.summary = self._summed_up()
+        except BaseException:
+            self._zip.close()
+            raise
+
+    def read(self, name: str) -> Entry:
+        """Return one top-level key; raises BadData."""
+        with _believed(self._path):
+            row = self._rows[name]
+            values = tuple([self._value(each) for each in row["values"]])
+            return Entry(name, self._zip.read(row["file"]), tuple(row["registry"]), values)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._zip.close()
+
+    def _summed_up(self) -> Snapshot:
+        header = self._json(_HEADER)
+        if header["format"] != "reem-snapshot":
+            raise BadData(f"{self._path}: not a snapshot of REEM")
+        if header["version"] > VERSION:
+            raise BadData(
+                f"{self._path}: version {header['version']} of the format; this program knows {VERSION}: update reem"
+            )
+        # The rows are trusted only as far as `_saved_key` has checked them: they become names of keys on a server.
+        index = self._json(_INDEX)
+        self._rows: dict[str, dict[str, Any]] = {row["name"]: row for row in index["keys"]}
+        keys = tuple([_saved_key(row) for row in self._rows.values()])
+        return Snapshot(
+            path=self._path,
+            kind="portable",
+            time=_within(float(header["time"]), _LATEST),
+            size=self._path.stat().st_size,
+            count=len(keys),
+            keys=keys,
+            server=str(header["server"]),
+            namespace=str(header["namespace"]),
+            foreign=int(index["foreign"]),
+            foreign_names=tuple(map(str, index["foreign_names"])),
+        )
+
+    def _json(self, member: str) -> dict[str, Any]:
+        if self._zip.getinfo(member).file_size > _LARGEST_INDEX:
+            raise ValueError(f"{member} is larger than any index")
+        content: dict[str, Any] = orjson.loads(self._zip.read(member))
+        return content
+
+    def _value(self, row: dict[str, Any]) -> Value:
+        blob = self._zip.read(row["file"])
+        # Hashes hold pairs, sorted sets members and scores, JSON is one text.
+        pieces = (blob,) if row["type"] == "string" else tuple(split(blob))
+        if (row["type"] in ("hash", "zset") and len(pieces) % 2) or (row["type"] == "ReJSON-RL" and len(pieces) != 1):
+            raise ValueError(f"a {row['type']} of {len(pieces)} pieces")
+        return Value(row["suffix"], row["type"], pieces)
+
+
+def _saved_key(row: dict[str, Any]) -> SavedKey:
+    """Return what the index says of a key, nothing of which is trusted: these become names on a server."""
+    name = check_top_key(row["name"])
+    for suffix in [*row["registry"], *[value["suffix"] for value in row["values"]]]:
+        if suffix and suffix[0] not in ".[~":
+            raise ValueError(f"{suffix!r} is not the place of a value")
+        parse_suffix(suffix)
+    unknown = [value["type"] for value in row["values"] if value["type"] not in KINDS]
+    if unknown:
+        raise ValueError(f"a value of {name} has the unknown type {unknown[0]!r}")
+    values = tuple([(it["suffix"], it["type"], int(_within(it["size"], 2**63))) for it in row["values"]])
+    return SavedKey(name, int(_within(row["size"], 2**63)), values)
+
+
+def _within(number: float, limit: float) -> float:
+    if not 0 <= number < limit:
+        raise ValueError(f"{number!r} cannot be")
+    return number
+
+
+@contextmanager
+def _believed(path: Path) -> Iterator[None]:
+    """Turn whatever a damaged file leads to into BadData."""
+    try:
+        yield
+    except BadData:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise BadData(f"{path}: the snapshot is damaged or not complete: {error}") from None
+    # What code runs into that finds other types and names than it expects in a file which was made up.
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError, MemoryError) as error:
+        raise BadData(f"{path}: the snapshot is damaged, its index does not fit its content: {error}") from None
+
+
+def header(server: str, namespace: str, match: str, version: str) -> dict[str, Any]:
+    """Return what the first member says of the rest."""
+    now = time.time()
+    utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now))
+    return {"time": now, "utc": utc, "server": server, "namespace": namespace, "match": match, "reem": version}

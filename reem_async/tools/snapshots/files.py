@@ -1,0 +1,223 @@
+"""Files of snapshots: what one says of itself, names by time, and writing that is all or nothing."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+import time
+import zipfile
+import zlib
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import orjson
+
+from ...errors import BadData
+from ..partfile import PartFile
+
+__all__ = ["SUFFIXES", "NewFile", "SavedKey", "Snapshot", "check_target", "dated", "new_name", "prune", "sniff"]
+
+SUFFIXES = {"portable": ".zip", "rdb": ".rdb"}
+"""How the names of both kinds of files end. What a file is, its content says."""
+
+FIRST_MEMBER = b"reem-snapshot.json"
+"""The name of the first member of a portable snapshot."""
+
+# reem-20260801T120000Z.zip, reem-auto-20260801T120000Z-2.rdb: only "auto" ones, of --keep, are ever deleted.
+_NAME = re.compile(r"reem-(?P<auto>auto-)?(?P<time>\d{8}T\d{6}Z)(?:-\d+)?\.(?:zip|rdb)")
+_TIME = "%Y%m%dT%H%M%SZ"
+# Bytes of the first member that are read: the rest of a header that somebody made up is not needed.
+_LONGEST_HEADER = 1 << 16
+
+
+class SavedKey(NamedTuple):
+    """One top-level key in a portable snapshot.
+
+    Attributes:
+        name: The key, without namespace.
+        document: Bytes of the document's JSON.
+        values: Of each value that a ship holds: the key's name after the tag, the Redis type, and bytes.
+    """
+
+    name: str
+    document: int
+    values: tuple[tuple[str, str, int], ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Bytes of document and values."""
+        return self.document + sum([size for _, _, size in self.values])
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """What a file holds.
+
+    Attributes:
+        path: The file.
+        kind: "portable" or "rdb".
+        time: When it was taken, in seconds since 1970.
+        size: Bytes of the file.
+        count: Top-level keys in a portable one; Redis keys of the first database in an RDB file, and None
+            where it does not say.
+        keys: The top-level keys of a portable one, in order of their names.
+        server: Where it was taken, or which program wrote the RDB file.
+        namespace: The namespace it was taken of.
+        foreign: How many Redis keys were left out since they are not REEM's.
+        foreign_names: The first of them, with their types.
+        doubt: Of one that was just saved, why keys may be missing; empty if all that the server counts were found.
+    """
+
+    path: Path
+    kind: str
+    time: float
+    size: int
+    count: int | None
+    keys: tuple[SavedKey, ...] = field(default=(), repr=False)
+    server: str = ""
+    namespace: str = ""
+    foreign: int = 0
+    foreign_names: tuple[str, ...] = ()
+    doubt: str = ""
+
+
+def sniff(path: Path) -> str:
+    """Return "portable" or "rdb", by what the file begins with.
+
+    Raises:
+        BadData: It is neither.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(64)
+    # A zip file's first member: its name stands 30 bytes after the signature.
+    if head.startswith(b"PK\3\4") and head[30:].startswith(FIRST_MEMBER):
+        return "portable"
+    if re.match(rb"REDIS\d{4}|VALKEY\d{3}", head):
+        return "rdb"
+    raise BadData(f"{path}: neither a snapshot of REEM nor an RDB file; it begins with {head[:16]!r}")
+
+
+def new_name(directory: Path, kind: str, moment: float, *, auto: bool) -> Path:
+    """Return a name that says when, in UTC, and that no file of the directory has."""
+    stem = f"reem-{'auto-' if auto else ''}{time.strftime(_TIME, time.gmtime(moment))}"
+    path, number = directory / f"{stem}{SUFFIXES[kind]}", 1
+    while path.exists():
+        number += 1
+        path = directory / f"{stem}-{number}{SUFFIXES[kind]}"
+    return path
+
+
+def dated(path: Path) -> float | None:
+    """Return the time in a name that `new_name` made, None for any other name."""
+    found = _NAME.fullmatch(path.name)
+    if found is None:
+        return None
+    with suppress(ValueError):
+        return datetime.datetime.strptime(found["time"], _TIME).replace(tzinfo=datetime.UTC).timestamp()
+    return None
+
+
+def prune(made: Sequence[Path], keep: int) -> list[Path]:
+    """Delete the oldest snapshots that were saved by period until `keep` are left; return what was deleted.
+
+    Only files beside the last one made that have such a name and such content, and are of its kind, server,
+    namespace and pattern, are deleted, and never that one itself. Those of earlier runs go first, whatever the
+    clock said then and says now: a robot without a clock of its own begins each day in 1970.
+
+    Args:
+        made: What this run has saved, in this order.
+        keep: How many to leave, at least 1.
+    """
+    # A clock may have been set back since: files of this run are in the order in which they were made, not of their
+    # times.
+    newest, order = made[-1], {path: number for number, path in enumerate(made)}
+    origin = _origin(newest)
+    own = [
+        path
+        for path in newest.parent.iterdir()
+        if path.suffix == newest.suffix and path != newest and _is_automatic(path) and _origin(path) == origin
+    ]
+    # -1 for files of earlier runs: they are older than all of this run.
+    own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
+    # `own` is without the newest one, which counts among those that are kept.
+    gone = own[: max(0, len(own) + 1 - keep)]
+    for path in gone:
+        path.unlink(missing_ok=True)
+    return gone
+
+
+def _is_automatic(path: Path) -> bool:
+    found = _NAME.fullmatch(path.name)
+    if found is None or found["auto"] is None or path.is_symlink() or not path.is_file():
+        return False
+    try:
+        return SUFFIXES[sniff(path)] == path.suffix
+    except (BadData, OSError):
+        return False
+
+
+def _origin(path: Path) -> tuple[object, ...]:
+    """Return what of which server a snapshot holds, as far as it says that; an RDB file does not."""
+    if path.suffix != SUFFIXES["portable"]:
+        return ()
+    try:
+        with zipfile.ZipFile(path) as archive:
+            said = orjson.loads(archive.open(FIRST_MEMBER.decode()).read(_LONGEST_HEADER))
+        return said["server"], said["namespace"], said["match"]
+    except (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, zlib.error, RuntimeError):
+        # Not readable: equal to no other file, so it is not deleted.
+        return (path,)
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Raise what would only show after the work: FileExistsError, NotADirectoryError, IsADirectoryError."""
+    if path.is_dir():
+        raise IsADirectoryError(
+            f"{path} is a directory; name a file in it, or use --directory, which names one by time"
+        )
+    if not path.parent.is_dir():
+        raise NotADirectoryError(f"{path}: there is no directory {path.parent}; make it first")
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} is there already; choose another name, or replace it with overwrite=True")
+
+
+class NewFile:
+    """A file that gets the name `path` when all of it is on the disk, or never; until then it is hidden beside it.
+
+    Attributes:
+        file: What to write to.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._part = PartFile(path)
+        self.file: BinaryIO = self._part.path.open("r+b")
+
+    def commit(self) -> None:
+        """Give the file its name."""
+        self.file.flush()
+        # First the content, then the name: after a power failure there is never a name with half a file.
+        os.fsync(self.file.fileno())
+        self.file.close()
+        self._part.finish()
+        _sync_directory(self._part.path.parent)
+
+    def discard(self) -> None:
+        """Remove the file. A thread that still writes to it or commits it gets an error, and the name stays free."""
+        with suppress(OSError):
+            self.file.close()
+        self._part.close()
+
+
+def _sync_directory(directory: Path) -> None:
+    """Make the new name survive a power failure, where directories can be opened."""
+    with suppress(OSError):
+        descriptor = os.open(directory, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,90 @@
+"""A client of redis-py for the same server, for what REEM has no call for."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import redis
+import redis.asyncio
+
+from ..errors import Misuse, NoJsonSupport
+from .options import Options
+from .packing import Packer
+
+__all__ = ["asyncio_client", "client"]
+
+_NO_JSON = "UNKNOWN COMMAND 'JSON."
+"""How the error of a server without JSON begins, in capitals; redis-py has taken its `ERR` away."""
+
+
+def _in_words(error: redis.exceptions.ResponseError, command: Any) -> Exception:
+    """Return an error reply, in words that help if it is that of a server without JSON."""
+    if not str(error).upper().startswith(_NO_JSON):
+        return error
+    return NoJsonSupport(
+        f"{command}: this server has no JSON, so interface.client has no JSON commands; documents are text there. "
+        "Read and write them with a KeyValueStore, kvs['foo']['bar']; client.get('foo') returns the text of one"
+    )
+
+
+class _Client(redis.Redis):
+    """With the names of rejson-py besides, which REEM 0.1 handed out: `jsonget(...)` is `json().get(...)`."""
+
+    def jsonset(self, name: str, path: str, obj: Any, nx: bool = False, xx: bool = False) -> Any:
+        """Store JSON; raises ResponseError if a parent is missing, as servers did then (they answer nil now)."""
+        reply = self.json().set(name, path, obj, nx, xx)
+        if reply is None and not nx and not xx:
+            raise redis.exceptions.ResponseError(f"{name}: the parent of {path} is missing")
+        return reply
+
+    def parse_response(self, connection: Any, command_name: Any, **options: Any) -> Any:
+        """Return a reply; raises NoJsonSupport where the server has no JSON."""
+        try:
+            return super().parse_response(connection, command_name, **options)  # type: ignore[no-untyped-call]
+        except redis.exceptions.ResponseError as error:
+            raise _in_words(error, command_name) from None
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("json"):
+            name = name.removeprefix("json")
+            return getattr(self.json(), "delete" if name == "del" else name)
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+
+class _AsyncioClient(redis.asyncio.Redis):
+    """The same for asyncio, without rejson-py's names."""
+
+    async def parse_response(self, connection: Any, command_name: Any, **options: Any) -> Any:
+        """Return a reply; raises NoJsonSupport where the server has no JSON."""
+        try:
+            return await super().parse_response(connection, command_name, **options)
+        except redis.exceptions.ResponseError as error:
+            raise _in_words(error, command_name) from None
+
+
+def _settings(options: Options) -> tuple[str, dict[str, Any]]:
+    """Return the class of connections and how they are made: replies are str, in the shapes of protocol 2."""
+    if type(options) is not Options:
+        raise Misuse(
+            f"{options.address}: interface.client is for one server; use redis.RedisCluster or redis.sentinel.Sentinel"
+        )
+    # As redis-py comes: programs of REEM 0.1, and its documentation, expect these shapes.
+    settings = {"socket_timeout": options.timeout, **options.settings, "protocol": 2, "decode_responses": True}
+    if options.socket_path is not None:
+        return "UnixDomainSocketConnection", {**settings, "path": options.socket_path}
+    return "SSLConnection" if options.tls else "Connection", settings
+
+
+def client(options: Options) -> Any:
+    """Return a blocking client; nothing is connected yet."""
+    kind, settings = _settings(options)
+    settings = {"command_packer": Packer(), **settings}
+    pool = redis.ConnectionPool(connection_class=getattr(redis.connection, kind), **settings)
+    return _Client.from_pool(pool)
+
+
+def asyncio_client(options: Options) -> Any:
+    """Return an asyncio client; nothing is connected yet."""
+    kind, settings = _settings(options)
+    pool = redis.asyncio.ConnectionPool(connection_class=getattr(redis.asyncio.connection, kind), **settings)
+    return _AsyncioClient.from_pool(pool)

@@ -1,0 +1,137 @@
+"""The state of an interface's connection: to look at, to be called about, to iterate over."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from ..concurrency.queues import BoundedQueue, Last
+from ..concurrency.streams import Stream
+from ..errors import InterfaceClosed
+
+__all__ = ["State", "StateChange", "StateChanges", "States"]
+
+logger = logging.getLogger("reem.connection")
+
+State = Literal["idle", "connected", "lost", "reconnecting", "closed"]
+"""idle: nothing was connected yet. lost: a connection broke and none is left that answers; the next call makes a
+new one, and an event loop tries once at once. reconnecting: the same, and it is tried until it works, since somebody
+follows updates."""
+
+# Changes that wait for a slow reader of `states()`: of a server that comes and goes, the last ones tell.
+_KEPT = 100
+
+
+@dataclass(frozen=True, slots=True)
+class StateChange:
+    """One change of the state of an interface's connection.
+
+    Attributes:
+        state: The new state.
+        reason: Why, for people; empty where there is nothing to say.
+        time: When, in seconds since 1970 on this machine's clock.
+        restarted: The server is another process than at the last connection: it was restarted (and may
+            have lost what it had not saved), or another one took its place.
+    """
+
+    state: State
+    reason: str
+    time: float
+    restarted: bool = False
+
+
+class StateChanges(Stream[StateChange]):
+    """Yields the state as it is, then each change: an async iterator; ends when the interface is closed."""
+
+    @property
+    def _following(self) -> bool:
+        return True
+
+    async def listen(self) -> None:
+        """Nothing to wait for: it follows from the beginning."""
+
+
+class States:
+    """The state of one interface. Any thread may call; what is called back runs on the thread that noticed.
+
+    Attributes:
+        unreadable: How many messages on followed channels could not be read.
+    """
+
+    def __init__(self) -> None:
+        self.unreadable = 0
+        self.last = StateChange("idle", "", time.time())
+        self._lock = threading.RLock()
+        self._queues: list[weakref.ref[BoundedQueue]] = []  # leaving a WeakSet takes steps that a signal may divide
+        self._callbacks: list[Callable[[StateChange], object]] = []
+        self._servers: dict[str, str] = {}
+
+    def changes(self) -> StateChanges:
+        """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
+        changes = StateChanges(Last(_KEPT))
+        with self._lock:
+            changes.queue.put(self.last)
+            if self.last.state == "closed":
+                changes.queue.close()
+            self._queues.append(weakref.ref(changes.queue, self._queues.remove))
+        return changes
+
+    def call(self, callback: Callable[[StateChange], object]) -> None:
+        """Call `callback` with each change from now on; it must not block. What it raises is logged."""
+        self._callbacks.append(callback)
+
+    def opened(self, address: str, server: str | None) -> None:
+        """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so)."""
+        with self._lock:
+            # Per address: another node of a cluster is another process without anything having been restarted.
+            before = self._servers.get(address, server)
+            restarted = before != server and server is not None
+            if server is not None:
+                self._servers[address] = server
+            if restarted or self.last.state not in ("connected", "closed"):
+                self._change("connected", f"the server at {address} was restarted" if restarted else "", restarted)
+
+    def lost(self, reason: Exception) -> bool:
+        """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
+        with self._lock:
+            if self.last.state in ("connected", "idle") and not isinstance(reason, InterfaceClosed):
+                self._change("lost", str(reason))
+            return self.last.state == "lost"
+
+    def answered(self) -> None:
+        """Note that the server answers over another connection than the one that was lost."""
+        with self._lock:
+            if self.last.state == "lost":
+                self._change("connected", "")
+
+    def retrying(self) -> None:
+        """Note that a connection is made again."""
+        with self._lock:
+            if self.last.state in ("connected", "lost"):
+                self._change("reconnecting", self.last.reason)
+
+    def closed(self) -> None:
+        """Note the end, which ends all iterators."""
+        with self._lock:
+            if self.last.state != "closed":
+                self._change("closed", "")
+            for queue in self._listening():
+                queue.close()
+
+    def _listening(self) -> list[BoundedQueue]:
+        return [queue for reference in tuple(self._queues) if (queue := reference()) is not None]
+
+    def _change(self, state: State, reason: str, restarted: bool = False) -> None:
+        self.last = StateChange(state, reason, time.time(), restarted)
+        for queue in self._listening():
+            queue.put(self.last)
+        for callback in list(self._callbacks):
+            try:
+                callback(self.last)
+            except Exception:
+                logger.exception("a callback for changes of the connection raised")

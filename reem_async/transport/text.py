@@ -1,0 +1,216 @@
+"""Where a plan's JSON commands meet a server that has no JSON module: see `reem_async.plain`.
+
+Which kind of server it is, each connection knows: HELLO lists the modules. Only where no JSON is among them is one
+question more asked, once for each connection, since some servers have JSON without a module.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Protocol
+from zlib import crc32
+
+from ..errors import NoJsonSupport
+from ..plain.batches import Known, Steps, Watched, concerns, has_json
+from ..plain.changes import after_look
+from ..plain.translation import directly, finished, looked_at, shortcut, translated
+from ..plan import Command, Reply
+from ..plan.staging import KEPT, as_given, is_large, stage
+from . import Held
+from .parsing import error_of
+
+__all__ = ["PROBE", "HeldText", "Text", "is_plain", "lists_json", "over_wire"]
+
+PROBE: Command = ("JSON.GET",)
+"""Refused by every server: for its number of words by one that knows the command, else as an unknown one."""
+
+_AT_A_TIME = 8
+"""Changes below the top that one interface has under way at the same time, each over a connection of its own."""
+
+_MODULES = (b"ReJSON", "ReJSON", b"json", "json")
+"""What HELLO calls the modules of Redis and of Valkey."""
+
+
+def lists_json(greeting: Any) -> bool:
+    """Return whether a reply to HELLO lists a JSON module."""
+    if not isinstance(greeting, dict):
+        return False
+    modules = greeting.get(b"modules") or greeting.get("modules") or ()
+    return any(isinstance(each, dict) and (each.get(b"name") or each.get("name")) in _MODULES for each in modules)
+
+
+def is_plain(reply: Reply) -> bool:
+    """Return whether a reply to `PROBE` says that the server has no JSON."""
+    return isinstance(reply, NoJsonSupport)
+
+
+class Send(Protocol):
+    """Sends commands that any server takes."""
+
+    def __call__(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
+        """Return their replies, once awaited."""
+        ...
+
+
+class Lending(Protocol):
+    """What a transport has for it: a connection of the caller's own, and a lock."""
+
+    def hold(self) -> AbstractAsyncContextManager[Held]:
+        """Lend a connection."""
+        ...
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
+        """Return the lock of `key`."""
+        ...
+
+
+class Text:
+    """The documents of one server without JSON, as one transport meets them."""
+
+    def __init__(self) -> None:
+        self.known = Known()
+
+    def shortcut(self, commands: Sequence[Command]) -> list[Command] | None:
+        """Return what to send for what programs do most, None for all else; `finished` makes the answers."""
+        return shortcut(commands, self.known)
+
+    def finished(self, commands: Sequence[Command], replies: list[Reply]) -> list[Reply]:
+        """Return the answers to commands for which there was a shortcut."""
+        return finished(commands, replies, self.known, error_of)
+
+    async def roundtrip(self, send: Send, lending: Lending, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+        """Send commands for which there is no shortcut: in one round trip, or in two on a connection that is lent."""
+        keys = looked_at(commands, self.known)
+        if keys:
+            return await self._after_look(lending, keys, commands, bulk)
+        if not concerns(commands):
+            return await send(commands, bulk=bulk)
+        replies = await _carried_out(send, directly(commands, self.known, error_of), bulk)
+        assert replies is not None
+        return replies
+
+    async def _after_look(
+        self, lending: Lending, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
+    ) -> list[Reply]:
+        """Look, then change, again if somebody else was first. Two round trips.
+
+        Callers of one transport go one after the other for each key, since they would only be in each other's way, and
+        no more than a few at a time, since each has a connection. Cancelled, or broken off, it was applied once or not
+        at all; the connection is closed.
+        """
+        # Locks by a few numbers rather than by key, which bounds the connections as well. Sorted, so that two callers
+        # who need the same two locks never wait for each other.
+        turns = {f"documents {crc32(key) % _AT_A_TIME}" for key in keys}
+        return await self._in_turn(sorted(turns), lending, keys, commands, bulk)
+
+    async def _in_turn(
+        self, turns: Sequence[str], lending: Lending, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
+    ) -> list[Reply]:
+        if turns:
+            async with lending.ordered(turns[0]):
+                return await self._in_turn(turns[1:], lending, keys, commands, bulk)
+        async with lending.hold() as held:
+            if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
+                return await held.roundtrip(commands, bulk=bulk)
+            replies = await held.attempt(keys, commands, bulk)
+            # Somebody was first, and will be again while the array is on its way: from now on it is sent ahead.
+            if replies is None and commands[-1][0] == "EXEC" and any(map(is_large, commands)):
+                return await _Ahead(held, keys, commands).carried_out(bulk)
+            while replies is None:
+                replies = await held.attempt(keys, commands, bulk)
+            return replies
+
+
+class HeldText:
+    """A connection of one caller's own, to a server without JSON.
+
+    Args:
+        held: The connection.
+        text: The server's documents.
+    """
+
+    def __init__(self, held: Held, text: Text) -> None:
+        self._held = held
+        self._known = text.known
+        self._watched = Watched()
+
+    async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        """Send `commands` and return their replies; a change of what was not read before takes two round trips."""
+        while True:
+            steps = translated(commands, self._known, error_of, self._watched)
+            replies = await _carried_out(self._held.roundtrip, steps, bulk)
+            if replies is not None:
+                return replies
+
+    async def attempt(self, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool) -> list[Reply] | None:
+        """Look at `keys` and change them where nothing is watched before; return None if somebody else was first."""
+        return await _carried_out(self._held.roundtrip, after_look(commands, keys, self._known, error_of, None), bulk)
+
+
+class _Ahead:
+    """A transaction whose large values are sent before it: others would always be first while they are on their way.
+
+    Args:
+        held: The connection.
+        keys: Of the documents; all are in one slot.
+        commands: MULTI, what it does, EXEC.
+    """
+
+    def __init__(self, held: HeldText, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
+        tag = f"{{{keys[0].decode(errors='surrogateescape')}}}"
+        self._held, self._keys = held, keys
+        self._commands, self._coming = stage(commands, tag, secrets.token_hex(5))
+
+    async def carried_out(self, bulk: bool) -> list[Reply]:
+        """Send it until nobody else is first."""
+        sent = -float(KEPT)
+        while True:
+            # Sent again well before the server forgets it.
+            if time.monotonic() - sent > KEPT / 2:
+                sent = time.monotonic()
+                refused = await self._sent()
+                if refused is not None:
+                    return refused
+            replies = await self._held.attempt(self._keys, self._commands, bulk)
+            if replies is not None:
+                return as_given(self._commands, self._coming, replies)
+
+    async def _sent(self) -> list[Reply] | None:
+        """Send what is large; return the replies if the server refuses that."""
+        replies = await self._held.roundtrip([each.upload for each in self._coming])
+        reason = next((reply for reply in replies if isinstance(reply, Exception)), None)
+        return None if reason is None else [reason] * (len(self._commands) - len(self._coming))
+
+
+async def _carried_out(send: Send, steps: Steps, bulk: bool) -> list[Reply] | None:
+    """Send what a translation yields, until it returns."""
+    commands = next(steps)
+    while True:
+        replies = await send(commands, bulk=bulk)
+        try:
+            commands = steps.send(replies)
+        except StopIteration as end:
+            found: list[Reply] | None = end.value
+            return found
+
+
+def over_wire(
+    commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]
+) -> tuple[Sequence[Command], Callable[[list[Reply] | Exception], None]]:
+    """Return what to send in place of `commands`, which only read, and what to call with the replies."""
+    if not has_json(commands):
+        return commands, done
+    steps = directly(commands, Known(), error_of)
+
+    def answered(outcome: list[Reply] | Exception) -> None:
+        if isinstance(outcome, list):
+            try:
+                steps.send(outcome)
+            except StopIteration as end:
+                outcome = end.value
+        done(outcome)
+
+    return next(steps), answered

@@ -1,0 +1,191 @@
+"""Stores of old versions, as these wrote them, and what they hold."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import threading
+
+import numpy as np
+from conftest import ROOT
+
+from reem import NumpyShip, SpecialDatatypeShip
+
+VERSIONS = ["reem_0_0_11", "reem_0_1_2", "reem_0_1_3"]
+
+A = np.arange(6.0).reshape(2, 3)
+
+
+class Pose:
+    def __init__(self, x, y):
+        self.x, self.y = x, y
+
+    def __eq__(self, other):
+        return type(other) is Pose and (self.x, self.y) == (other.x, other.y)
+
+    __hash__ = None
+
+
+class PoseShip(SpecialDatatypeShip):
+    """The custom ship that the stores were written with."""
+
+    def check_fit(self, value):
+        return isinstance(value, Pose)
+
+    def get_label(self):
+        return "pose"
+
+    def write(self, key, value, client):
+        client.hset(key, "x", str(value.x))
+        client.hset(key, "y", str(value.y))
+
+    def read(self, key, client):
+        client.hgetall(key)
+
+    def interpret_read(self, responses):
+        return Pose(float(responses[0][b"x"]), float(responses[0][b"y"]))
+
+
+def ships():
+    return [PoseShip(), NumpyShip()]
+
+
+STORED = {
+    "plain": {"id": 3, "x": [1, 2.5, None, True, "t"]},
+    "mixed": {"image": A.astype("uint8"), "id": 3},
+    "whole array": A,
+    "number": 5,
+    "float": 0.1 + 0.2,
+    "text": "hello",
+    "list": [1, 2.5, {"a": "b"}],
+    "deep": {
+        "a": {"b": {"arr": A.T, "n": None, "more": np.arange(3, dtype="int32")}, "c": 1},
+        "none": np.zeros((0, 3)),
+        "one": np.array(7.5),
+        "yes": np.array([True, False]),
+    },
+    "pose": {"where": Pose(1.5, 2.5), "n": 1},
+    "whole pose": Pose(3.0, 4.0),
+    "replaced": {"arr": 5, "x": {"z": A * 2}, "n": 1},
+    "over": {"a": A},
+    "beside": {"sub": A},
+    "back": 7,
+    "writer": A,
+    "published": {"arr": A, "t": 1.25},
+    "kinds": {"big": np.arange(3, dtype=">i4"), "text": np.array(["ab", "c"]), "complex": np.array([1 + 2j])},
+    "cam": {"image": A + 1},
+}
+"""What the program that was recorded had stored in the end."""
+
+SINCE_0_1 = {"items": [1, A, 3], "box": {"l": [1, {"m": A}]}}
+"""What 0.0.11 could not store."""
+
+SINCE_0_1_3 = {
+    "dropped": {"image": A},  # of which an entry was deleted, and with it, by 0.1.3, the document
+    "tolerant": {"a": {"b": {"image": A, "n": 1, "more": A * 3}}},
+    "tolerant number": 5,
+}
+"""What only 0.1.3 could store or leave."""
+
+NOT_OLD = {
+    "reem_0_0_11": {"plain"},
+    "reem_0_1_2": {"plain", "list"},
+    "reem_0_1_3": {"plain", "list", "tolerant number"},
+}
+"""What is stored as it is today."""
+
+
+def stored(version):
+    return {
+        **STORED,
+        **(SINCE_0_1 if version != "reem_0_0_11" else {}),
+        **(SINCE_0_1_3 if version == "reem_0_1_3" else {}),
+    }
+
+
+def recorded(version, only=None, space=""):
+    """The commands, with `space` before each key; of some top-level keys, or all."""
+    commands = []
+    for line in (ROOT / "tests/olddata" / f"{version}.jsonl").read_text(encoding="utf-8").splitlines():
+        name, key, *rest = (word.encode("latin-1") for word in json.loads(line))
+        top = key.decode().partition("&&&&")[0].partition(".")[0].partition("[")[0]
+        if only is None or top in only:
+            commands.append((name, space.encode() + key, *rest))
+    return commands
+
+
+def replay(raw, version, only=None, space=""):
+    with raw.pipeline(transaction=False) as pipeline:
+        for command in recorded(version, only, space):
+            pipeline.execute_command(*command)
+        pipeline.execute()
+
+
+def everything(raw):
+    """All keys with what they hold; notes of the last update aside."""
+    return {
+        key: raw.json().get(key) if raw.type(key) == "ReJSON-RL" else raw.dump(key)
+        for key in raw.scan_iter()
+        if not key.endswith(":last")
+    }
+
+
+class Cut:
+    """A way to a server that hands on a number of commands, one by one, and is dead from then on.
+
+    Attributes:
+        handed_on: How many it has handed on.
+    """
+
+    def __init__(self, port, after):
+        self._target, self._left = port, after
+        self.handed_on = 0
+        self._links = []
+        self._lock = threading.Lock()
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.url = f"redis://127.0.0.1:{self._listening.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self._end()
+
+    def _accept(self):
+        with contextlib.suppress(OSError):
+            while True:
+                client, _ = self._listening.accept()
+                server = socket.create_connection(("127.0.0.1", self._target))
+                for link in (client, server):
+                    link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._links += [client, server]
+                threading.Thread(target=self._up, args=(client, server), daemon=True).start()
+                threading.Thread(target=self._down, args=(client, server), daemon=True).start()
+
+    def _up(self, client, server):
+        with contextlib.suppress(OSError, ValueError), client.makefile("rb") as words:
+            while line := words.readline():
+                command = line
+                for _ in range(int(line[1:])):
+                    size = words.readline()
+                    command += size + words.read(int(size[1:]) + 2)
+                with self._lock:
+                    if not self._left:
+                        self._end()
+                        return
+                    self._left -= 1
+                    self.handed_on += 1
+                    server.sendall(command)
+
+    def _down(self, client, server):
+        with contextlib.suppress(OSError):
+            while data := server.recv(65536):
+                client.sendall(data)
+
+    def _end(self):
+        for link in [self._listening, *self._links]:
+            with contextlib.suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+            link.close()

@@ -1,0 +1,110 @@
+"""A robot with a camera and a depth camera, and how much of it the page's slider has.
+
+The quick version is in test_browser_pictures.py. All of it, with the defaults of `reem browse`, in 70 seconds:
+
+    .venv/bin/python tests/picturekit.py
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from reem import PublishSpace, RedisInterface
+from reem.server import EmbeddedServer
+
+INSTANTS = 155
+
+
+def robot(url, name):
+    """Publish a camera's 640x480x3 uint8 at 30 Hz and depth, 640x480 float32, at 10 Hz, until killed."""
+    rows, columns = np.mgrid[0:480, 0:640].astype(np.float32)
+    noise = np.random.default_rng(1).normal(0, 4, (480, 640, 3))
+    pictures = []
+    for number in range(10):
+        wave = 128 + 60 * np.sin((columns + 20 * number) / 40) + 50 * np.cos(rows / 60)
+        pictures.append(
+            np.clip(wave[:, :, None] * (1.0, 0.8, 0.6) + np.roll(noise, number, 0), 0, 255).astype(np.uint8)
+        )
+    depth = (1.0 + rows / 100 + 0.3 * np.sin(columns / 25)).astype(np.float32)
+    with RedisInterface(url) as interface:
+        space = PublishSpace(interface)
+        space[name] = {"camera": {"image": pictures[0], "frame": 0}, "depth": {"image": depth, "frame": 0}}
+        began = time.monotonic()
+        for number in itertools.count(1):
+            time.sleep(max(began + number / 30 - time.monotonic(), 0))
+            space[name]["camera"]["image"] = pictures[number % 10]
+            if number % 3 == 0:
+                space[name]["depth"]["image"] = depth + np.float32(number % 100 / 1000)
+
+
+@contextlib.contextmanager
+def running_robot(url, name):
+    """Run the robot in a process of its own."""
+    process = subprocess.Popen([sys.executable, __file__, "robot", url, name])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def look_back(ask, path, start, end, instants=INSTANTS):
+    """Ask for the picture at so many instants of a span; returns what is said of each, None where there is none."""
+    found = []
+    for at in np.linspace(start, end, instants):
+        answer = ask.ask("image", path=path, at=at)
+        found.append(json.loads(answer.headers["x-picture"]) if answer.status_code == 200 else None)
+    return found
+
+
+def told(answers):
+    """Return one line on the answers."""
+    pictures = [answer for answer in answers if answer is not None]
+    ages = [answer["age"] for answer in pictures if answer["age"] is not None]
+    previews = sum([answer["preview"] for answer in pictures])
+    return (
+        f"{len(pictures)} of {len(answers)} instants have a picture, {previews} of them small; "
+        f"{len(ages)} with an age: median {statistics.median(ages):.2f} s, at most {max(ages):.2f} s"
+    )
+
+
+def main():
+    """Print what the slider has after a minute."""
+    from browserkit import client_of, served
+
+    from reem_async import RedisInterface as AsyncInterface
+    from reem_async.tools.browser import LiveSource
+
+    with EmbeddedServer() as server:
+        make = served(lambda: LiveSource(AsyncInterface(server.url)))
+        with make as (address, source), running_robot(server.url, "robot"), client_of(address) as ask:
+            before = resident()
+            time.sleep(66)
+            grown = (resident() - before) / 1e6
+            for name in ("camera", "depth"):
+                span = ask.json("tree", open="1:0:")
+                print(f"{name}: {told(look_back(ask, f'robot.{name}.image', span['start'] + 2, span['end']))}")
+            print(f"{span['end'] - span['start']:.1f} s kept, {source.history.dropped} changes dropped")
+            counted, bound = source.history.bytes / 1e6, source.history.budget / 1e6
+            print(f"memory: {counted:.0f} MB counted of {bound:.0f} MB, the process grew by {grown:.0f} MB")
+
+
+def resident():
+    """Return how many bytes of memory this process has."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["robot"]:
+        robot(*sys.argv[2:])
+    else:
+        main()

@@ -1,0 +1,326 @@
+"""The page as something one leaves open all day: what it marks, says and plots."""
+
+# ruff: noqa: F811 - fixtures are named as arguments
+from __future__ import annotations
+
+import re
+import threading
+import time
+
+import numpy as np
+import pytest
+from browserkit import client_of, live, served
+from conftest import eventually
+from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
+
+from reem.server import EmbeddedServer
+from reem_async.tools.browser.history import History
+from reem_async.tools.browser.marks import differing
+
+expect = playwright.expect
+
+
+# --- one instant, and what changed at it -------------------------------
+
+
+def test_the_figures_beside_an_array_are_of_that_array(pspace, address, key):
+    """They were asked for separately, and were of another frame than the table."""
+    pspace[key()] = {"a": np.zeros((40, 40))}
+    ended = threading.Event()
+
+    def publish():
+        number = 0
+        while not ended.is_set():
+            number += 1
+            pspace[key()]["a"] = np.full((40, 40), number, np.float64)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        with client_of(address) as ask:
+            for _ in range(20):
+                for view in ("table", "line", "histogram"):
+                    said = ask.json(view, path=f"{key()}.a")
+                    low, high = said["statistics"]["low"], said["statistics"]["high"]
+                    found = {"table": "cells", "line": "lines", "histogram": "low"}[view]
+                    shown = said[found] if view == "histogram" else said[found][0][0]
+                    assert float(low) == float(high) == float(shown), view
+    finally:
+        ended.set()
+        thread.join()
+
+
+def test_only_what_has_another_value_is_marked_as_changed(pspace, address, key):
+    value = {"mode": "idle", "n": 1, "q": [1.0, 2.0], "deep": {"a": 1, "b": 2}, "x": 5}
+    pspace[key()] = value
+    with client_of(address) as ask:
+        eventually(lambda: key() in ask.rows())
+        time.sleep(0.05)
+        before = ask.json("tree", open="1:0:")["end"]
+        newer = value | {"n": 2, "q": [1.0, 3.0], "deep": {"a": 1, "b": 3}, "new": 1}
+        del newer["x"]
+        pspace[key()] = newer
+        eventually(lambda: "new" in ask.rows(key()))
+        after = ask.json("tree", open="1:0:")["end"]
+        marks = {label: it["mark"] for label, it in ask.rows(key(), at=after, since=before).items()}
+        assert marks == {"mode": "", "n": "changed", "q": "changed", "deep": "inside", "new": "changed"}
+        assert {label: it["mark"] for label, it in ask.rows(f"{key()}.q", at=after, since=before).items()} == {
+            "[0]": "",
+            "[1]": "changed",
+        }
+        assert ask.rows(at=after, since=before)[key()]["mark"] == "inside"
+
+
+def test_arrays_that_were_published_again_with_the_same_items_are_not_marked():
+    one, same, other = np.zeros(5), np.zeros(5), np.ones(5)
+    for new, found in ((same, set()), (other, {("k", "a")}), (other.astype(int), {("k", "a")})):
+        assert (
+            differing([("k",)], lambda name: {"a": one, "n": 1}, lambda name, new=new: {"a": new, "n": 1}, 9) == found
+        )
+    assert len(differing([("k",)], lambda name: {}, lambda name: dict.fromkeys("abcdefgh", 1), 5)) == 5
+
+
+def test_the_rate_at_the_beginning_of_what_is_known_is_right():
+    """It was that of a second of which only a part was known."""
+    history = History(1000.0, 1 << 20)
+    history.start = 100.0
+    for number in range(1, 100):
+        history.add(("k", "x"), number, 8, 100 + number / 20)
+    for at in (100.1, 100.3, 100.9, 101.5, 104.0):
+        assert history.rate("k", at) == pytest.approx(20.0, rel=0.06), at
+    history = History(1000.0, 1 << 20)
+    history.add(("k", "x"), 1, 8, time.time())
+    assert history.rate("k", time.time()) is None, "less than a second is known: that is no rate"
+
+
+# --- what the page says -------------------------------
+
+
+def test_a_server_that_died_greys_the_page_and_is_told_in_plain_words(chromium, tmp_path):
+    visitor = Visitor(chromium, None)
+    with EmbeddedServer(directory=tmp_path / "data") as server, served(live(server.url)) as (address, _):
+        page = visitor.open("/", address)
+        expect(page.locator("#tree")).to_contain_text("reem set demo 1")
+        live_colour = "getComputedStyle(document.getElementById('live')).backgroundColor"
+        green = page.evaluate(live_colour)
+        port = server.port
+        server.stop()
+        expect(page.locator("#banner")).to_contain_text(
+            re.compile("^The server at 127.0.0.1:.* has not answered since")
+        )
+        expect(page.locator("#banner")).not_to_contain_text("Error")
+        expect(page.locator("#banner")).to_have_attribute("title", re.compile("no server answers"))
+        assert page.evaluate(live_colour) != green
+        assert "grayscale" in page.evaluate("getComputedStyle(document.querySelector('main')).filter")
+        with EmbeddedServer(port, tmp_path / "data"):
+            expect(page.locator("#banner")).to_be_hidden()
+            assert page.evaluate(live_colour) == green
+    visitor.contexts[0].close()
+
+
+def test_a_deep_link_opens_the_branches_above_and_marks_its_row(visit, kvs, key):
+    kvs[key()] = {"a key": {"list": [{"x": number} for number in range(250)]}}
+    for number in range(40):
+        kvs[key(f"other{number}")] = 1
+    inner = f'{key()}["a key"].list[230]'
+    page = visit.open("/view/" + inner + ".x")
+    expect(page.locator("h1")).to_have_text(inner + ".x")
+    wanted = page.locator("#tree .row[aria-selected=true]")
+    expect(wanted).to_have_count(1)
+    expect(wanted).to_be_in_viewport()
+    assert wanted.get_attribute("data-address") == inner + ".x"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [[0.3, 0.30000000000000004], [1e9, 1e9 + 1e-6], [5.0, 5.0], [-1e-300, 1e-300], [1e300, 1.0000000000001e300]],
+)
+def test_the_labels_of_a_nearly_constant_plot_differ(visit, values):
+    page = visit.open("/")
+    labels = page.evaluate(
+        """async (values) => {
+          const { Plot } = await import("/static/plot.js");
+          const said = [];
+          const before = CanvasRenderingContext2D.prototype.fillText;
+          CanvasRenderingContext2D.prototype.fillText = function (text, x) {
+            if (this.textAlign === "right") said.push(text);
+          };
+          const box = document.createElement("div");
+          box.style.cssText = "position: fixed; inset: 0";
+          document.body.append(box);
+          const plot = new Plot(box);
+          said.length = 0;
+          plot.set({ names: [""], times: [0, 1], lines: [values] });
+          CanvasRenderingContext2D.prototype.fillText = before;
+          return said;
+        }""",
+        values,
+    )
+    assert len(labels) >= 2
+    assert len(set(labels)) == len(labels), labels
+
+
+def test_numbers_are_short_and_all_their_digits_are_there_on_hover(visit, kvs, key):
+    kvs[key()] = {
+        "pi": 3.141592653589793,
+        "stamp": 1764022683.123456,
+        "q": [0.123456789012, 2.5],
+        "t": np.full((3, 2), 1 / 3),
+    }
+    page = visit.open(f"/view/{key()}.pi")
+    expect(page.locator(".big")).to_have_text("3.14159")
+    expect(page.locator(".big")).to_have_attribute("title", "3.141592653589793")
+    for name, short, whole in (
+        ("pi", "3.14159", "3.141592653589793"),
+        ("stamp", "1764022683.1", "1764022683.123456"),
+        ("q", "[0.123457, 2.5]", "[0.123456789012, 2.5]"),
+    ):
+        value = row(page, f"{key()}.{name}").locator(".value")
+        expect(value).to_have_text(short)
+        expect(value).to_have_attribute("title", re.compile(re.escape(whole)))
+    page = visit.open(f"/view/{key()}.t")
+    expect(page.locator("td").first).to_have_text("0.333333")
+    expect(page.locator("td").first).to_have_attribute("title", "0.3333333333333333")
+    expect(page.locator(".facts dd").first).to_have_text("0.333333")
+
+
+def test_keys_with_a_dot_are_shown_as_paths_write_them(kvs, address, key):
+    name = key("m.a")
+    kvs[name] = {"x.y": 1, "plain": [2]}
+    with client_of(address) as ask:
+        eventually(lambda: f'["{name}"]' in ask.rows())
+        assert list(ask.rows(f'["{name}"]')) == ['["x.y"]', "plain"]
+        assert list(ask.rows(f'["{name}"].plain')) == ["[0]"]
+
+
+# --- a dashboard -------------------------------
+
+
+def keep_publishing(page, work, until):
+    """Publish while the page draws, until something is to be seen."""
+    for number in range(200):
+        work(number)
+        page.wait_for_timeout(50)
+        if number > 20 and until():
+            return
+    raise AssertionError("it did not appear")
+
+
+def test_small_vectors_are_drawn_over_time_and_lines_can_be_hidden(visit, pspace, key):
+    pspace[key()] = {"v": np.array([1.0, 2.0, 30.0])}
+    page = visit.open(f"/view/{key()}.v")
+    entries = page.locator("#view .card:not([hidden]) .legend button")
+    keep_publishing(
+        page,
+        lambda number: pspace[key()].__setitem__("v", np.array([1.0, 2.0, 30.0 + number])),
+        lambda: entries.count() == 3,
+    )
+    expect(entries.nth(2)).to_have_attribute("aria-pressed", "true")
+    entries.nth(2).click()
+    expect(entries.nth(2)).to_have_attribute("aria-pressed", "false")
+    for number in range(10):
+        pspace[key()]["v"] = np.array([1.0, 2.0, number])
+        page.wait_for_timeout(30)
+    expect(entries.nth(2)).to_have_attribute("aria-pressed", "false")
+
+
+def test_the_page_of_a_dict_has_its_pictures_and_plots_together_and_rows_for_the_rest(visit, pspace, key):
+    rows = np.add.outer(np.arange(40), np.arange(60)).astype(np.uint8)
+    pspace[key()] = {"image": rows, "x": 1.0, "q": [1.0, 2.0], "name": "arm", "deep": {"a": 1}}
+    page = visit.open(f"/view/{key()}")
+    keep_publishing(
+        page,
+        lambda number: pspace[key()].__setitem__("x", float(number)),
+        lambda: page.locator(".pane canvas").count() >= 1,
+    )
+    pspace[key()]["q"] = [1.0, 3.0]
+    expect(page.locator(".pane .pane-head a")).to_have_text(["image", "x", "q"])
+    expect(page.locator(".pane img")).to_have_js_property("naturalWidth", 60)
+    assert page.locator("#view .row").evaluate_all("rows => rows.map(row => row.dataset.address)") == [
+        f"{key()}.name",
+        f"{key()}.deep",
+    ]
+
+
+def test_a_depth_image_with_holes_and_a_path_of_points(visit, pspace, key):
+    """NaN is counted below the picture; rows of two numbers are lines in a pane, not a picture two pixels wide."""
+    depth = np.full((480, 640), 1.5, np.float32)
+    depth[:10, :10] = np.nan
+    pspace[key()] = {"depth": depth, "path": np.cumsum(np.ones((40, 2)), 0)}
+    page = visit.open(f"/view/{key()}.depth")
+    expect(page.locator(".facts")).to_contain_text("NaN or infinite100")
+    expect(page.locator("#view")).to_contain_text("100 are NaN or infinite: magenta.")
+    page = visit.open(f"/view/{key()}")
+    expect(page.locator(".pane img")).to_have_count(1)
+    expect(page.locator(".pane canvas")).to_have_count(1)
+    expect(page.locator(".pane .legend")).to_contain_text("[1]")
+
+
+def test_the_first_page_shows_busy_keys_and_what_is_pinned_instead(visit, pspace, key):
+    pspace[key("busy")] = {"x": 0.0}
+    pspace[key("quiet")] = {"y": 5.0}
+    page = visit.open("/")
+    busy = page.locator(f'.pane .pane-head a[title="{key("busy")}.x"]')
+    keep_publishing(page, lambda number: pspace[key("busy")].__setitem__("x", float(number)), lambda: busy.count() == 1)
+    expect(page.locator("#view h2")).to_have_text("Busiest keys")
+    page.goto(page.url + f"view/{key('quiet')}.y")
+    page.get_by_role("button", name="Pin", exact=True).click()
+    page.locator("a.brand").click()
+    expect(page.locator("#view h2")).to_have_text("Pinned")
+    expect(page.locator(".pane .pane-head a")).to_have_text([f"{key('quiet')}.y"])
+    page.locator(".pin").click()
+    expect(page.locator("#view h2")).not_to_have_text("Pinned")
+
+
+def test_panes_are_moved_by_dragging_and_the_edge_as_well(visit, kvs, key):
+    kvs[key()] = {"a": np.zeros((20, 20)), "b": np.zeros((20, 20))}
+    page = visit.open(f"/view/{key()}")
+    titles = page.locator(".pane .pane-head a")
+    expect(titles).to_have_text(["a", "b"])
+    page.locator(".pane-head").nth(0).drag_to(page.locator(".pane").nth(1))
+    expect(titles).to_have_text(["b", "a"])
+    before = page.locator("#tree-panel").bounding_box()["width"]
+    edge = page.locator("#edge").bounding_box()
+    page.mouse.move(edge["x"] + 1, 300)
+    page.mouse.down()
+    page.mouse.move(edge["x"] + 121, 300, steps=4)
+    page.mouse.up()
+    wide = page.locator("#tree-panel").bounding_box()["width"]
+    assert wide == pytest.approx(before + 120, abs=8)
+    page.reload()
+    expect(titles).to_have_text(["a", "b"])
+    assert page.locator("#tree-panel").bounding_box()["width"] == pytest.approx(wide, abs=2)
+
+
+def test_the_value_under_the_pointer_is_told(visit, kvs, key):
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[20, 30] = 7, 8, 9
+    kvs[key()] = {"image": image, "depth": np.arange(1200, dtype=np.float32).reshape(30, 40)}
+    for name, (width, height), told in (
+        ("image", (60, 40), "row 20, column 30: [7, 8, 9]"),
+        ("depth", (40, 30), "row 15, column 20: 620"),
+    ):
+        page = visit.open(f"/view/{key()}.{name}")
+        expect(page.locator(".picture img")).to_have_js_property("naturalWidth", width)
+        box = page.locator(".picture img").bounding_box()
+        page.locator(".picture img").hover(
+            position={"x": box["width"] * (width / 2 + 0.5) / width, "y": box["height"] * (height / 2 + 0.5) / height}
+        )
+        expect(page.locator(".pixel")).to_have_text(told)
+
+
+def test_what_is_wrong_with_a_value_is_said_beside_the_field(visit, pspace, key, server_url):
+    pspace[key()] = {"kp": 2.0}
+    page = visit.open(f"/view/{key()}.kp")
+    expect(page.locator("#badge")).to_have_text("can write")
+    page.locator("summary", has_text="Edit").click()
+    area = page.locator("textarea")
+    expect(area).to_have_value("2.0")
+    area.fill("[1,")
+    page.get_by_text("Write…").click()
+    expect(page.locator(".wrong")).to_contain_text("Not JSON")
+    expect(area).to_have_attribute("aria-invalid", "true")
+    area.fill("3")
+    expect(page.locator(".wrong")).to_be_hidden()
+    with served(live(server_url)) as (address, _):
+        expect(visit.open("/", address).locator("#badge")).to_be_hidden()

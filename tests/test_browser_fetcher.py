@@ -1,0 +1,80 @@
+"""What the page reads into its past goes between the updates where it belongs."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+from conftest import aeventually
+
+from reem_async.errors import ConnectionLost
+from reem_async.pubsub.monitor import Monitor
+from reem_async.tools.browser.fetcher import Allowance, Fetcher
+from reem_async.tools.browser.history import History
+
+LARGE = np.zeros((300, 300))
+
+
+def fetcher_of(interface, name, fence, last_note=""):
+    history = History(1000.0, 1 << 24)
+    history.begin(name, b"{}")
+    return Fetcher(interface.session, history, Allowance(1e9, 1e9), lambda name: last_note, fence), history
+
+
+async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(key, apspace, binterface):
+    """The second deletion is in what is read, the third is not: that of an item done twice would be seen."""
+    monitor = Monitor(binterface, [key()])
+    await monitor.listen()
+    await apspace[key()].write({"l": [0, 1, 2, 3], "image": LARGE})
+    await apspace[key()]["l"][0].delete()
+
+    async def fence():
+        await apspace[key()]["l"][0].delete()
+        for _ in range(3):
+            fetcher.heard(await anext(monitor))
+
+    fetcher, history = fetcher_of(binterface, key(), fence)
+    fetcher.want((key(),), time.time())
+    task = asyncio.create_task(fetcher.run())
+    await aeventually(lambda: not fetcher.behind)
+    task.cancel()
+    assert history.tree((key(),), time.time())["l"] == [2, 3]
+    await monitor.close()
+
+
+async def test_nothing_is_waited_for_that_was_heard_of_before(key, apspace, binterface):
+    monitor = Monitor(binterface, [key()])
+    await monitor.listen()
+    await apspace[key()].write({"n": 1, "image": LARGE})
+    event = await anext(monitor)
+
+    async def fence():
+        raise AssertionError("a fence")
+
+    fetcher, history = fetcher_of(binterface, key(), fence, f"{event.publisher} {event.sequence}")
+    fetcher.want((key(),), time.time())
+    task = asyncio.create_task(fetcher.run())
+    await aeventually(lambda: not fetcher.behind)
+    task.cancel()
+    assert history.tree((key(),), time.time())["n"] == 1
+    await monitor.close()
+
+
+async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, binterface):
+    """The connection of the notices breaks: it stays unknown until it is looked at again."""
+    await apspace[key()].write({"n": 1, "image": LARGE})
+    asked = asyncio.Event()
+
+    async def fence():
+        asked.set()
+        raise ConnectionLost("gone")
+
+    fetcher, history = fetcher_of(binterface, key(), fence)
+    fetcher.want((key(),), time.time())
+    task = asyncio.create_task(fetcher.run())
+    await asyncio.wait_for(asked.wait(), 10)
+    await asyncio.sleep(0)
+    task.cancel()
+    assert fetcher.behind == {key()}
+    assert history.kept((key(), "n"), time.time()).late > 0

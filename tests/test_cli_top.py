@@ -1,0 +1,154 @@
+"""reem top, and what all commands have in common: files, NaN, one report at the end."""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import threading
+import time
+
+import numpy as np
+import pytest
+from rich.console import Console
+from test_cli import REEM, CommandLine
+
+import reem as blocking
+from reem_async.pubsub.monitor import Event
+from reem_async.tools.cli.board import Board
+from reem_async.tools.cli.output import json_text
+from reem_async.tools.cli.picture import Picture
+from reem_async.tools.cli.values import preview
+from reem_async.tools.cli.windows import ALL, Window
+
+
+@pytest.fixture
+def cli(server_url, key):
+    return CommandLine(server_url, f"{key.prefix}:")
+
+
+@pytest.fixture
+def robot(cli):
+    """Two programs publish `arm`, one of them `cam`, until the test ends."""
+    over = threading.Event()
+    with (
+        blocking.RedisInterface(cli.url, namespace=cli.namespace) as one,
+        blocking.RedisInterface(cli.url, namespace=cli.namespace) as two,
+    ):
+        spaces = blocking.PublishSpace(one), blocking.PublishSpace(two)
+
+        def publish():
+            while not over.wait(0.02):
+                spaces[0].update(arm={"x": 1}, cam={"n": 1})
+                spaces[1]["arm"] = {"x": 2}
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        yield
+        over.set()
+        thread.join()
+
+
+def test_top_shows_keys_and_points_out_two_publishers(cli, robot):
+    """One row for each key, once, at the end."""
+    run = cli("top", "--timeout", "1.5", "--json")
+    assert run.exit_code == 0
+    rows = {row["path"]: row for row in map(json.loads, run.stdout.splitlines())}
+    assert len(rows) == len(run.stdout.splitlines()) == 2
+    assert (rows["arm"]["publishers"], rows["cam"]["publishers"]) == (2, 1)
+    assert rows["arm"]["hz"] > rows["cam"]["hz"] > 1
+    assert rows["cam"]["age_s"] < 1
+    assert "warning: arm is published by 2 interfaces at once" in run.stderr
+
+
+def test_doctor_points_out_two_publishers(cli, robot):
+    """It listens for a second."""
+    run = cli("doctor", "--no-write", "--json")
+    (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "publishers"]
+    assert row["status"] == "warn"
+    assert "arm is published by 2" in row["message"]
+
+
+def test_who_takes_over_is_one_publisher():
+    """A program that was started anew publishes under another id; one that is heard again is a second one."""
+    window = Window(10)
+    for moment, publisher, expected in [(1, "a", 1), (2, "a", 1), (3, "b", 1), (4, "b", 1), (5, "a", 2), (30, "b", 1)]:
+        window.add(Event(("x",), 1, False, 1, moment, moment, publisher, 1))
+        assert window.publishers == expected, moment
+
+
+@pytest.mark.parametrize(
+    ("columns", "lines", "titles"),
+    [
+        (100, 30, "path Hz bytes/s delay ms age s publishers shared updates lost"),
+        (60, 12, "path Hz bytes/s delay ms age s lost"),
+        (40, 8, "path Hz bytes/s lost"),
+    ],
+)
+def test_the_table_fits_any_terminal(columns, lines, titles):
+    """Numbers are whole, names are cut, and that two publish one key stands there however many keys there are."""
+    board = Board(ALL, 100, lambda path: path[:1])
+    for number in range(25 * 4):
+        publisher = "b" if number % 8 == 3 else "a"  # key 03 has two
+        name = f"sensor_with_a_rather_long_name_{number % 25:02}" if number % 25 != 3 else "k03"
+        now = time.time() + number / 1000
+        board.take(Event((name, "x"), 1, False, 25_000, now, now, publisher, 1), None)
+    board.take(Event(("k03",), 1, False, 25_000, now, now, "b", 2), None)
+    board.take(Event(("k03",), 1, False, 25_000, now, now, "a", 2), None)
+    screen = io.StringIO()
+    console = Console(file=screen, width=columns, height=lines, color_system=None)
+    console.print(Picture(board, "", console)._drawn())
+    shown = screen.getvalue().rstrip("\n").split("\n")
+    assert " ".join(shown[0].split()) == titles
+    assert len(shown) < lines
+    assert max(map(len, shown)) <= columns
+    assert "MB/s" in shown[1]
+    assert any(line.startswith("! several publishers, each") for line in shown)
+    assert any(line.startswith("… ") for line in shown) == (lines < 28)
+
+
+def test_nan_is_called_by_its_name(cli):
+    """In JSON and in the preview of an array; None stays null, and nothing else changes."""
+    assert json_text({"a": [1.5, float("nan")], "b": None}) == '{"a":[1.5,NaN],"b":null}'
+    assert json_text(np.array([np.inf, -np.inf])) == "[Infinity,-Infinity]"
+    assert json_text({"a": "\u00e9", "b": None}) == '{"a":"\u00e9","b":null}'
+    said = preview(np.array([1.0, np.nan, 3.0, np.inf]), 80)
+    assert "min 1.0, max 3.0, mean 2, 2 of 4 are NaN or infinite" in said
+    assert "2 of 2 are NaN" in preview(np.full(2, np.nan), 80)
+
+
+def test_a_recording_of_nothing_warns(cli, tmp_path):
+    """It is complete and empty, and says where to look."""
+    run = cli.process("record", "nothing*", "--duration", "0.2", "-o", str(tmp_path / "x.mcap"))  # it is made nicer
+    assert run.returncode == 0
+    assert "nothing was recorded" in run.stderr
+    assert "reem top" in run.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["log", "info", "no.mcap"],
+        ["log", "export", "no.mcap"],
+        ["play", "no.mcap"],
+        ["record", "--sample", "no.csv"],
+        ["set", "x", "@no.npy"],
+        ["snapshot", "restore", "no.zip"],
+        ["up", "--from", "no.zip"],
+    ],
+    ids=" ".join,
+)
+def test_a_file_that_is_not_there_is_exit_code_3(cli, tmp_path, monkeypatch, words):
+    """Of every command; and the file is named."""
+    monkeypatch.chdir(tmp_path)
+    run = subprocess.run([REEM, *words], env=cli.environment(), capture_output=True, text=True, timeout=30, check=False)
+    assert run.returncode == 3, run.stderr
+    assert words[-1].removeprefix("@") in run.stderr
+
+
+def test_a_server_on_the_port_is_named(cli, server_url):
+    """`reem up` where one is up already says how to use it."""
+    port = str(blocking.RedisInterface(server_url).client.connection_pool.connection_kwargs.get("port"))
+    run = subprocess.run([REEM, "up", "--port", port], capture_output=True, text=True, timeout=30, check=False)
+    assert run.returncode == 1
+    assert f"connect to redis://localhost:{port}" in run.stderr

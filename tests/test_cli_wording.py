@@ -1,0 +1,108 @@
+"""Errors on the command line advise what can be typed there: options, not arguments of Python."""
+
+from __future__ import annotations
+
+import ast
+import re
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from test_cli import CommandLine
+from typer.testing import CliRunner
+
+import reem as blocking
+from examples.custom_ship import Scan, ScanShip
+from reem import NumpyShip
+from reem_async.errors import BadValue
+from reem_async.tools.cli import build
+from reem_async.tools.cli.wording import _WORDS, in_words
+
+APART = ("tools/cli", "tools/browser", "tools/notebook.py")  # themselves, addresses of the page, HTML
+CORE = [
+    path for path in sorted((ROOT / "reem_async").rglob("*.py")) if not any(part in path.as_posix() for part in APART)
+]
+
+ARGUMENT = re.compile(r"(?<![?&\w])[a-z][a-z_]+=(?!\{\})|RedisInterface\((?!\{\})|\bappend\(\)")
+"""What a message advises a program: `timeout=`, `RedisInterface(...)`. `timeout={}` complains of what was given."""
+
+OF_PROGRAMS = {
+    "transport/endpoints.py": ["read_from_replicas=True: the address"],  # no command has it
+    "transport/options.py": [
+        "leave protocol= out",  # named as it stands in the URL
+        "leave ssl= out",  # likewise
+        "user and password go in username=",  # of a host without a scheme, which commands give one
+    ],
+}
+"""What no command can meet, or what can be typed as it is said."""
+
+
+def messages():
+    """Every text with blanks in it, except docstrings: the file and the text, {} for what is filled in."""
+    for path in CORE:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        nodes = list(ast.walk(tree))
+        inner = {id(value) for node in nodes if isinstance(node, ast.JoinedStr) for value in node.values}
+        alone = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        for node in nodes:
+            if isinstance(node, ast.JoinedStr):
+                text = "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not {id(node)} & (inner | alone):
+                text = node.value
+            else:
+                continue
+            if " " in text:
+                yield path.relative_to(ROOT / "reem_async").as_posix(), text
+
+
+def test_no_message_advises_what_cannot_be_typed():
+    """Of the whole library, since nearly all of it is beneath a command."""
+    wrong = [
+        f"{file}: {text}"
+        for file, text in messages()
+        if ARGUMENT.search(in_words(text).replace(": RedisInterface(ships=[...])", ""))
+        and not any(known in text for known in OF_PROGRAMS.get(file, ()))
+    ]
+    assert wrong == []
+
+
+def test_every_entry_of_the_table_is_still_said():
+    """A message that was reworded would reach the user as the library says it."""
+    said = "\n".join(text.replace("{}", "x") for _, text in messages())
+    said += "\nRedisInterface: f() got an unexpected keyword argument 'foo'; see redis-py's connection options"
+    assert [of_library.pattern for of_library, _ in _WORDS if not of_library.search(said)] == []
+
+
+@pytest.fixture
+def cli(server_url, key):
+    return CommandLine(server_url, f"{key.prefix}:")
+
+
+def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):
+    """Of commands that meet such a message easily."""
+    monkeypatch.chdir(tmp_path)
+    cli.result("set", "a", "[1]")
+    assert "to make a list longer, set it as a whole" in cli.error(1, "set", "a[5]", "1")
+    assert "--str, or as a float" in cli.error(2, "set", "a", "9" * 30)
+    for words, code, advice in [
+        (("save", "a.zip"), 0, ""),
+        (("save", "a.zip"), 2, "replace it with --force"),
+        (("restore", "a.zip"), 1, "--replace replaces them, --into gives"),
+    ]:
+        words = ["snapshot", *words, "--namespace", cli.namespace]
+        run = CliRunner().invoke(build(), words, env=cli.environment(), prog_name="reem")
+        assert run.exit_code == code, run.stderr
+        assert advice in run.stderr
+    assert "option foo, which redis-py does not know" in cli.error(2, "get", "a", "--url", "redis://localhost?foo=1")
+    assert "'--rate'" in cli.error(2, "play", "no.mcap", "--rate", "0")
+
+
+def test_a_value_of_a_ship_says_that_a_program_reads_it(cli):
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace, ships=[ScanShip(), NumpyShip()]) as interface:
+        blocking.KeyValueStore(interface)["scan"] = {"last": Scan("front", np.zeros((2, 3)))}
+    assert "read it in a program that has this ship" in cli.error(1, "get", "scan", "--json")
+
+
+def test_what_is_not_advised_stays_as_it_is():
+    """Only advice is translated."""
+    assert in_words(str(BadValue("foo.bar: 5 is no text"))) == "foo.bar: 5 is no text"

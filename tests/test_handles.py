@@ -1,0 +1,341 @@
+"""Handles answer as a user of dicts expects, or say what to type; what a handle is not is said at once."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import pickle
+import threading
+from unittest import mock
+
+import numpy as np
+import pytest
+from conftest import PLAIN, assert_no_orphans, assert_same, commands_run
+
+import reem
+import reem_async
+from reem import BadKey, BadType, BadValue, Conflict, MissingKey, PathRefused, WriteOnly, WrongType
+from reem_async.plan.paths import parse, show
+
+MISTAKES = {
+    "a number": lambda handle: handle == 1,
+    "a number before it": lambda handle: 1 == handle,  # noqa: SIM300 - in this order
+    "not a number": lambda handle: handle != 1,
+    "True": lambda handle: handle == True,  # noqa: E712 - the mistake itself
+    "None": lambda handle: handle == None,  # noqa: E711
+    "a list": lambda handle: handle == [1],
+    "an array": lambda handle: handle == np.arange(3),
+    "an array before it": lambda handle: np.arange(3) == handle,
+    "a numpy scalar before it": lambda handle: np.float64(1) == handle,
+    "its truth": bool,
+    "not": lambda handle: not handle,
+    "less": lambda handle: handle < 3,
+    "more or equal": lambda handle: handle >= 3,
+    "plus": lambda handle: handle + 1,
+    "plus, after": lambda handle: 1 + handle,
+    "times a numpy scalar": lambda handle: np.float64(2) * handle,
+    "divided": lambda handle: handle / 2,
+    "minus": lambda handle: -handle,
+    "an array of it": np.asarray,
+    "a mean": np.mean,
+    "float": float,
+    "int": int,
+    "round": round,
+    "a number format": lambda handle: f"{handle:.2f}",
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES.values(), ids=list(MISTAKES))
+def test_a_handle_taken_for_its_value_says_how_to_read(kvs, pspace, akvs_handle, key, mistake):
+    """A TypeError, in both fronts, of a publish space and of a subscriber's copy too; nothing is sent for it."""
+    local = reem.SilentSubscriber(key(), kvs.interface)["n"]
+    for handle, remedy in [
+        (kvs[key()]["n"], "with .read()"),
+        (akvs_handle, "with await handle.read()"),
+        (pspace[key()]["n"], "with a KeyValueStore"),
+        (local, "with .read()"),
+    ]:
+        with pytest.raises(TypeError, match="a handle is a place in the dictionary, not the value") as caught:
+            mistake(handle)
+        assert str(caught.value).startswith(f"{key()}.n: ")
+        assert str(caught.value).endswith(remedy)
+
+
+@pytest.fixture
+def akvs_handle(server_url, key):
+    """A handle of the other front; nothing is ever sent."""
+    return reem_async.KeyValueStore(reem_async.RedisInterface(server_url))[key()]["n"]
+
+
+def test_handles_of_one_place_are_equal_and_of_others_not(kvs, pspace, akvs_handle, key):
+    """In sets, dicts and lists; what knows handles only as objects is let alone."""
+    handle = kvs[key()]["n"]
+    assert handle == kvs[key()]["n"]
+    assert handle != kvs[key()]["m"]
+    assert handle != kvs[key()]
+    assert handle != pspace[key()]["n"]
+    assert handle != akvs_handle
+    assert {handle: 5}[kvs[key()]["n"]] == 5
+    assert len({handle, kvs[key()]["n"], kvs[key()]}) == 2
+    assert handle in [kvs[key()], kvs[key()]["n"]]
+    assert handle is not None
+    assert handle == mock.ANY
+    assert handle != object()
+    assert copy.copy(handle) == handle
+    assert kvs["m.a"] != kvs["m"]["a"]
+    called = mock.Mock()
+    called(handle)
+    called.assert_called_once_with(kvs[key()]["n"])
+    kvs[key()] = {"n": 3}
+    assert pickle.loads(pickle.dumps(handle)).read() == 3
+
+
+def test_printing_a_handle_says_what_it_is(kvs, pspace, akvs_handle, key):
+    """And how to read it."""
+    assert str(kvs[key()]["n"]) == f"<Accessor {key()}.n: a place, whose value is read with .read()>"
+    assert f"{akvs_handle}" == f"<Accessor {key()}.n: a place, whose value is read with await handle.read()>"
+    assert repr(pspace[key()]) == f"<PublishAccessor {key()}: a place, whose value is read with a KeyValueStore>"
+
+
+def test_storing_a_handle_says_to_read_it(kvs, key):
+    """At the top and inside of what is stored."""
+    kvs[key()] = {"n": 1}
+    for value in (kvs[key()]["n"], {"x": kvs[key()]["n"]}, [kvs[key()]["n"]]):
+        with pytest.raises(BadType, match=r"\.read\(\)"):
+            kvs[key()]["m"] = value
+    assert kvs[key()].read() == {"n": 1}
+
+
+def test_what_a_dict_user_types(kvs, key, raw):
+    """`in`, `for` and `keys` look without fetching a value."""
+    kvs[key()] = {"a": 1, "image": np.zeros((480, 640, 3), np.uint8), "d": {"\u4e00": {}}}
+    place = kvs[key()]
+    before = commands_run(raw)
+    assert "a" in place
+    assert "x" not in place
+    assert place.keys() == list(place) == ["a", "image", "d"]
+    assert "\u4e00" in place["d"]
+    assert place["d"]["\u4e00"].keys() == []
+    ran = commands_run(raw)
+    if not PLAIN:  # there the document is one string
+        assert not [name for name in ran if name in ("get", "json.get") and ran[name] != before.get(name)]
+    assert key() in kvs
+    assert key() in list(kvs)
+    for wrong in (place["a"], place["image"]):
+        for call in (wrong.keys, lambda wrong=wrong: "x" in wrong, lambda wrong=wrong: list(wrong)):
+            with pytest.raises(WrongType, match=r"not a dict.*\.read\(\)"):
+                call()
+    for missing in (kvs[key("none")], place["none"], kvs[key("none")]["\u4e00"]):
+        for call in (missing.keys, lambda missing=missing: "x" in missing):
+            with pytest.raises(MissingKey):
+                call()
+    with pytest.raises(BadKey, match="keys of a dict are str"):
+        assert 5 in place
+    with pytest.raises(TypeError):
+        reversed(place)
+
+
+def test_pop_removes_and_returns(kvs, key, raw):
+    """Of dicts, lists and the store, arrays too, and nothing is left behind."""
+    kvs[key()] = {"n": 1, "image": np.arange(6), "l": [1, np.arange(2), 3], "deep": {"x": np.ones(2)}}
+    assert kvs[key()].pop("n") == 1
+    assert_same(kvs[key()].pop("image"), np.arange(6))
+    assert kvs[key()]["l"].pop() == 3
+    assert_same(kvs[key()]["l"].pop(-1), np.arange(2))
+    assert kvs[key()]["l"].pop(0) == 1
+    assert kvs[key()].pop("gone", None) is None
+    assert kvs[key()]["l"].pop(-1, "empty") == "empty"
+    with pytest.raises(KeyError):
+        kvs[key()].pop("gone")
+    assert_no_orphans(raw, key())
+    assert_same(kvs.pop(key()), {"l": [], "deep": {"x": np.ones(2)}})
+    assert kvs.pop(key(), 7) == 7
+    with pytest.raises(MissingKey):
+        kvs.pop(key())
+    with pytest.raises(TypeError, match="one default"):
+        kvs.pop(key(), 1, 2)
+    assert_no_orphans(raw, key())
+
+
+def test_of_many_who_pop_one_gets_each(kvs, key, server_url):
+    """Atomic: an item goes to one of them, once."""
+    kvs[key()] = list(range(40))
+    got: list[int] = []
+
+    def take():
+        with contextlib.closing(reem.RedisInterface(server_url)) as interface:
+            place = reem.KeyValueStore(interface)[key()]
+            while True:
+                try:
+                    item = place.pop(0, None)
+                except Conflict:
+                    continue
+                if item is None:
+                    return
+                got.append(item)
+
+    threads = [threading.Thread(target=take) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(30)
+    assert sorted(got) == list(range(40))
+
+
+def test_update_stores_all_or_none_in_one_transaction(kvs, key, raw):
+    """What it replaces is gone, what it does not name stays."""
+    kvs[key()] = {"n": 1, "stays": 2, "image": np.arange(3)}
+    kvs[key()].update({"n": 2, "image": "none"}, force=np.ones(3), t=(1, 2))
+    assert_same(kvs[key()].read(), {"n": 2, "stays": 2, "image": "none", "force": np.ones(3), "t": [1, 2]})
+    kvs[key()].update([("n", 3)])
+    kvs[key()].update({})
+    before = commands_run(raw).get("exec", 0)
+    kvs[key()].update(n=4, force=np.zeros(3))
+    assert commands_run(raw)["exec"] == before + 1
+    for bad, kind in [({"n": 5, "x": {1}}, BadType), ({"n": 5, 6: 7}, BadKey), ({"n": 5, "x": float("nan")}, BadValue)]:
+        with pytest.raises(kind):
+            kvs[key()].update(bad)
+    assert_same(kvs[key()]["n"].read(), 4)
+    assert_no_orphans(raw, key())
+
+
+def test_update_where_there_is_no_dict_stores_nothing(kvs, key, raw):
+    """Of no key, and says what is missing."""
+    kvs[key()] = {"n": 1, "l": [{"x": 1}, np.arange(2)]}
+    for place in (kvs[key("none")], kvs[key()]["n"], kvs[key()]["none"], kvs[key()]["l"]):
+        for values in ({"a": 1, "b": 2}, {"a": 1, "b": np.ones(2)}, {"a": 1}, {"b": np.ones(2)}):
+            with pytest.raises(PathRefused):
+                place.update(values)
+    kvs[key()]["l"][0].update(x=2, y=3)
+    assert_same(kvs[key()].read(), {"n": 1, "l": [{"x": 2, "y": 3}, np.arange(2)]})
+    kvs[key()]["l"][0]["image"] = np.arange(4)
+    with pytest.raises(BadType, match=r"one by one, or use edit\(\)"):
+        kvs[key()]["l"][0].update(image=1, y=4)
+    with pytest.raises(BadType, match="one by one"):
+        kvs[key()]["l"][-2].update(x=1, y=4)
+    assert_same(kvs[key()]["l"][0].read(), {"x": 2, "y": 3, "image": np.arange(4)})
+    assert_no_orphans(raw, key())
+    assert_no_orphans(raw, key("none"))
+
+
+def test_an_update_is_published_value_by_value(kvs, pspace, key):
+    """In its order, and none is missing after one that was refused."""
+    pspace[key()] = {}
+    with kvs[key()].watch(reem.Last(10)) as updates:
+        assert next(updates).initial
+        with pytest.raises(PathRefused):
+            pspace[key()]["none"].update(a=1, b=2)
+        pspace[key()].update(a=1, force=np.ones(3))
+        first = next(updates)
+        while first.path != f"{key()}.a":  # what was refused is told of by a look at what is there
+            first = next(updates)
+        second = next(updates)
+        assert second.path == f"{key()}.force"
+        assert_same(second.data, {"a": 1, "force": np.ones(3)})
+        assert second.sequence == first.sequence + 1
+        assert not second.gap
+
+
+def test_setdefault_stores_only_where_nothing_is(kvs, key, raw):
+    """And returns what is there then."""
+    kvs[key()] = {"n": 1, "none": None}
+    assert kvs[key()].setdefault("n", 5) == 1
+    assert kvs[key()].setdefault("none", 5) is None
+    assert kvs[key()].setdefault("m", [1]) == [1]
+    assert_same(kvs[key()].setdefault("image", np.arange(3)), np.arange(3))
+    assert_same(kvs[key()].setdefault("image", 7), np.arange(3))
+    assert kvs.setdefault(key("other"), {}) == {}
+    assert kvs.setdefault(key("other"), {"x": 1}) == {}
+    with pytest.raises(PathRefused):
+        kvs[key("third")].setdefault("x", 1)
+    with pytest.raises(BadType):
+        kvs[key()].setdefault("bad", {1})
+    with pytest.raises(BadKey):
+        kvs[key()].setdefault(0, 1)
+    assert_same(kvs[key()].read(), {"n": 1, "none": None, "m": [1], "image": np.arange(3)})
+    assert_no_orphans(raw, key())
+
+
+def test_a_store_is_updated_key_by_key_after_all_was_looked_at(kvs, pspace, key):
+    """Nothing is stored if one cannot be."""
+    kvs.update({key(): {"n": 1}}, **{key("image"): np.ones(2)})
+    assert_same(kvs[key("image")].read(), np.ones(2))
+    with pytest.raises(BadType):
+        kvs.update({key(): 2, key("image"): {1}})
+    with pytest.raises(BadKey):
+        kvs.update({key(): 2, "": 1})
+    assert kvs[key()].read() == {"n": 1}
+    pspace.update({key(): 3})
+    assert kvs[key()].read() == 3
+
+
+def test_a_publish_space_refuses_what_would_read(pspace, key):
+    """As it refuses `read`."""
+    for call in (
+        pspace[key()].keys,
+        lambda: "x" in pspace[key()],
+        lambda: list(pspace[key()]),
+        lambda: pspace[key()].pop("x"),
+        lambda: pspace[key()].setdefault("x", 1),
+        lambda: pspace.pop(key()),
+        lambda: pspace.setdefault(key(), 1),
+    ):
+        with pytest.raises(WriteOnly):
+            call()
+
+
+async def test_the_awaited_twins(akvs, key):
+    """The same in asyncio; what cannot wait says what to await."""
+    await akvs.update({key(): {"a": 1, "image": np.arange(3)}})
+    place = akvs[key()]
+    assert await place.keys() == ["a", "image"]
+    assert await place.contains("a")
+    assert not await place.contains("b")
+    await place.update(b=np.ones(2), a=2)
+    assert await place.pop("a") == 2
+    assert await place.pop("a", None) is None
+    assert await place.setdefault("c", 5) == 5
+    assert_same(await akvs.pop(key()), {"image": np.arange(3), "b": np.ones(2), "c": 5})
+    assert await akvs.setdefault(key(), {}) == {}
+    for call, remedy in [
+        (lambda: list(place), "await accessor.keys()"),
+        (lambda: "a" in place, "await accessor.contains('a')"),
+        (lambda: list(akvs), "await store.keys()"),
+        (lambda: "a" in akvs, "await store.contains('a')"),
+    ]:
+        with pytest.raises(TypeError) as caught:
+            call()
+        assert remedy in str(caught.value)
+
+
+def test_a_key_with_a_dot_is_shown_quoted(kvs, key):
+    """So that it cannot be taken for a path, and what is shown can be typed."""
+    for path in [("m.a",), ("m.a", "x"), ("a[0]",), ('a"b', 3), ("plain", "x"), (".x",), ("a b", "c.d")]:
+        assert parse(show(path)) == path
+    assert show(("m.a", "x")) == '["m.a"].x'
+    dotted = key("m.a")
+    kvs[dotted] = 5
+    assert kvs.get(f'["{dotted}"]') == 5
+    with pytest.raises(MissingKey):
+        kvs.get(dotted)
+    with pytest.raises(MissingKey, match=r'nothing is stored at \["'):
+        kvs[dotted]["x"].read()
+
+
+def test_an_item_of_an_array_says_that_arrays_are_read_whole(kvs, key):
+    """Of a list that is too short it says no such thing."""
+    kvs[key()] = {"image": np.zeros((2, 2)), "l": [1]}
+    with pytest.raises(MissingKey, match=r"image is an array, and arrays are read whole: read it, then take \[0\]"):
+        kvs[key()]["image"][0].read()
+    for place in (kvs[key()]["l"][5], kvs[key()]["image"][0][1], kvs[key()]["none"][0]):
+        with pytest.raises(MissingKey, match="nothing is stored at"):
+            place.read()
+
+
+def test_ipython_is_offered_the_keys(kvs, pspace, key):
+    """After `kvs["` and `kvs["foo"]["`; nothing where there are none."""
+    kvs[key()] = {"a": 1, "b": 2}
+    assert key() in kvs._ipython_key_completions_()
+    assert kvs[key()]._ipython_key_completions_() == ["a", "b"]
+    assert kvs[key()]["a"]._ipython_key_completions_() == []
+    assert pspace[key()]._ipython_key_completions_() == []

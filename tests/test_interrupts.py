@@ -1,0 +1,309 @@
+"""Signals: a handler that raises, calls REEM or closes it may come at any step of any blocking call."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from conftest import ROOT
+from interruptkit import at_step
+
+import reem
+from reem.errors import InterfaceClosed
+from reem_async.concurrency.aside import aside
+from reem_async.concurrency.locks import Locks
+from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Every, Last, Newest
+from reem_async.errors import QueueFull
+from reem_async.pubsub.updates import Update
+from reem_async.transport.options import Options
+from reem_async.transport.packing import Packer
+
+SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**6))
+PATIENCE = 10.0
+
+
+def elsewhere(work):
+    """Run `work` on another thread; whether it ended in time."""
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    thread.join(PATIENCE)
+    return not thread.is_alive()
+
+
+def run(code, *words):
+    return subprocess.run(
+        [sys.executable, "-W", "ignore:coroutine:RuntimeWarning", "-c", code, *words],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("mode", ["raise", "call", "close"])
+def test_signals_at_random_instants_in_every_blocking_call(server_url, key, mode):
+    """Every call ends, other threads go on, and nothing crashes; `tests/interruptkit.py` does the same for longer."""
+    words = ("--mode", mode, "--seconds", "5", "--seed", str(SEED), "--url", server_url, "--prefix", f"{key.prefix}:")
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "tests/interruptkit.py"), *words],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout[-3000:]}\n{done.stderr[-6000:]}"
+
+
+@pytest.fixture
+def no_callbacks_of_the_collector():
+    """Hypothesis leaves one behind: of a handler that raises in it Python says that it was ignored."""
+    kept = gc.callbacks[:]
+    gc.callbacks.clear()
+    yield
+    gc.callbacks.extend(kept)
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+CALLS = {
+    "watch": lambda kvs, key: kvs[key].watch().listen(),
+    "loop": lambda kvs, key: next(kvs[key].watch()),
+    "read": lambda kvs, key: kvs[key].read(),
+    "publish": lambda kvs, key: reem.PublishSpace(kvs).__setitem__(key, 2),
+    "callback": lambda kvs, key: reem.CallbackSubscriber(key, kvs.interface, lambda *_: None).listen(),
+    "states": lambda kvs, key: next(kvs.interface.states()),
+    "close": lambda kvs, key: kvs.interface.close(),
+}
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
+def test_a_handler_that_closes_the_interface_works_at_each_step(server_url, key, name):
+    """The call that it came into ends: with what it is for, or with InterfaceClosed. Every 7th step of Python."""
+    name_of_key, place, reached = key(), random.randrange(7), True
+    with reem.RedisInterface(server_url) as other:
+        reem.KeyValueStore(other)[name_of_key] = 1
+    while reached:
+        place += 7
+        interface = reem.RedisInterface(server_url)
+        kvs = reem.KeyValueStore(interface)
+        if place % 2:
+            kvs[name_of_key].watch().listen()
+        began = time.monotonic()
+        with contextlib.suppress(InterfaceClosed):
+            reached = at_step(place, interface.close, lambda kvs=kvs: CALLS[name](kvs, name_of_key))
+        assert time.monotonic() - began < 2
+        if reached:
+            assert interface.state == "closed"
+        interface.close()
+
+
+@pytest.mark.usefixtures("no_callbacks_of_the_collector")
+@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
+def test_a_handler_that_raises_keeps_no_other_thread_waiting_at_any_step(server_url, key, name):
+    """Ctrl-C comes into every 7th step of Python; then another thread follows, publishes and closes."""
+    name_of_key, place, reached = key(), random.randrange(7), True
+    with reem.RedisInterface(server_url) as other:
+        reem.KeyValueStore(other)[name_of_key] = 1
+
+    def probe():
+        kvs[name_of_key].watch().listen()
+        reem.PublishSpace(kvs)[name_of_key] = 2
+        interface.close()
+
+    while reached:
+        place += 7
+        interface = reem.RedisInterface(server_url)
+        kvs = reem.KeyValueStore(interface)
+        try:
+            reached = at_step(place, interrupt, lambda kvs=kvs: CALLS[name](kvs, name_of_key))
+        except KeyboardInterrupt:
+            if name == "close":
+                continue
+            assert elsewhere(probe), f"a thread waits for ever after an interrupt at step {place}"
+        interface.close()
+
+
+def test_ctrl_c_in_the_first_call_of_a_program_keeps_no_import_lock(server_url, key):
+    """What a program needs only then is imported on another thread, so another thread's first call goes on."""
+    code = (
+        "import os, random, signal, sys, threading, reem\n"
+        "url, key, seed = sys.argv[1:]\n"
+        "random.seed(int(seed))\n"
+        "def ring(*_): raise KeyboardInterrupt\n"
+        "signal.signal(signal.SIGALRM, ring)\n"
+        "def probe():\n"
+        "    kvs[key].watch().listen(); reem.PublishSpace(kvs)[key] = 1; kvs[key].increment(1); kvs.keys(key)\n"
+        "bad = 0\n"
+        "for child in range(12):\n"
+        "    if pid := os.fork():\n"
+        "        bad += os.waitpid(pid, 0)[1] != 0\n"
+        "        continue\n"
+        "    kvs = reem.KeyValueStore(reem.RedisInterface(url))\n"
+        "    try:\n"
+        "        signal.setitimer(signal.ITIMER_REAL, random.uniform(0.0001, 0.12))\n"
+        "        probe()\n"
+        "    except KeyboardInterrupt: pass\n"
+        "    signal.setitimer(signal.ITIMER_REAL, 0)\n"
+        "    thread = threading.Thread(target=probe, daemon=True)\n"
+        "    thread.start(); thread.join(10)\n"
+        "    os._exit(thread.is_alive())\n"
+        "print(bad)\n"
+    )
+    done = run(code, server_url, key(), str(SEED))
+    assert done.stdout == "0\n", (SEED, done.stderr)
+
+
+@pytest.mark.usefixtures("no_callbacks_of_the_collector")
+def test_what_runs_aside_goes_on_when_its_caller_is_interrupted():
+    """And brings its result, its error, and the caller's context else."""
+    steps, go_on = [], threading.Event()
+
+    def work():
+        go_on.wait(PATIENCE)
+        steps.append(threading.current_thread() is threading.main_thread())
+
+    timer = threading.Timer(0.05, lambda: os.kill(os.getpid(), 2))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        aside(work)
+    go_on.set()
+    end = time.monotonic() + PATIENCE
+    while not steps and time.monotonic() < end:
+        time.sleep(0.001)
+    assert steps == [False]
+    assert aside(lambda: 5) == 5
+    with pytest.raises(ZeroDivisionError):
+        aside(lambda: 1 / 0)
+
+
+def test_redis_py_never_has_hiredis_format_a_number():
+    """hiredis crashes the interpreter if a handler of signals raises meanwhile."""
+    packer = Options("localhost", 1.0, {})  # refuses what redis-py does not take
+    assert type(packer.blocking_connection()._command_packer) is Packer
+    assert Packer().pack("HELLO", 3, "AUTH", "me", b"x") == [
+        b"*5\r\n$5\r\nHELLO\r\n$1\r\n3\r\n$4\r\nAUTH\r\n$2\r\nme\r\n$1\r\nx\r\n"
+    ]
+    assert Packer().pack("CLIENT SETINFO", 1.5) == [b"*3\r\n$6\r\nCLIENT\r\n$7\r\nSETINFO\r\n$3\r\n1.5\r\n"]
+
+
+# --- the queue of a loop, which has no lock -----------------------------------------------------------
+
+
+def update(number, **more):
+    return Update("a", number, number, sequence=number, **more)
+
+
+def test_a_queue_tells_what_was_lost_before_updates_that_it_dropped():
+    """Once, with the next update that is taken, however many were dropped in between."""
+    box = BoundedQueue(Last(2))
+    for number in range(1, 50):
+        box.put(update(number, gap=number in (3, 20), missed=number if number in (3, 20) else 0))
+    assert len(box._gaps) == 1
+    first, second = box.take(), box.take()
+    assert (first.sequence, first.gap, first.missed) == (48, True, 23)
+    assert (second.sequence, second.gap, second.missed) == (49, False, 0)
+    assert (box.take(), box.dropped) == (EMPTY, 47)
+    box.put(update(50, gap=True, missed=None))
+    box.put(update(51, gap=True, missed=1))
+    assert [(each.gap, each.missed) for each in (box.take(), box.take())] == [(True, None), (True, 1)]
+    box.close()
+    with pytest.raises(Ended):
+        box.take()
+
+
+def test_a_queue_that_may_drop_nothing_fails_after_what_it_has():
+    """What came in time is taken, then QueueFull."""
+    box = BoundedQueue(Every(2))
+    for number in range(1, 5):
+        box.put(update(number))
+    assert [box.take().sequence, box.take().sequence, box.dropped] == [1, 2, 1]
+    with pytest.raises(QueueFull):
+        box.take_waiting()
+
+
+@pytest.mark.parametrize("policy", [Newest(), Last(3)])
+def test_several_threads_take_from_a_queue_while_one_puts(policy):
+    """Each update is taken once or counted as dropped, losses add up, the last arrives, and all threads end."""
+    box, taken = BoundedQueue(policy), []
+
+    def take():
+        try:
+            while True:
+                taken.append(box.take_waiting())
+        except Ended:
+            return
+
+    threads = [threading.Thread(target=take) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for number in range(1, 20_001):
+        box.put(update(number, gap=number % 7 == 0, missed=number % 7 == 0 and 1))
+    end = time.monotonic() + PATIENCE
+    while box._items and time.monotonic() < end:
+        time.sleep(0.001)
+    box.close()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert not any(thread.is_alive() for thread in threads)
+    assert len(taken) + box.dropped == 20_000
+    assert len({each.sequence for each in taken}) == len(taken)
+    assert 20_000 in {each.sequence for each in taken}
+    assert sum(each.missed for each in taken) == 20_000 // 7
+
+
+# --- the lock that keeps the updates of a key in order -------------------------------------------------
+
+
+def test_a_failing_call_in_a_handler_leaves_the_call_it_came_into_its_lock(server_url, key):
+    """It is given back at the end of that call, and not before: others must not overtake its update."""
+    name, place, reached, held = key(), 0, True, 0
+    with reem.RedisInterface(server_url) as interface:
+        pspace = reem.PublishSpace(interface)
+        pspace[name] = 1
+        transport = interface._direct.session.transport
+
+        def is_free():
+            free = []
+
+            def look():
+                for lock in transport._orders.all():
+                    free.append(lock._lock.acquire(blocking=False))
+                    if free[-1]:
+                        lock._lock.release()
+
+            assert elsewhere(look)
+            return all(free)
+
+        def fail():
+            nonlocal held
+            before = is_free()
+            with pytest.raises(reem.ReemError):
+                pspace[name]["no"]["where"] = 1
+            assert is_free() == before
+            held += not before
+
+        while reached:
+            place += 11
+            reached = at_step(place, fail, lambda: pspace.__setitem__(name, 2))
+            assert is_free()
+    assert held > 3
+
+
+def test_a_thread_broken_off_among_the_locks_keeps_no_other_from_them():
+    """Found by `make hunt`, seed 201: a call that was broken off in there had kept the lock of the locks for ever."""
+    locks = Locks(threading.Lock)
+    for number in range(2000):
+        locks.of(f"key{number}")
+    locks._trimming.acquire()  # by a thread that was broken off
+    found = []
+    others = threading.Thread(target=lambda: found.extend(locks.of(f"other{number}") for number in range(2000)))
+    others.start()
+    others.join(10)
+    assert len(found) == 2000
+    assert all(locks.of(f"other{number}") is found[number] for number in range(2000))

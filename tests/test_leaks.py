@@ -1,0 +1,264 @@
+"""What is kept for each key or each loop goes when nobody needs it any more."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import os
+import random
+import time
+
+import numpy as np
+import pytest
+from conftest import PATIENCE
+
+import reem
+import reem_async
+from reem_async import session as sessions
+from reem_async.concurrency.locks import Locks
+from reem_async.plan.reads import RawRead
+from reem_async.plan.shapes import ShapeCache
+from reem_async.pubsub.manager import manager_of
+from reem_async.pubsub.replica import State
+from reem_async.session import _Numbers
+
+
+async def aeventually(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+def listeners(interface):
+    return [each for audience in manager_of(interface.session)._topics.values() for each in audience.present()]
+
+
+class SlowShip(reem_async.BytesShip):
+    """Takes its time to make a value."""
+
+    async def unpack(self, blob):
+        await asyncio.sleep(PATIENCE)
+        return bytes(blob)
+
+
+async def test_closing_ends_what_runs_in_the_background(server_url, key):
+    """The heartbeat, and a ship that is at work on an update."""
+    interface = reem_async.RedisInterface(server_url, ships=[SlowShip()])
+    space = reem_async.PublishSpace(interface)
+    await space[key()].write({"n": 0})
+    mirror = reem_async.SilentSubscriber(key(), interface)
+    await mirror.listen()
+
+    def running():
+        return {task.get_name() for task in asyncio.all_tasks() if task.get_name().startswith("reem")}
+
+    await space[key()].write({"n": b"slow"})
+    await aeventually(lambda: f"reem ships {key()}" in running())
+    assert "reem heartbeat" in running()
+    await interface.close()
+    assert not running()
+
+
+async def test_a_loop_that_is_left_by_break_drops_its_watch(server_url, key, raw):
+    """Without `gc.collect`: nothing refers back to it. A heartbeat ends the subscription, nothing published."""
+    name = key()
+    gc.disable()
+    try:
+        async with reem_async.RedisInterface(server_url) as interface:
+            await reem_async.PublishSpace(interface)[name].write({"n": 0})
+            subscriber = reem_async.SilentSubscriber(name, interface)
+            await subscriber.listen()
+            for _ in range(10):
+                async for _update in subscriber:
+                    break
+                async for _update in reem_async.KeyValueStore(interface)[name].watch():
+                    break
+            assert len(subscriber._watches) == 0
+            await aeventually(lambda: len(listeners(interface)) == 1)
+            watch = reem_async.KeyValueStore(interface)[name].watch()
+            await watch.__anext__()
+            waiting = asyncio.ensure_future(watch.__anext__())  # a loop that has waited, too
+            await asyncio.sleep(0.01)
+            waiting.cancel()
+            await asyncio.wait([waiting])
+            del watch, waiting
+            await aeventually(lambda: len(listeners(interface)) == 1)
+            await subscriber.close()
+            del subscriber
+            async for _update in reem_async.KeyValueStore(interface)[name].watch():
+                break
+            await aeventually(lambda: not manager_of(interface.session)._topics)
+            await aeventually(lambda: raw.execute_command("PUBSUB", "NUMSUB", f"{{{name}}}:notices")[1] == 0)
+    finally:
+        gc.enable()
+
+
+async def test_a_mirror_that_is_dropped_is_unsubscribed(ainterface, akvs, key):
+    """Without `gc.collect`, as a watch: nothing refers back to it."""
+    gc.disable()
+    try:
+        mirror = akvs[key()].mirror()
+        await mirror.listen()
+        await akvs[key()].write(1)
+        assert await mirror.wait_until(lambda value: value == 1, PATIENCE) == 1
+        del mirror
+        await aeventually(lambda: not manager_of(ainterface.session)._topics)
+    finally:
+        gc.enable()
+
+
+def test_a_dropped_watch_of_the_blocking_front_is_unsubscribed(server_url, key):
+    """By a heartbeat, although nothing is published."""
+    with reem.RedisInterface(server_url) as interface:
+        name = key()
+        reem.KeyValueStore(interface)[name] = 1
+        for _update in reem.KeyValueStore(interface)[name].watch():
+            break
+        gc.collect()
+        manager = interface._followers.session.subscriptions
+        end = time.monotonic() + PATIENCE
+        while manager._topics and time.monotonic() < end:
+            time.sleep(0.02)
+        assert not manager._topics
+        assert not manager._subscribed
+
+
+async def test_a_store_and_its_transport_keep_a_bounded_number_of_keys(server_url, key):
+    """Whatever they keep for a key is made anew when it is gone; what was said of shapes stays."""
+    async with reem_async.RedisInterface(server_url) as interface:
+        pspace = reem_async.PublishSpace(interface)
+        steady = key()
+        pspace.track_schema_changes(False, [steady])
+        held = pspace[steady]["x"]
+        for number in range(2100):
+            pspace[f"{key.prefix}:{number}"]
+            interface.session.transport.ordered(f"{number}")
+        assert len(pspace._tops) <= 1000
+        assert len(interface.session.transport._orders.all()) <= 1000
+        await pspace[steady].write({"x": np.zeros(3)})
+        with pytest.raises(TypeError, match="track_schema_changes"):
+            await pspace[steady].write({"x": 1})
+        assert held._writer.tracking.by_key.get(held._writer.name)
+        pspace.track_schema_changes(True)
+        assert not held._writer.tracking.by_key.get(held._writer.name)
+
+
+class FailingShip(reem_async.BytesShip):
+    """Cannot make a value of what begins with "bad"."""
+
+    def unpack(self, blob):
+        if bytes(blob).startswith(b"bad"):
+            raise ValueError("bad")
+        return bytes(blob)
+
+
+@pytest.mark.parametrize("stored", [False, True])
+async def test_a_copy_keeps_no_replies_that_its_values_were_made_of(server_url, key, monkeypatch, stored):
+    """Whether ships could make them or not."""
+    monkeypatch.setattr(logging.getLogger("reem.subscribe"), "disabled", True)  # pytest keeps the errors in its records
+
+    def kept():
+        gc.collect()  # an error and the frames it names
+        return [each for each in gc.get_objects() if isinstance(each, RawRead) and each.name == key()]
+
+    async with reem_async.RedisInterface(server_url, ships=[FailingShip()]) as interface:
+        space = reem_async.PublishSpace(interface)
+        await space[key()].write({"n": b"good"})
+        async with reem_async.SilentSubscriber(key(), interface, stored=stored) as subscriber:
+            assert subscriber.value() == {"n": b"good"}
+            assert not kept()
+            await space[key()].write({"n": b"bad"})
+            await aeventually(lambda: subscriber._link.follower._replica.state is State.BROKEN)
+            assert not kept()
+
+
+class _Lock:
+    pass
+
+
+def test_a_lock_in_use_is_never_replaced():
+    """However many others were asked for meanwhile; those that nobody uses go."""
+    locks = Locks(_Lock)
+    held = {f"held {number}": locks.of(f"held {number}") for number in range(20)}
+    for number in range(10_000):
+        locks.of(str(number))
+        name = f"held {number % 20}"
+        assert locks.of(name) is held[name]
+    gc.collect()
+    assert len(locks.all()) <= 1020
+
+
+def test_numbers_of_a_publisher_never_go_back_when_idle_keys_are_forgotten(monkeypatch):
+    """A key that comes back is published under another id, from 1 on."""
+    monkeypatch.setattr(sessions, "_IDLE", 0.0)
+    monkeypatch.setattr(sessions, "_LOOKS", 0.0)
+    numbers, last, ids = _Numbers(), {}, {}
+    for _ in range(20_000):
+        channel = str(int(random.paretovariate(0.3)) % 4000)
+        publisher, number = numbers.next(channel)
+        assert number == last.get((publisher, channel), 0) + 1
+        last[publisher, channel] = number
+        ids.setdefault(channel, []).append(publisher)
+    assert len(numbers._last) <= 1001
+    assert len({each for those in ids.values() for each in those}) > 2
+
+
+def test_keys_that_are_published_now_and_then_keep_their_numbers():
+    """However many they are."""
+    numbers = _Numbers()
+    for turn in range(1, 4):
+        for channel in range(5000):
+            assert numbers.next(str(channel)) == (numbers.publisher, turn)
+
+
+def test_what_is_remembered_of_documents_is_bounded():
+    """Also while no reply to a write comes."""
+    memory = ShapeCache()
+    for number in range(25_000):
+        document = str(number)
+        memory.saw_members(document, frozenset([b"x"]))
+        memory.broke_off(document)
+        memory.saw_layout(document, (), ())
+        memory.saw_shape(document, (), frozenset())
+        memory.saw_number(document, (), 1.0)
+        memory.saw_number("one", (document,), 1.0)
+    kept = (memory._members, memory._broken_off, memory._layouts, memory._shapes, memory._numbers)
+    sizes = [len(each) for each in kept]
+    assert max(sizes) <= 10_001
+    assert len(memory._numbers["one"]) <= 100
+    assert memory.sure_members("24999") == frozenset()
+
+
+def test_a_number_is_taken_back_only_if_it_was_the_last():
+    """A handler of signals may have published in between, on the thread that keeps all others away."""
+    numbers = _Numbers()
+    publisher, number = numbers.next("a")
+    numbers.take_back("a", publisher, number)
+    assert numbers.next("a") == (publisher, 1)
+    assert numbers.next("a") == (publisher, 2)
+    numbers.take_back("a", publisher, 1)
+    assert numbers.next("a") == (publisher, 3)
+
+
+async def test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks(ainterface, key):
+    """They never end there; it took a second until it was given up."""
+    mirror = reem_async.SilentSubscriber(key(), ainterface)
+    await mirror.listen()
+    pid = os.fork()
+    if pid == 0:
+        store = reem_async.KeyValueStore(ainterface)
+        begun = time.monotonic()
+        asyncio.run(store[key()].get())
+        os._exit(time.monotonic() - begun > 0.9)
+    assert await asyncio.to_thread(os.waitpid, pid, 0) == (pid, 0)
+
+
+def test_after_a_change_that_was_broken_off_an_empty_registry_shows_that_nothing_was_left():
+    """So the next changes need not look again."""
+    cache = ShapeCache()
+    cache.broke_off("foo")
+    assert cache.is_unsure("foo")
+    cache.saw_members("foo", frozenset())
+    assert not cache.is_unsure("foo")

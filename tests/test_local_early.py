@@ -1,0 +1,96 @@
+"""`local="early"`: what subscribers near by are told before the server has it, and how that is put right."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import numpy as np
+import pytest
+import redis
+from conftest import PATIENCE, assert_same
+
+import reem_async
+from reem_async.errors import ServerFull
+from reem_async.local.host import reason_against
+from reem_async.server import EmbeddedServer
+from reem_async.store import publish
+
+pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
+
+IMAGE = np.arange(30_000, dtype=np.float64)
+
+
+@contextlib.asynccontextmanager
+async def parties(url, name):
+    """An early publisher, another one, a store, and the updates that a subscriber and a watch of the store are told."""
+    async with contextlib.AsyncExitStack() as stack:
+        early, other, near = [
+            await stack.enter_async_context(reem_async.RedisInterface(url, local=local))
+            for local in ("early", "auto", "auto")
+        ]
+        spaces, kvs = [reem_async.PublishSpace(each) for each in (early, other)], reem_async.KeyValueStore(near)
+        await spaces[0][name].write({"n": 1})
+        subscriber = await stack.enter_async_context(reem_async.SilentSubscriber(name, near))
+        told = subscriber.watch(reem_async.Every(100))
+        stored = await stack.enter_async_context(kvs[name].watch(reem_async.Every(100)))
+        assert (await next_of(told)).initial
+        assert (await next_of(stored)).initial
+        yield spaces, kvs, told, stored
+
+
+async def next_of(updates):
+    return await asyncio.wait_for(anext(updates), PATIENCE)
+
+
+async def test_early_what_the_server_refuses_is_put_right_with_a_gap():
+    """And until then who was told is ahead of the server."""
+    with EmbeddedServer() as server, redis.Redis.from_url(server.url) as admin:
+        async with parties(server.url, "cam") as (spaces, kvs, told, stored):
+            admin.config_set("maxmemory", "1")
+            with pytest.raises(ServerFull):
+                await spaces[0]["cam"].write({"n": 2, "image": IMAGE})
+            update = await next_of(told)
+            assert update.early
+            assert_same(update.data, {"n": 2, "image": IMAGE})
+            assert (await kvs["cam"].read()) == {"n": 1}
+            update = await next_of(told)
+            assert (update.early, update.gap, update.data) == (False, True, {"n": 1})
+            admin.config_set("maxmemory", "0")
+            await spaces[0]["cam"].write({"n": 3})
+            assert (await next_of(told)).data == {"n": 3}
+            # Who follows the store has heard of nothing that it never had.
+            assert (await next_of(stored)).data == {"n": 3}
+
+
+async def test_what_follows_the_store_is_never_told_early(server_url, key):
+    async with parties(server_url, key("cam")) as (spaces, _, told, stored):
+        for number in range(2, 12):
+            await spaces[0][key("cam")].write({"n": number, "image": IMAGE})
+        assert [(await next_of(told)).early for _ in range(10)] == [True] * 10
+        update = await next_of(stored)
+        while update.data["n"] < 11:
+            assert not update.early
+            update = await next_of(stored)
+
+
+async def test_early_what_another_publisher_overtook_is_put_right(server_url, key, monkeypatch):
+    """The other one's update comes to the server between the early notice and the update itself."""
+    async with parties(server_url, key("cam")) as ((one, other), kvs, told, _):
+        await one[key("cam")].write({"n": 2, "image": IMAGE})
+        assert (await next_of(told)).data["n"] == 2
+        share, waiting = publish._Setting.share, [other]
+
+        async def overtaken(self, path):
+            await share(self, path)
+            if waiting:
+                await waiting.pop()[key("cam")].write({"n": 4, "image": IMAGE})
+
+        monkeypatch.setattr(publish._Setting, "share", overtaken)
+        await one[key("cam")].write({"n": 3, "image": IMAGE})
+        updates = [await next_of(told)]
+        assert updates[0].early
+        assert updates[0].data["n"] == 3
+        while not (updates[-1].data["n"] == 3 and any(update.gap for update in updates)):
+            updates.append(await next_of(told))
+        assert (await kvs[key("cam")]["n"].read()) == 3

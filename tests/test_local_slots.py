@@ -1,0 +1,23 @@
+"""Slots of shared memory in the hands of processes that are killed; `make slots` goes on for longer."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from conftest import PATIENCE, ROOT
+
+from reem_async.local.host import reason_against
+
+pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
+
+
+def test_no_frame_is_torn_and_nothing_is_left_whoever_is_killed():
+    """And all mirrors have what the server has at each pause."""
+    words = "--seed", "31", "--uses", "8000", "--rounds", "3", "--within", str(6 * PATIENCE)
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.slots", *words],
+        cwd=ROOT, capture_output=True, text=True, timeout=240, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-3000:]}"

@@ -1,0 +1,164 @@
+"""What users see of the local path: `reem doctor`, `reem top`, the page. Looking on costs publishers nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import sys
+import urllib.parse
+
+import numpy as np
+import pytest
+import redis
+from browserkit import client_of, live, served
+from conftest import PATIENCE, eventually
+from test_cli import CommandLine
+
+import reem
+import reem_async
+from reem_async.local.host import reason_against
+from reem_async.pubsub.monitor import Event, Monitor
+from reem_async.server import EmbeddedServer
+from reem_async.tools.cli import sharing
+from reem_async.tools.cli.checks import OK, UNKNOWN, WARN
+from reem_async.tools.cli.following import follow
+from reem_async.tools.cli.windows import ALL, Window
+
+IMAGE = np.arange(30_000, dtype=np.float64)
+only_where_there_is = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
+
+
+@pytest.fixture
+def beside(server_url, key):
+    """A subscriber in another interface, for whom publishers put frames into shared memory."""
+    with reem.RedisInterface(server_url) as interface:
+        subscriber = reem.SilentSubscriber(key("cam"), interface)
+        subscriber.listen()
+        yield subscriber
+
+
+def local_finding(url, *words, namespace=""):
+    run = CommandLine(url, namespace)("doctor", "--no-write", "--json", *words)
+    assert run.exit_code == 0, run.output
+    (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "local"]
+    return row
+
+
+# --- reem doctor ------------------------------------------------------------------------------------
+
+
+@only_where_there_is
+def test_doctor_has_another_process_look_into_memory(server_url):
+    row = local_finding(server_url)
+    assert row["status"] == OK
+    assert f"between programs of user {os.geteuid()}" in row["message"]
+    assert ("in this container" in row["message"]) == sharing.is_contained()
+
+
+@only_where_there_is
+async def test_doctor_notices_that_others_cannot_look(monkeypatch):
+    """Whatever the reason: here it is given a process that looks at another file."""
+    monkeypatch.setattr(sharing, "_LOOK", sharing._LOOK.replace("sys.argv[1:]", "[*sys.argv[1:3], 1, 0, 1]"))
+    assert "cannot open the memory" in await sharing.unseen_by_another()
+    monkeypatch.setattr(sharing, "_LOOK", "raise SystemExit(7)")
+    assert "ended with 7" in await sharing.unseen_by_another()
+
+
+def test_doctor_says_why_there_is_none(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "linux")
+    found = sharing.found("no shared memory is to be had here: [Errno 1] Operation not permitted")
+    assert found.status == WARN
+    assert "not permitted; large values go through the server" in found.message
+    monkeypatch.setattr(sys, "platform", "darwin")
+    assert sharing.found("only Linux has what it takes").status == OK
+
+
+@only_where_there_is
+@pytest.mark.parametrize(
+    ("channels", "status"),
+    [(["&{robot:*}:notices", "&{robot:*}:notices@*"], OK), (["&{robot:*}:notices"], WARN), ([], UNKNOWN)],
+)
+def test_doctor_notices_that_a_user_may_not_use_the_channels(channels, status):
+    with (
+        EmbeddedServer() as server,
+        contextlib.closing(redis.Redis.from_url(server.url)) as admin,
+    ):
+        rules = ["reset", "on", ">secret", "~*", "resetchannels", *channels, "+@all"]
+        admin.execute_command("ACL", "SETUSER", "guest", *rules)
+        port = urllib.parse.urlsplit(server.url).port
+        row = local_finding(f"redis://guest:secret@127.0.0.1:{port}", namespace="robot:")
+    assert row["status"] == status, row
+    assert ("deploy/users.acl" in row["remedy"]) == (status == WARN)
+
+
+# --- reem top, and the page -------------------------------------------------------------------------
+
+
+def test_top_says_of_late_and_not_for_ever():
+    window = Window(100)
+    for moment, local, expected in [(100, False, "-"), (101, True, "yes"), (105, False, "yes"), (112, False, "-")]:
+        window.add(Event(("cam",), 1, False, 1, moment, moment, "a", 1, local=local))
+        assert ALL.cells(window)[-1] == expected
+        assert ALL.data(window)["local"] is (expected == "yes")
+        assert ("shared memory" in ALL.line(window)) == (expected == "yes")
+
+
+@only_where_there_is
+async def test_an_event_says_whether_its_value_is_in_shared_memory(server_url, key, beside):
+    async with (
+        reem_async.RedisInterface(server_url) as interface,
+        reem_async.RedisInterface(server_url) as other,
+        Monitor(other, [key("cam")]) as monitor,
+    ):
+        space = reem_async.PublishSpace(interface)
+        for value, local in [({"n": 1}, False), ({"n": 2, "image": IMAGE}, True), ({"n": 3}, False)]:
+            await space[key("cam")].write(value)
+            assert (await anext(monitor)).local is local
+
+
+@only_where_there_is
+def test_the_page_says_which_key_is_shared(server_url, key, beside, pspace):
+    with served(live(server_url)) as (address, _), client_of(address) as page:
+        pspace[key("cam")] = {"image": IMAGE}
+        pspace[key("arm")] = {"n": 1}
+        eventually(lambda: {key("cam"), key("arm")} <= page.rows().keys())
+        eventually(lambda: page.rows()[key("cam")]["shared"])
+        assert not page.rows()[key("arm")]["shared"]
+
+
+# --- who only looks on ------------------------------------------------------------------------------
+
+
+@only_where_there_is
+@pytest.mark.parametrize("stored", [False, True], ids=["top", "hz and echo"])
+async def test_commands_that_measure_have_nothing_copied_and_fetch_nothing(stored, server_url, key, raw):
+    """Beside them alone, a publisher takes no shared memory, and no array is read."""
+
+    def sent():
+        return raw.info("stats")["total_net_output_bytes"]
+
+    async with reem_async.RedisInterface(server_url) as interface, reem_async.RedisInterface(server_url) as other:
+        space, heard, begun = reem_async.PublishSpace(interface), [], asyncio.Event()
+        await space[key("cam")].write({"n": 0})
+        following = asyncio.ensure_future(
+            follow(
+                other,
+                [key("cam")],
+                lambda event, _: heard.append(event),
+                count=5,
+                seconds=PATIENCE,
+                every=0.1,
+                tick=lambda _: begun.set(),
+                stored=stored,
+            )
+        )
+        await begun.wait()
+        before = sent()
+        for number in range(1, 6):
+            await space[key("cam")].write({"n": number, "image": IMAGE})
+        await following
+        assert not any(event.local for event in heard)
+        assert not interface.session.local._segments
+        assert sent() - before < IMAGE.nbytes

@@ -1,0 +1,278 @@
+"""A mirror of the store: read from memory, with its age, and an error in place of an old value."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+from conftest import FRONTS, aeventually, assert_same, eventually, nothing_sent
+
+import reem
+import reem_async
+from reem_async.errors import BadValue, InterfaceClosed, MissingKey, ReadOnly, Stale
+from reem_async.pubsub import manager as managers
+from reem_async.pubsub.manager import manager_of
+from reem_async.server import EmbeddedServer
+
+IMAGE = np.zeros((480, 640, 3), np.uint8)
+
+
+class Mirrored:
+    """A mirror of either front."""
+
+    def __init__(self, front, path, **options):
+        self.front = front
+        self.mirror = front.at(path).mirror(**options)
+        self.wait(self.mirror.listen)
+
+    def wait(self, call, *arguments):
+        result = call(*arguments)
+        return self.front.run(result) if hasattr(self.front, "run") else result
+
+    def until(self, predicate, timeout=10.0):
+        return self.wait(self.mirror.wait_until, predicate, timeout)
+
+    def close(self):
+        self.wait(self.mirror.close)
+
+
+@pytest.fixture
+def mirrored(front):
+    with contextlib.ExitStack() as stack:
+
+        def begin(path, **options):
+            return stack.enter_context(contextlib.closing(Mirrored(front, path, **options)))
+
+        yield begin
+
+
+def test_a_mirror_answers_from_memory_what_anybody_stored_or_published(mirrored, kvs, pspace, raw, key):
+    """With nothing sent, at any depth; what is missing as in a store."""
+    top = key()
+    kvs[top] = {"joint": 1.5, "deep": {"l": [1, 2]}, "small": np.arange(3)}
+    it = mirrored((top,))
+    mirror = it.mirror
+    with nothing_sent(raw):
+        for _ in range(50):
+            assert mirror["joint"].read() == 1.5
+            assert mirror["deep"]["l"][-1].read() == 2
+            assert_same(mirror.value(), {"joint": 1.5, "deep": {"l": [1, 2]}, "small": np.arange(3)})
+    kvs[top]["joint"] = 2.5
+    assert it.until(lambda value: value["joint"] == 2.5)["deep"] == {"l": [1, 2]}
+    raw.execute_command("JSON.SET", top, "$.joint", "3.5")
+    it.until(lambda value: value["joint"] == 3.5)
+    pspace[top]["joint"] = 4.5
+    it.until(lambda value: value["joint"] == 4.5)
+    assert mirror["joint"].read() == 4.5
+    with pytest.raises(MissingKey):
+        mirror["nothing"].read()
+    assert mirror["nothing"].get("default") == "default"
+    with pytest.raises(ReadOnly):
+        mirror["joint"] = 1
+    raw.delete(top)
+    assert it.until(lambda value: value is None) is None
+
+
+def test_a_copy_may_be_changed_by_who_has_it(mirrored, kvs, key):
+    """Nobody else sees that."""
+    kvs[key()] = {"l": [1]}
+    mirror = mirrored((key(),)).mirror
+    mirror.value()["l"].append(2)
+    mirror["l"].read().append(3)
+    assert mirror.value() == {"l": [1]}
+
+
+def test_waiting_ends_at_once_later_or_in_vain(mirrored, kvs, key):
+    """The predicate gets None where nothing is; what it raises is raised."""
+    it = mirrored((key(),))
+    assert it.until(lambda value: value is None) is None
+    with pytest.raises(TimeoutError, match=key()):
+        it.until(lambda value: value == 5, 0.05)
+    with pytest.raises(ZeroDivisionError):
+        it.until(lambda value: 1 / 0)
+
+    def late(value):
+        raise TimeoutError("the predicate's own")
+
+    for timeout in None, 10.0:
+        with pytest.raises(TimeoutError, match="own"):
+            it.until(late, timeout)
+    later = threading.Timer(0.1, kvs[key()].write, [5])
+    later.start()
+    assert it.until(lambda value: value == 5) == 5
+    later.join()
+
+
+def test_a_predicate_of_the_blocking_front_may_call_reem(kvs, key):
+    """It is called on the caller's thread."""
+    kvs[key()] = 1
+    with kvs[key()].mirror() as mirror:
+        assert mirror.wait_until(lambda value: kvs[key()].read() == value, 10) == 1
+
+
+def test_large_arrays_stay_at_the_server_if_asked_for(mirrored, raw, kvs, key):
+    """What they are stands in their place; small ones are fetched."""
+    top = key()
+    kvs[top] = {"image": IMAGE, "small": np.arange(3), "n": 1}
+    it = mirrored((top,), largest=1000)
+    place = it.mirror["image"].read()
+    assert (place.label, place.size >= IMAGE.nbytes, place.summary) == ("numpy", True, "uint8[480,640,3]")
+    assert_same(it.mirror["small"].read(), np.arange(3))
+    kvs[top]["n"] = 2
+    it.until(lambda value: value["n"] == 2)
+    assert it.mirror["image"].read() is place
+    kvs[top]["image"] = IMAGE + 1  # of the same shape
+    it.until(lambda value: value["image"] is not place)
+    kvs[top]["image"] = np.zeros((2, 2), np.uint8)
+    assert_same(it.until(lambda value: isinstance(value["image"], np.ndarray))["image"], np.zeros((2, 2), np.uint8))
+    kvs[top]["image"] = IMAGE
+    it.until(lambda value: not isinstance(value["image"], np.ndarray))
+    assert_same(kvs[top]["image"].read(), IMAGE)
+
+
+@pytest.mark.alone
+def test_the_age_is_that_of_the_last_sign_of_life(mirrored, kvs, key):
+    """Asked for as often as `max_age` needs it, so a quiet key is no old one."""
+    kvs[key()] = 1
+    it = mirrored((key(),), max_age=0.5)
+    fresh = 0
+    for _ in range(40):
+        with pytest.raises(TimeoutError):
+            it.until(lambda value: False, 0.05)
+        with contextlib.suppress(Stale):  # a busy machine
+            assert it.mirror.value() == 1
+            fresh += it.mirror.age < 0.5
+    assert fresh > 30  # with a sign of life each second, half of them
+    with pytest.raises(BadValue):
+        mirrored((key(),), max_age=0)
+
+
+@pytest.mark.parametrize("kind", list(FRONTS))
+def test_a_stopped_server_makes_the_copy_too_old_and_a_dead_one_is_an_error(kind):
+    """No old value; when it is back, the mirror is too."""
+    with EmbeddedServer() as server:
+        front = FRONTS[kind](server.url)
+        with contextlib.closing(front):
+            front.write(("foo",), {"a": 1})
+            fresh, any_age = Mirrored(front, ("foo",), max_age=0.3), Mirrored(front, ("foo",))
+            os.kill(server.pid, signal.SIGSTOP)
+            try:
+
+                def raises(mirror):
+                    if kind == "asyncio":
+                        front.run(asyncio.sleep(0.02))
+                    try:
+                        return not mirror.value()
+                    except Stale as error:
+                        return str(error)
+
+                assert "copy" in eventually(lambda: raises(fresh.mirror))
+                assert fresh.mirror.age > 0.3
+                assert "connection is down" in eventually(lambda: raises(any_age.mirror))
+            finally:
+                os.kill(server.pid, signal.SIGCONT)
+            assert any_age.until(lambda value: value == {"a": 1}, 10)
+            assert fresh.until(lambda value: value == {"a": 1}, 10)
+            fresh.close()
+            with pytest.raises(Stale, match="closed"):
+                fresh.mirror.value()
+            with pytest.raises(InterfaceClosed):
+                fresh.until(lambda value: True)
+            any_age.close()
+
+
+def test_a_mirror_that_does_not_follow_yet_says_so(front, key):
+    """It is a `with` that begins."""
+    mirror = front.at((key(),)).mirror()
+    with pytest.raises(Stale, match="listen"):
+        mirror.value()
+    assert mirror.age == float("inf")
+    wait = getattr(front, "run", lambda result: result)
+    with pytest.raises(Stale, match="listen"):
+        wait(mirror.wait_until(lambda value: True, 1.0))
+
+
+async def test_a_cut_connection_is_an_error_until_the_copy_is_there_again(ainterface, akvs, key):
+    """Not the old value with a new connection."""
+    await akvs[key()].write(1)
+    async with akvs[key()].mirror() as mirror:
+        for wire in list(manager_of(ainterface.session)._wires.values()):
+            wire.abort(reem_async.ConnectionLost("cut"))
+        with pytest.raises(Stale):
+            mirror.value()
+        await akvs[key()].write(2)
+        assert await mirror.wait_until(lambda value: True, 10) == 2
+
+
+async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_the_mirror(
+    ainterface, akvs, key, raw, monkeypatch
+):
+    """However many keys are followed beside; then the next one that needs them decides."""
+    monkeypatch.setattr(managers, "_HEARTBEAT", 1000.0)
+    manager = manager_of(ainterface.session)
+
+    def calls(command):
+        return raw.info("commandstats").get(f"cmdstat_{command}", {"calls": 0})["calls"]
+
+    async with akvs[key("a")].mirror(max_age=0.3):
+        async with akvs[key("b")].mirror(max_age=0.005) as mirror:
+            assert manager._period == 0.005 / 3
+            await manager.fence()  # the notes that following begins with have been asked for
+            gets, pings = calls("get"), calls("ping")
+            await aeventually(lambda: calls("ping") >= pings + 20)
+            assert calls("get") == gets
+            assert mirror.age < 10
+        monkeypatch.setattr(managers, "_HEARTBEAT", 1.0)
+        await aeventually(lambda: manager._period == 0.3 / 3)
+    await aeventually(lambda: manager._period == 1.0)
+
+
+async def test_many_wait_and_one_is_cancelled(akvs, key):
+    """Which disturbs no other."""
+    async with akvs[key()].mirror() as mirror:
+        waiting = [asyncio.ensure_future(mirror.wait_until(lambda value: value == 1)) for _ in range(5)]
+        await asyncio.sleep(0)
+        waiting[0].cancel()
+        await akvs[key()].write(1)
+        assert await asyncio.wait_for(asyncio.gather(*waiting[1:]), 10) == [1] * 4
+        await aeventually(lambda: not mirror._waiting)
+
+
+def test_threads_read_one_mirror(kvs, key):
+    """While another writes."""
+    kvs[key()] = {"a": 0, "b": 0}
+    with kvs[key()].mirror() as mirror:
+        torn, ended = [], threading.Event()
+
+        def read():
+            while not ended.is_set():
+                value = mirror.value()
+                if value["a"] != value["b"]:
+                    torn.append(value)
+
+        readers = [threading.Thread(target=read) for _ in range(2)]
+        for reader in readers:
+            reader.start()
+        for number in range(1, 200):
+            kvs[key()] = {"a": number, "b": number}
+        mirror.wait_until(lambda value: value["a"] == 199, 10)
+        ended.set()
+        for reader in readers:
+            reader.join()
+        assert not torn
+
+
+def test_closing_the_interface_ends_a_mirror_quietly(server_url, key):
+    """In whichever order."""
+    interface = reem.RedisInterface(server_url)
+    mirror = reem.KeyValueStore(interface)[key()].mirror()
+    mirror.listen()
+    interface.close()
+    mirror.close()
+    with pytest.raises(Stale):
+        mirror.value()

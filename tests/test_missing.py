@@ -1,0 +1,196 @@
+"""What is not there: what reads as None, what raises, how to ask; and the names by which old programs catch it."""
+
+from __future__ import annotations
+
+import contextlib
+
+import numpy as np
+import pytest
+import redis
+from conftest import assert_no_orphans, assert_same, eventually
+
+import reem
+import reem_async
+from reem_async.errors import BadType, MissingKey, NotFinite, Overflow, PathRefused, TooDeep, WrongType
+from reem_async.store.catalog import outline
+
+# --- a top-level key that is not there ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("below", [(), ("a",), ("a", "b", 0), (0,), (-1,), ("a", -1)])
+def test_reading_a_top_level_key_that_is_not_there_gives_none(front, key, below):
+    """At any depth: an actuator that starts before its controller (manual, 4.2.1) finds no command yet."""
+    assert front.read([key("absent"), *below]) is None
+
+
+def test_what_is_missing_from_a_document_that_is_there_is_an_error(front, key):
+    """Whatever the way it is addressed."""
+    front.write([key()], {"l": [1], "none": None})
+    for path in (["absent"], ["l", 1], ["l", -2], ["l", "x"], ["none", "x"]):
+        with pytest.raises(MissingKey):
+            front.read([key(), *path])
+    assert front.read([key(), "none"]) is None
+
+
+def test_a_program_that_must_know_asks(front, key, raw):
+    """`key in store`, `await store.contains(key)`: None that is stored counts, what others stored does not."""
+    assert not front.contains(key())
+    front.write([key()], None)
+    assert front.contains(key())
+    assert front.read([key()]) is None
+    raw.set(key("other"), 1)
+    assert not front.contains(key("other"))
+    front.delete([key()])
+    assert not front.contains(key())
+    with pytest.raises(reem.BadKey):
+        front.contains(5)
+
+
+def test_defaults_and_every_other_call_stay_as_they_are(front, key):
+    """`get` tells what is missing from what is None; `store.get` without a default raises."""
+    absent = key("absent")
+    assert front.get(f"{absent}.x", 5) == front.get(absent, 5) == 5
+    calls = (
+        front.delete,
+        front.length,
+        front.type,
+        lambda path: front.append(path, 1),
+        lambda path: front.get(path[0]),
+    )
+    for call in calls:
+        with pytest.raises(MissingKey, match=absent):
+            call([absent])
+
+
+def test_the_reader_of_one_key_does_the_same(interface, key):
+    """`Reader.read_from_redis`."""
+    reader = reem.Reader(key(), interface)
+    assert reader.read_from_redis(".") is None
+    assert reader.read_from_redis(".a.b") is None
+    reem.Writer(key(), interface).send_to_redis(".", {"a": {}})
+    with pytest.raises(MissingKey):
+        reader.read_from_redis(".a.b")
+
+
+def test_accessors_get_with_a_default(kvs, key):
+    """Of the value itself, and of an element as in REEM 0.1."""
+    assert kvs[key()].get(5) == 5
+    assert kvs[key()].get() is None
+    assert kvs[key()].get("element", 5) == 5
+    with pytest.raises(MissingKey), kvs[key()]:
+        pytest.fail("the block ran")
+
+
+async def test_tools_still_say_that_nothing_is_there(ainterface, key):
+    """They do not read through `Accessor.read`."""
+    with pytest.raises(MissingKey):
+        await outline(ainterface, key())
+
+
+# --- an array as the first thing below a top-level key ------------------------------------------------
+
+
+@pytest.mark.parametrize("value", [np.arange(3.0), np.zeros(20_000), b"bytes"], ids=["small", "large", "bytes"])
+@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
+def test_a_single_array_makes_the_top_level_dict(open_front, key, raw, space, value):
+    """As `kvs["read_frame_rate_test"]["subkey"] = arr` of the manual (5.1.2) needs it."""
+    front, reader = open_front(space), open_front()
+    front.write([key(), "subkey"], value)
+    assert_same(reader.read([key()]), {"subkey": value})
+    front.write([key(), "other"], value)
+    assert_same(reader.read([key()]), {"subkey": value, "other": value})
+    front.delete([key()])
+    front.write([key(), "subkey"], value)
+    assert_same(reader.read([key()]), {"subkey": value})
+    assert_no_orphans(raw, key())
+
+
+def test_it_does_so_though_another_program_deleted_the_key_meanwhile(open_front, key, raw):
+    """What this one remembers of the arrays there is no reason to refuse."""
+    front, other = open_front(), open_front()
+    for number in range(3):
+        front.write([key(), "subkey"], np.arange(number))
+        front.write([key(), "subkey"], np.arange(number + 1))
+        other.delete([key()])
+    front.write([key(), "subkey"], np.arange(5))
+    assert_same(other.read([key()]), {"subkey": np.arange(5)})
+    assert_no_orphans(raw, key())
+
+
+def test_what_is_there_meanwhile_stays(open_front, key, raw):
+    """The dict is made only where there is none: both of two that begin at once are there afterwards."""
+    one, other = open_front(), open_front()
+    one.write([key(), "a"], np.arange(2))
+    other.write([key(), "b"], np.arange(3))
+    assert_same(one.read([key()]), {"a": np.arange(2), "b": np.arange(3)})
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (["x"], 5), (["x"], {"image": np.arange(3)}), (["x"], [np.arange(3)]), (["x"], {}), (["x"], "text"),
+        (["x", "y"], np.arange(3)), ([0], np.arange(3)), ([-1], np.arange(3)),
+    ],
+)  # fmt: skip
+def test_nothing_else_makes_a_top_level_key(front, key, raw, path, value):
+    """As the originals' tests define it."""
+    with pytest.raises(redis.exceptions.ResponseError, match=key()):
+        front.write([key(), *path], value)
+    assert not list(raw.scan_iter(match=f"*{key()}*"))
+
+
+def test_followers_see_the_dict_that_an_array_made(interface, pspace, key):
+    """Of the whole key and of the place in it."""
+    mirrors = [reem.SilentSubscriber(name, interface) for name in (key(), f"{key()}.image")]
+    with contextlib.ExitStack() as stack:
+        for mirror in mirrors:
+            stack.enter_context(mirror)
+        pspace[key()]["image"] = np.arange(4)
+        eventually(lambda: mirrors[0].value() is not None and mirrors[1].value() is not None)
+        assert_same(mirrors[0].value(), {"image": np.arange(4)})
+        assert_same(mirrors[1].value(), np.arange(4))
+
+
+# --- the names by which old programs catch refusals -----------------------------------------------------
+
+
+def deep(levels):
+    return {"a": deep(levels - 1)} if levels else 1
+
+
+@pytest.mark.parametrize(
+    ("call", "error"),
+    [
+        (lambda front, name: front.write([name("absent"), "x"], 5), PathRefused),
+        (lambda front, name: front.write([name(), "gone", "x"], 5), PathRefused),
+        (lambda front, name: front.write([name(), "gone", "x"], np.arange(3)), PathRefused),
+        (lambda front, name: front.write([name(), "n", "x"], 5), PathRefused),
+        (lambda front, name: front.write([name(), "l", 5], 5), PathRefused),
+        (lambda front, name: front.read([name(), "gone"]), MissingKey),
+        (lambda front, name: front.read([name(), "l", 5]), MissingKey),
+        (lambda front, name: front.type([name(), "gone"]), MissingKey),
+        (lambda front, name: front.append([name(), "n"], 5), WrongType),
+        (lambda front, name: front.append([name(), "n"], np.arange(3)), WrongType),
+        (lambda front, name: front.append([name(), "gone"], 5), MissingKey),
+        (lambda front, name: front.increment([name(), "s"], 5), WrongType),
+        (lambda front, name: front.multiply([name(), "l"], 5), WrongType),
+        (lambda front, name: front.length([name(), "n"]), WrongType),
+        (lambda front, name: front.increment([name(), "n"], 2**63 - 1), Overflow),
+        (lambda front, name: front.write([name()], {"a": float("nan")}), NotFinite),
+        (lambda front, name: front.write([name()], deep(130)), TooDeep),
+    ],
+)
+def test_what_the_server_used_to_refuse_is_caught_as_a_response_error(front, key, call, error):
+    """Programs of REEM 0.0 and 0.1 catch redis-py's; new ones the errors of REEM."""
+    front.write([key()], {"n": 1, "s": "text", "l": [1]})
+    with pytest.raises(redis.exceptions.ResponseError) as caught:
+        call(front, key)
+    assert isinstance(caught.value, error)
+    assert isinstance(caught.value, reem.ReemError)
+
+
+def test_wrong_types_are_bad_types():
+    """So that whoever catches those of before still does."""
+    assert issubclass(WrongType, BadType)
+    assert issubclass(NotFinite, reem.BadValue)
+    assert reem.WrongType is reem_async.WrongType

@@ -1,0 +1,490 @@
+"""What a publisher does in an outage: raise, drop, or keep the newest of each place; on servers that really go away."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import pickle
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from chaos.proxy import Proxy
+from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually
+
+import reem
+import reem_async
+from reem_async.concurrency.queues import Every
+from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.server.embedded import EmbeddedServer
+from reem_async.store import outage
+from reem_async.store.document import DocumentWriter
+
+
+class Server:
+    """A private server that can be ended and started again on its port, with its data."""
+
+    def __init__(self, directory, stack):
+        self._directory = directory
+        self._stack = stack
+        self.port = 0
+        self.start()
+
+    def start(self):
+        self._running = self._stack.enter_context(EmbeddedServer(port=self.port, directory=self._directory))
+        self.port = self._running.port
+        self.url = f"redis://127.0.0.1:{self.port}"
+        self.pid = self._running.pid
+
+    def stop(self):
+        self._running.__exit__(None, None, None)
+
+
+@pytest.fixture
+def server(tmp_path):
+    """One of the test's own."""
+    with contextlib.ExitStack() as stack:
+        yield Server(tmp_path, stack)
+
+
+@pytest.fixture(params=list(FRONTS))
+def publisher(request, server):
+    """Makes either front with a PublishSpace of a policy; `front.eventually` waits, and has the event loop go on."""
+    with contextlib.ExitStack() as stack:
+
+        def make(policy, url=server.url, **options):
+            front = stack.enter_context(contextlib.closing(FRONTS[request.param](url, "PublishSpace", **options)))
+            front.kvs = type(front.kvs)(front.interface, policy)
+
+            def going_on():
+                if request.param == "asyncio":
+                    front.run(asyncio.sleep(0.005))
+
+            front.eventually = lambda condition: eventually(lambda: going_on() or condition())
+            return front
+
+        yield make
+
+
+@pytest.fixture
+def reader(server):
+    """A blocking store, of an interface made when it is asked for."""
+    with contextlib.ExitStack() as stack:
+        yield lambda: reem.KeyValueStore(stack.enter_context(reem.RedisInterface(server.url)))
+
+
+def lose(front, server):
+    """End the server, and have the publisher notice by an update that may be lost."""
+    front.write(["lost"], 0)
+    server.stop()
+    front.write(["lost"], 1)
+
+
+def test_what_is_no_policy_is_refused():
+    for package in (reem, reem_async):
+        with pytest.raises(BadValue, match="'raise', 'drop' or 'newest'"):
+            package.PublishSpace(package.RedisInterface("redis://127.0.0.1:1"), outage="keep")
+
+
+def test_a_publisher_raises_unless_it_says_otherwise(publisher, server):
+    front = publisher("raise")
+    front.write(["a"], 1)
+    server.stop()
+    with pytest.raises((NotConnected, ConnectionLost)):
+        front.write(["a"], 2)
+    with pytest.raises(NotConnected):
+        front.write(["a"], 2)
+    assert (front.kvs.dropped, front.kvs.waiting) == (0, 0)
+
+
+def test_the_newest_of_each_place_is_sent_when_the_server_is_back(publisher, server, reader, caplog):
+    """With the bytes of the time of the call; what was replaced is counted."""
+    front, image = publisher("newest"), np.zeros(40_000)
+    front.write(["robot"], {"pose": {"x": 0, "y": 0}, "old": 1, "image": image})
+    lose(front, server)
+    before = front.kvs.dropped
+    for number in range(1, 4):
+        front.write(["robot", "pose", "x"], number)
+    front.write(["robot", "pose"], {"x": 5, "y": 5})  # in place of what is inside
+    front.write(["robot", "pose", "y"], 6)
+    image[:] = 7
+    front.write(["robot", "image"], image)
+    image[:] = 8
+    front.delete(["robot", "old"])
+    assert front.kvs.dropped - before == 3
+    assert front.kvs.waiting >= 4
+    server.start()
+    front.eventually(lambda: front.kvs.waiting == 0)
+    assert_same(reader()["robot"].read(), {"pose": {"x": 5, "y": 6}, "image": np.full(40_000, 7.0)})
+    assert front.kvs.dropped - before == 3
+    front.write(["robot", "pose", "x"], 9)
+    assert reader()["robot"]["pose"]["x"].read() == 9
+    front.eventually(lambda: "the server answers again" in caplog.text)
+    assert caplog.text.count("until the server is back") == 1
+
+
+def test_updates_are_dropped_and_counted(publisher, server, reader, caplog):
+    front = publisher("drop")
+    front.write(["a"], 1)
+    lose(front, server)
+    before = front.kvs.dropped
+    assert before == 1
+    for number in range(5):
+        front.write(["a"], number)
+    front.delete(["a"])
+    assert (front.kvs.dropped - before, front.kvs.waiting) == (6, 0)
+    server.start()
+    front.eventually(lambda: "the server answers again" in caplog.text)
+    assert reader()["a"].read() == 1
+    front.write(["a"], 7)
+    assert reader()["a"].read() == 7
+
+
+@pytest.mark.parametrize("policy", ["drop", "newest"])
+async def test_subscribers_are_told_of_what_was_dropped(server, policy):
+    """One whose own connection stands: by the number of what comes next; and each update comes once, in its order."""
+    with Proxy(server.port) as proxy:
+        async with (
+            reem_async.RedisInterface(server.url) as near,
+            reem_async.RedisInterface(proxy.url, timeout=0.3) as far,
+        ):
+            space = reem_async.PublishSpace(far, policy)
+            await space["a"].write({"x": 0, "y": 0})
+            async with reem_async.KeyValueStore(near)["a"].watch(Every(100)) as watch:
+                assert (await anext(watch)).initial
+                proxy.black_hole()
+                await space["a"]["x"].write(1)  # it was under way: swallowed here, but nobody can know
+                began = time.time()
+                for number in range(2, 6):
+                    await space["a"]["x"].write(number)
+                await space["a"]["y"].write(1)
+                ended = time.time()
+                proxy.heal()
+                await aeventually(lambda: not space.waiting and space._outages._asking is False)
+                await space["a"]["x"].write(6)
+                if policy == "newest":
+                    kept = [await asyncio.wait_for(anext(watch), PATIENCE) for _ in range(2)]
+                    assert [(each.path, each.value, each.missed) for each in kept] == [("a.x", 5, 4), ("a.y", 1, 0)]
+                    assert all(began <= each.time <= ended for each in kept)
+                last = await asyncio.wait_for(anext(watch), PATIENCE)
+                assert (last.value, last.sequence) == (6, 8)
+                assert last.missed == (0 if policy == "newest" else 6)
+                assert space.dropped == (4 if policy == "newest" else 6)
+
+
+def test_what_may_have_been_applied_is_not_sent_again(publisher, server, reader):
+    """Its reply was lost: here it was applied, and another program's later write stays."""
+    with Proxy(server.port) as proxy:
+        front = publisher("newest", proxy.url)
+        front.write(["a"], 0)
+        proxy.drop_reply(b"SET")
+        front.write(["a"], 1)
+        assert proxy.settled()
+        assert (front.kvs.dropped, front.kvs.waiting) == (1, 0)
+        other = reader()
+        assert other["a"].read() == 1
+        other["a"] = 2
+        front.write(["b"], 1)
+        front.eventually(lambda: front.kvs.waiting == 0 and "b" in other)
+        assert other["a"].read() == 2
+
+
+def test_a_server_that_hangs_is_waited_for_once(publisher, server, reader):
+    """The first call takes its time limit; those after it, of other keys too, do not ask the server at all."""
+    front = publisher("newest", timeout=0.3)
+    for name in "abc":
+        front.write([name], 0)
+    os.kill(server.pid, signal.SIGSTOP)
+    try:
+        front.write(["a"], 1)
+        for name in "bc" * 50:
+            front.write([name], 1)
+        assert front.kvs.waiting == 2
+        assert front.kvs.dropped == 1 + 98
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+    front.eventually(lambda: front.kvs.waiting == 0)
+    assert {name: reader()[name].read() for name in "bc"} == {"b": 1, "c": 1}
+
+
+@pytest.mark.parametrize("policy", ["drop", "newest"])
+def test_an_outage_ends_for_several_keys_that_are_published_all_the_time(publisher, server, reader, caplog, policy):
+    """Faster than the server is asked for each of them: a key that is within reach again stays so."""
+    with Proxy(server.port) as proxy:
+        front, names, number = publisher(policy, proxy.url), "abc", 0
+        for name in names:
+            front.write([name], 0)
+
+        def publish():
+            nonlocal number
+            number += 1
+            for name in names:
+                front.write([name], number)
+
+        server.stop()
+        publish()
+        publish()
+        proxy.delay = 0.01
+        server.start()
+        front.eventually(lambda: publish() or "the server answers again" in caplog.text)
+        publish()
+        assert [reader()[name].read() for name in names] == [number] * 3
+        assert front.kvs.waiting == 0
+        assert caplog.text.count("until the server is back") == 1
+
+
+def test_what_depends_on_what_is_there_raises_and_comes_behind_what_is_kept(publisher, server, reader):
+    front = publisher("newest")
+    front.write(["l"], [1])
+    lose(front, server)
+    for call in (lambda: front.append(["l"], 2), lambda: front.increment(["n"], 1)):
+        with pytest.raises(NotConnected):
+            call()
+    front.write(["l"], [3])
+    server.start()
+    front.append(["l"], 4)
+    front.eventually(lambda: front.kvs.waiting == 0)
+    assert reader()["l"].read() == [3, 4]
+
+
+def test_what_is_refused_afterwards_is_logged_and_counted(publisher, server, tmp_path, caplog):
+    """As where the server has lost what the place was in. A deletion of what is not there is no loss."""
+    front = publisher("newest")
+    front.write(["a"], {"b": {}})
+    front.write(["lost"], 0)
+    lose(front, server)
+    before = front.kvs.dropped
+    for file in tmp_path.rglob("*"):
+        if file.is_file():
+            file.unlink()
+    front.write(["a", "b", "c"], 1)
+    front.delete(["a", "b", "d"])
+    server.start()
+    front.eventually(lambda: front.kvs.waiting == 0)
+    front.eventually(lambda: "the server answers again" in caplog.text)
+    assert front.kvs.dropped - before == 1
+    assert "a.b.c: kept in an outage, and refused now" in caplog.text
+
+
+def test_memory_is_bounded(publisher, server, reader, monkeypatch):
+    """The oldest go first; a value that is too large by itself goes too."""
+    monkeypatch.setattr(outage, "_MOST", 10_000)
+    front = publisher("newest")
+    front.write(["a"], {})
+    lose(front, server)
+    before, waiting = front.kvs.dropped, front.kvs.waiting
+    for number in range(20):
+        front.write(["a", f"n{number}"], "x" * 1000)
+    assert 3 <= front.kvs.waiting <= 7
+    assert front.kvs.dropped - before + front.kvs.waiting - waiting == 20
+    front.write(["b"], "x" * 20_000)
+    assert front.kvs.dropped - before + front.kvs.waiting - waiting == 21
+    server.start()
+    front.eventually(lambda: front.kvs.waiting == 0)
+    assert "n19" in reader()["a"].read()
+    assert "n0" not in reader()["a"].read()
+
+
+def test_closing_gives_up_what_is_kept(publisher, server, caplog):
+    """It is counted and logged, and nobody goes on asking."""
+    front = publisher("newest")
+    lose(front, server)
+    front.write(["a"], 1)
+    before, left = front.kvs.dropped, front.kvs.waiting
+    front.interface.close() if isinstance(front.kvs, reem.PublishSpace) else front.run(front.interface.close())
+    assert left >= 1
+    assert (front.kvs.dropped, front.kvs.waiting) == (before + left, 0)
+    assert f"{left} kept updates were not sent" in caplog.text
+    assert "reem outage" not in [thread.name for thread in threading.enumerate()]
+    with pytest.raises(reem_async.InterfaceClosed):
+        front.write(["a"], 1)
+
+
+def test_a_number_is_not_used_again_if_the_server_goes_away_between_two_kept_updates(server, reader, monkeypatch):
+    """Before the second of them has one; and no update is held in memory once it is sent."""
+    held, started, gone = [], threading.Event(), threading.Event()
+    with reem.RedisInterface(server.url) as interface, reem.RedisInterface(server.url) as near:
+        space = reem.PublishSpace(interface, outage="newest")
+        space["a"] = {"x": 0}
+        server.stop()
+        space["a"]["x"] = 0  # may have been under way
+        space["a"]["x"] = 1
+        space["a"]["image"] = np.ones(5)
+        assert space.waiting == 2
+        look, send = DocumentWriter._check_place, DocumentWriter.send
+
+        async def look_without_server(self, *what):
+            if not gone.is_set():
+                assert started.wait(PATIENCE)
+                server.stop()
+                gone.set()
+            await look(self, *what)
+
+        async def send_noting(self, turn, assignments):
+            held.append(len(turn._tellings))
+            await send(self, turn, assignments)
+
+        monkeypatch.setattr(DocumentWriter, "_check_place", look_without_server)
+        monkeypatch.setattr(DocumentWriter, "send", send_noting)
+        server.start()
+        started.set()
+        eventually(lambda: gone.is_set() and space.waiting == 1)  # it was kept again
+        server.start()
+        eventually(lambda: not space.waiting and not space._core._outages._asking)
+        assert_same(reader()["a"].read(), {"x": 1, "image": np.ones(5)})
+        assert space.dropped == 1
+        assert int(near.client.get("{a}:last").split()[1]) == 4
+        assert held == [0, 0, 0]  # before each is sent, the second twice
+
+
+def test_no_thread_to_be_had_does_not_keep_an_interface_from_being_closed(server, reader):
+    """The next call starts one."""
+    with reem.RedisInterface(server.url) as interface:
+        space = reem.PublishSpace(interface, outage="newest")
+        server.stop()
+        usual = threading.stack_size(1 << 50)  # more than there are addresses
+        try:
+            with pytest.raises(RuntimeError, match="can't start new thread"):
+                space["a"] = 1
+        finally:
+            threading.stack_size(usual)
+        space["a"] = 2
+        server.start()
+        eventually(lambda: space.waiting == 0)
+        assert reader()["a"].read() == 2
+
+
+def test_an_update_of_several_is_kept_by_its_entries(publisher, server, reader):
+    front = publisher("newest")
+    front.write(["a"], {"x": 0, "y": 0, "z": 0})
+    lose(front, server)
+    call = front.kvs["a"].update({"x": 1, "y": 1})
+    if call is not None:
+        front.run(call)
+    front.write(["a", "y"], 2)
+    server.start()
+    front.eventually(lambda: front.kvs.waiting == 0)
+    assert reader()["a"].read() == {"x": 1, "y": 2, "z": 0}
+
+
+def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):
+    front = publisher("drop")
+    space, handle = pickle.loads(pickle.dumps((front.kvs, front.kvs["a"]["b"])))
+    assert space.outage == "drop"
+    server.stop()
+    for call in (lambda: space["a"].write(1), lambda: handle.write(1)):
+        result = call()
+        if result is not None:
+            front.run(result)
+    assert space.dropped == 1
+    closing = space.interface.close()
+    if closing is not None:
+        front.run(closing)
+
+
+def test_a_camera_goes_on_through_a_restart(server, reader, caplog):
+    """A blocking loop that knows nothing of it; each frame has one number, is told, or is counted."""
+    with reem.RedisInterface(server.url, timeout=0.5) as interface:
+        space = reem.PublishSpace(interface, outage="newest")
+        space["camera"] = {"number": -1, "image": np.zeros((48, 64), np.uint8)}
+        over = threading.Event()
+        frames, errors = [0], []
+
+        def camera():
+            try:
+                while not over.wait(0.01):
+                    frames[0] += 1
+                    space["camera"] = {"number": frames[0], "image": np.full((48, 64), frames[0] % 256, np.uint8)}
+            except BaseException as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=camera)
+        thread.start()
+        try:
+            for _ in range(2):
+                begun = frames[0]
+                eventually(lambda begun=begun: frames[0] > begun + 10)
+                server.stop()
+                begun = frames[0]
+                eventually(lambda begun=begun: frames[0] > begun + 20 and space.waiting)
+                server.start()
+                eventually(lambda: space.waiting == 0)
+            begun = frames[0]
+            eventually(lambda: frames[0] > begun + 5)
+        finally:
+            over.set()
+            thread.join()
+        assert not errors
+        eventually(lambda: not space.waiting and not space._core._outages._asking)
+        seen = reader()["camera"].read()
+        assert seen["number"] == frames[0]
+        assert seen["image"][0, 0] == frames[0] % 256
+        note = interface.client.get("{camera}:last")
+        assert int(note.split()[1]) == frames[0] + 1
+        assert 30 < space.dropped <= frames[0]
+    assert caplog.text.count("until the server is back") == 2
+    assert all(record.levelno == logging.WARNING for record in caplog.records if record.name == "reem.publish")
+
+
+def test_a_child_leaves_what_is_kept_to_its_parent(server, reader):
+    """It has neither the thread that would send it, nor is it the same publisher."""
+    with reem.RedisInterface(server.url) as interface:
+        space = reem.PublishSpace(interface, outage="newest")
+        space["a"] = 0
+        server.stop()
+        space["a"] = 1
+        space["a"] = 2
+        child = os.fork()
+        if child == 0:
+            status = 1
+            with contextlib.suppress(BaseException):
+                space["b"] = 1
+                status = 0 if space.waiting == 1 else 2
+            os._exit(status)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert space.waiting == 1
+        server.start()
+        eventually(lambda: space.waiting == 0)
+        assert reader()["a"].read() == 2
+
+
+def _appends(space):
+    space["a"].append(3)
+    return True
+
+
+def _closes(space):
+    space.interface.close()
+    return space.dropped == 0
+
+
+@pytest.mark.parametrize("call", [_appends, _closes, lambda space: (space.waiting, space.dropped) == (0, 0)])
+def test_whatever_a_child_calls_first_what_is_kept_is_not_its_own(server, reader, call):
+    with reem.RedisInterface(server.url) as interface:
+        space = reem.PublishSpace(interface, outage="newest")
+        space["a"] = [0]
+        server.stop()
+        space["a"] = [1]
+        space["a"] = [2]
+        go, tell = os.pipe()
+        child = os.fork()
+        if child == 0:
+            status = 1
+            with contextlib.suppress(BaseException):
+                os.close(tell)  # so that it does not wait for a parent that has failed
+                os.read(go, 1)
+                status = 0 if call(space) else 2
+            os._exit(status)
+        assert space.waiting == 1
+        server.start()
+        eventually(lambda: space.waiting == 0)
+        reader()["a"] = [4]
+        os.write(tell, b"x")
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        os.close(go)
+        os.close(tell)
+        assert reader()["a"].read() == ([4, 3] if call is _appends else [4])

@@ -1,0 +1,629 @@
+"""Servers without the JSON module: documents are text there, and everything else is as it is with it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import threading
+
+import numpy as np
+import orjson
+import pytest
+import redis
+from conftest import FRONTS, PLAIN, assert_same, eventually, placeholders
+from plainkit import Comparison
+
+import reem
+import reem.migration
+import reem.snapshots
+import reem_async
+from reem.server import EmbeddedCluster, EmbeddedServer
+from reem_async.plain.batches import Known
+from reem_async.plain.documents import MARK, Document
+from reem_async.plain.translation import directly, looked_at, translated
+from reem_async.store.catalog import names
+from reem_async.transport.parsing import error_of
+from reem_async.transport.text import HeldText
+
+with_module = pytest.mark.skipif(PLAIN, reason="compares with a server that has the module")
+
+
+@pytest.fixture(scope="module")
+def server():
+    with EmbeddedServer(json=False) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def raw(server):
+    """Another program's client of the plain server: it sees strings."""
+    with redis.Redis(unix_socket_path=server.socket_path) as client:
+        yield client
+
+
+@pytest.fixture(params=FRONTS)
+def open_front(request, server):
+    with contextlib.ExitStack() as stack:
+
+        def open_(space="KeyValueStore"):
+            return stack.enter_context(contextlib.closing(FRONTS[request.param](server.url, space)))
+
+        yield open_
+
+
+@pytest.fixture
+def front(open_front):
+    return open_front()
+
+
+@pytest.fixture(scope="module")
+def with_json():
+    """A server with the module."""
+    with EmbeddedServer() as running:
+        if not running.json:
+            pytest.skip("there is no server with JSON")
+        yield running
+
+
+def calls(raw):
+    """How often each command was called, and refused, since the server began."""
+    rows = raw.info("commandstats")
+    return {name.removeprefix("cmdstat_"): row["calls"] + row["rejected_calls"] for name, row in rows.items()}
+
+
+def called(raw, work):
+    """Which commands `work` leads to."""
+    before = calls(raw)
+    work()
+    return {name: count - before.get(name, 0) for name, count in calls(raw).items() if count > before.get(name, 0)}
+
+
+def text_of(raw, key):
+    """A document as another program sees it."""
+    return raw.execute_command("GET", key)
+
+
+def check_no_orphans(raw, key):
+    """Arrays, registry and placeholders name each other exactly."""
+    found = placeholders(orjson.loads(text_of(raw, key)))
+    members = {member.decode() for member in raw.smembers(f"{{{key}}}:ships")}
+    there = {name.decode().removeprefix(f"{{{key}}}") for name in raw.scan_iter(f"{{{key}}}*")} - {":ships", ":last"}
+    assert members == there
+    assert len(found) == len(there)
+
+
+# --- as the module -------------------------------------------------
+
+
+@with_module
+@pytest.mark.parametrize("seed", range(3))
+def test_generated_commands_are_answered_as_by_the_module(with_json, seed):
+    """Replies, refusals and what is stored, one by one; `python tests/plainkit.py` does it 100,000 times."""
+    comparison = Comparison(f"unix://{with_json.socket_path}", f"compared{seed}", seed)
+    assert comparison.run(int(os.environ.get("REEM_TEST_EXAMPLES", "2000")) // 2) is None
+    assert comparison.refused > 10
+
+
+def test_numbers_keep_every_bit():
+    document = Document(MARK + b'{"u":18446744073709551615,"i":-9223372036854775808,"f":0.1}')
+    document.run(("JSON.SET", "k", '$["x"]', b"5e-324"))
+    document.run(("JSON.NUMINCRBY", "k", '$["f"]', b"0.2"))
+    assert orjson.loads(document.string()) == {"u": 2**64 - 1, "i": -(2**63), "f": 0.1 + 0.2, "x": 5e-324}
+
+
+# --- what is stored -------------------------------------------------
+
+
+def test_a_document_is_json_text_behind_a_space(front, raw):
+    """Any program can read it; none writes a string that begins so."""
+    front.write(["text"], {"a": [1, 2.5, "x"], "b": None})
+    assert text_of(raw, "text") == b' {"a":[1,2.5,"x"],"b":null}'
+    front.write(["text", "a", 0], {"new": True})
+    assert orjson.loads(text_of(raw, "text")) == {"a": [{"new": True}, 2.5, "x"], "b": None}
+
+
+def test_whole_values_take_one_command_once_the_key_is_known(front, raw):
+    front.write(["whole"], {"a": 1})
+
+    def work():
+        for number in range(5):
+            front.write(["whole"], {"a": number})
+            assert front.read(["whole"]) == {"a": number}
+
+    assert {name: count for name, count in called(raw, work).items() if name != "info"} == {
+        "set": 5,
+        "get": 5,
+        "smembers": 5,
+    }
+
+
+def test_a_change_below_the_top_is_a_look_and_a_transaction(front, raw):
+    front.write(["below"], {"a": 1})
+    front.write(["below", "a"], 2)
+    done = called(raw, lambda: front.write(["below", "a"], 3))
+    done.pop("info")
+    assert done == {"watch": 1, "get": 1, "multi": 1, "set": 1, "exec": 1, "smembers": 1}
+
+
+def test_an_expiry_stays(front, raw):
+    front.write(["brief"], {"a": 1})
+    raw.expire("brief", 100)
+    front.write(["brief", "a"], 2)
+    front.write(["brief"], {"a": 3})
+    assert 90 < raw.ttl("brief") <= 100
+
+
+@pytest.mark.parametrize("text", [b"5", b'{"a": 1}', b"", b"hello"], ids=repr)
+def test_strings_of_other_programs_are_left_alone(front, raw, text):
+    """However they look; also right after a document was deleted under that name."""
+    front.write(["mine"], {"a": 1})
+    front.write(["mine"], {"a": 2})
+    front.delete(["mine"])
+    raw.set("mine", text)
+    for call in (
+        lambda: front.read(["mine"]),
+        lambda: front.write(["mine"], {"b": 1}),
+        lambda: front.write(["mine"], {"b": np.arange(3)}),
+        lambda: front.write(["mine", "a"], 1),
+        lambda: front.delete(["mine"]),
+        lambda: front.increment(["mine", "a"], 1),
+        lambda: front.append(["mine"], 1),
+    ):
+        with pytest.raises(reem.WrongKind, match="string"):
+            call()
+    assert text_of(raw, "mine") == text
+    assert not raw.exists("{mine}:ships", "{mine}.b")
+    raw.delete("mine")
+
+
+def test_what_is_no_string_is_left_alone(front, raw):
+    raw.delete("row")
+    raw.rpush("row", 1)
+    for call in (
+        lambda: front.read(["row"]),
+        lambda: front.write(["row"], 1),
+        lambda: front.write(["row", "a"], 1),
+        lambda: front.delete(["row"]),
+    ):
+        with pytest.raises(reem.WrongKind, match="list"):
+            call()
+    assert raw.lrange("row", 0, -1) == [b"1"]
+
+
+async def test_a_catalogue_tells_documents_from_strings(server, raw):
+    async with reem_async.RedisInterface(server, namespace="listed:") as interface:
+        store = reem_async.KeyValueStore(interface)
+        await store["one"].write({"a": np.arange(3)})
+        await store["two"].write(1)
+        raw.set("listed:three", "3")
+        raw.set("listed:four", '{"a": 1}')
+        assert {name async for name in names(interface)} == {"one", "two"}
+        assert set(await store.keys()) == {"one", "two"}
+
+
+# --- together with others -------------------------------------------------
+
+CLIENTS, CHANGES = (
+    int(os.environ.get(f"REEM_TEST_{what}", usual)) for what, usual in (("CLIENTS", "4"), ("CHANGES", "60"))
+)
+
+
+def test_no_change_is_lost_and_no_array_left_behind(server, raw):
+    """Clients of both fronts, each with an interface of its own, all below the top of one document."""
+    with contextlib.closing(reem.RedisInterface(server)) as interface:
+        reem.KeyValueStore(interface)["shared"] = {"sum": 0, "of": {}, "list": []}
+
+    def blocking(number):
+        with contextlib.closing(reem.RedisInterface(server, timeout=60)) as interface:
+            shared = reem.KeyValueStore(interface)["shared"]
+            for step in range(CHANGES):
+                shared["sum"] += 1
+                shared["of"][f"c{number}"] = np.full(4, step) if step % 3 == 0 else step
+                shared["list"].append([number, step])
+
+    def on_a_loop(number):
+        async def run():
+            async with reem_async.RedisInterface(server, timeout=60) as interface:
+                shared = reem_async.KeyValueStore(interface)["shared"]
+                for step in range(CHANGES):
+                    await asyncio.gather(
+                        shared["sum"].increment(1),
+                        shared["of"][f"c{number}"].write(np.full(4, step) if step % 3 == 0 else step),
+                        shared["list"].append([number, step]),
+                    )
+
+        asyncio.run(run())
+
+    both = [blocking, on_a_loop]
+    run_all([lambda number=number: both[number % 2](number) for number in range(CLIENTS)])
+    value = orjson.loads(text_of(raw, "shared"))
+    assert value["sum"] == CLIENTS * CHANGES
+    for number in range(CLIENTS):
+        assert sorted(step for who, step in value["list"] if who == number) == list(range(CHANGES))
+    check_no_orphans(raw, "shared")
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_a_broken_connection_leaves_a_change_done_once_or_not_at_all(server, raw, name):
+    """Connections are killed all the while; whoever was told that his call was lost has changed it at most once."""
+    with contextlib.closing(FRONTS[name](server.url)) as front:
+        front.write(["torn"], {"n": {str(number): 0 for number in range(CLIENTS)}, "a": {}})
+    done, lost, over = [0] * CLIENTS, [0] * CLIENTS, threading.Event()
+    ready = threading.Barrier(CLIENTS + 1)
+
+    def change(number):
+        with contextlib.closing(FRONTS[name](server.url)) as front:
+            ready.wait(30)
+            for step in range(CHANGES):
+                try:
+                    front.write(["torn", "a", str(number)], np.full(3, step))
+                    front.increment(["torn", "n", str(number)], 1)
+                    done[number] += 1
+                except reem.ConnectionLost:
+                    lost[number] += 1
+                except (reem.NotConnected, reem.PartialWrite):  # nothing, or the array alone, was applied
+                    continue
+
+    def kill():
+        ready.wait(30)
+        while not over.wait(0.01):
+            raw.client_kill_filter(_type="normal", skipme=True)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        run_all([lambda number=number: change(number) for number in range(CLIENTS)])
+    finally:
+        over.set()
+        killer.join()
+    with contextlib.closing(FRONTS[name](server.url)) as front:
+        for number in range(CLIENTS):
+            counted = front.read(["torn", "n", str(number)])
+            assert done[number] <= counted <= done[number] + lost[number]
+            front.write(["torn", "a", str(number)], np.zeros(2))
+        assert sum(lost) > 0
+    check_no_orphans(raw, "torn")
+
+
+def run_all(works):
+    """Run all at the same time; raises what any raised."""
+    failed = []
+
+    def guarded(work):
+        try:
+            work()
+        except BaseException as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=guarded, args=(work,)) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(1200)
+    if failed:
+        raise failed[0]
+
+
+async def test_a_cancelled_change_is_done_once_or_not_at_all(server):
+    """Cancelled after any number of steps of the event loop; the next change finds nothing watched, nor half done."""
+    async with reem_async.RedisInterface(server) as interface:
+        it = reem_async.KeyValueStore(interface)["given_up"]
+        await it.write({"n": 0, "a": None})
+        for steps in range(40):
+            before = (await it["n"].read(), await it["a"].read())
+            task = asyncio.create_task(it.update({"n": steps + 1, "a": np.full(3, steps)}))
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+            after = await it.read()
+            assert after["n"] in (before[0], steps + 1)
+            assert_same(after["a"], np.full(3, steps) if after["n"] == steps + 1 else before[1])
+
+
+def test_an_edit_of_what_has_changed_is_a_conflict(open_front):
+    one, other = open_front(), open_front()
+    one.write(["edited"], {"a": {"x": 1}})
+    if isinstance(one, FRONTS["blocking"]):
+
+        def edit():
+            with one.at(["edited", "a"]) as value:
+                other.write(["edited", "a", "x"], 2)
+                value["y"] = 1
+
+    else:
+
+        async def edit_on_a_loop():
+            async with one.at(["edited", "a"]).edit() as value:
+                await one.at(["edited", "a", "x"]).write(2)
+                value["y"] = 1
+
+        def edit():
+            one.run(edit_on_a_loop())
+
+    with pytest.raises(reem.Conflict):
+        edit()
+    assert one.read(["edited"]) == {"a": {"x": 2}}
+
+
+async def test_updates_come_whole_and_in_order(server):
+    async with reem_async.RedisInterface(server) as interface:
+        space = reem_async.PublishSpace(interface)
+        await space["told"].write({"n": 0})
+        seen = []
+        async with reem_async.CallbackSubscriber("told", interface, lambda data, updated_path: seen.append(data)):
+            for number in range(1, 30):
+                await space["told"]["n"].write(number)
+                await space["told"]["image"].write(np.full(3, number))
+            await asyncio.to_thread(eventually, lambda: seen and _is_last(seen[-1]))
+        numbers = [data["n"] for data in seen]
+        assert numbers == sorted(numbers)
+
+
+def _is_last(data):
+    return data["n"] == 29 and "image" in data and data["image"][0] == 29
+
+
+# --- a cluster, and servers of the other kind -------------------------------------------------
+
+
+def test_a_cluster_without_the_module():
+    with EmbeddedCluster(replicas=0, json=False) as cluster, contextlib.closing(reem.RedisInterface(cluster)) as at:
+        assert not cluster.json
+        store, space = reem.KeyValueStore(at), reem.PublishSpace(at)
+        for name in ("a", "b", "c", "d"):
+            store[name] = {"n": 1, "image": np.arange(5)}
+            mirror = reem.SilentSubscriber(name, at)
+            mirror.listen()
+            space[name]["more"] = {"deep": np.ones(2)}
+            space[name]["n"] = 2
+            eventually(lambda mirror=mirror: mirror.value()["n"] == 2)
+            assert_same(store[name].read(), {"n": 2, "image": np.arange(5), "more": {"deep": np.ones(2)}})
+            assert_same(mirror.value(), store[name].read())
+        assert set(store.keys()) == {"a", "b", "c", "d"}
+
+
+@with_module
+@pytest.mark.skipif(PLAIN, reason="the clients of such a run were taught what a document is")
+async def test_the_plain_client_says_what_to_use_in_place_of_json_commands(server):
+    """Those of both fronts, and by rejson's names; the error is a ResponseError, as old programs expect."""
+    with reem.RedisInterface(server) as interface:
+        reem.KeyValueStore(interface)["foo"] = {"n": 1}
+        client = interface.client
+        for call in (
+            lambda: client.json().get("foo"),
+            lambda: client.jsonset("foo", ".n", 2),
+            lambda: client.execute_command("json.del", "foo"),
+        ):
+            with pytest.raises(reem.NoJsonSupport, match="KeyValueStore") as caught:
+                call()
+            assert isinstance(caught.value, redis.ResponseError)
+        with pytest.raises(redis.ResponseError, match="unknown command 'NONSENSE'"):
+            client.execute_command("NONSENSE")
+        assert client.get("foo") == ' {"n":1}'
+        with pytest.raises(redis.ResponseError, match="unknown command"):
+            client.pipeline().json().get("foo", "$").execute()
+    async with reem_async.RedisInterface(server) as interface:
+        with pytest.raises(reem.NoJsonSupport, match="KeyValueStore"):
+            await interface.client.json().get("foo")
+        assert orjson.loads(await interface.client.get("foo")) == {"n": 1}
+
+
+def test_a_server_with_the_module_is_asked_nothing_more(with_json):
+    with redis.Redis(unix_socket_path=with_json.socket_path) as raw:
+
+        def work():
+            with contextlib.closing(reem.RedisInterface(with_json)) as interface:
+                store = reem.KeyValueStore(interface)
+                store["as_ever"] = {"a": 1}
+                store["as_ever"]["a"] = 2
+                assert store["as_ever"].read() == {"a": 2}
+
+        done = called(raw, work)
+    assert "watch" not in done
+    assert "get" not in done
+    assert done["json.get"] == 1
+
+
+@with_module
+def test_documents_move_to_a_server_with_json_and_back(server, with_json, tmp_path):
+    """Through a portable snapshot, to the last bit."""
+    value = {"f": [0.1, 1 / 3, 2.1046907004965418e-207, 1e300], "i": 2**64 - 1, "a": np.arange(4.0), "s": "\u00e9\0"}
+    with (
+        contextlib.closing(reem.RedisInterface(server, namespace="moved:")) as one,
+        contextlib.closing(reem.RedisInterface(with_json, namespace="moved:")) as other,
+    ):
+        reem.KeyValueStore(one)["it"] = value
+        reem.snapshots.save(one, tmp_path / "one.zip")
+        reem.snapshots.restore(other, tmp_path / "one.zip")
+        assert_same(reem.KeyValueStore(other)["it"].read(), value)
+        del reem.KeyValueStore(one)["it"]
+        reem.snapshots.save(other, tmp_path / "other.zip")
+        reem.snapshots.restore(one, tmp_path / "other.zip")
+        assert_same(reem.KeyValueStore(one)["it"].read(), value)
+
+
+@with_module
+def test_text_on_a_server_with_json_is_refused_with_the_command_that_converts_it(server, with_json):
+    """An RDB file of a plain server, loaded by one with the module, looks so."""
+    value = {"f": [0.1, 1 / 3, 2.1046907004965418e-207], "a": np.arange(4.0)}
+    with (
+        contextlib.closing(reem.RedisInterface(server)) as one,
+        contextlib.closing(reem.RedisInterface(with_json)) as other,
+        redis.Redis(unix_socket_path=server.socket_path) as source,
+        redis.Redis(unix_socket_path=with_json.socket_path) as target,
+    ):
+        reem.KeyValueStore(one)["carried"] = value
+        for key in ("carried", *source.scan_iter("{carried}*")):
+            target.restore(key, 0, source.dump(key))
+        target.set("stranger", "5")
+        store = reem.KeyValueStore(other)
+        for call in (
+            store["carried"].read,
+            lambda: store.set("carried", 1),
+            lambda: store.set("carried.b", 1),
+        ):
+            with pytest.raises(reem.WrongKind, match="reem migrate --yes"):
+                call()
+        assert [key.name for key in reem.migration.migrate(other, dry_run=True).keys] == ["carried"]
+        told = []
+        (done,) = reem.migration.migrate(other, progress=lambda *how: told.append(how)).keys
+        assert told == [(0, 1), (1, 1)]
+        assert (done.name, done.was_text, done.problem) == ("carried", True, "")
+        assert target.get("stranger") == b"5"
+        assert_same(store["carried"].read(), value)
+        assert reem.migration.migrate(other).keys == ()
+        assert reem.migration.migrate(one).keys == ()
+
+
+# --- the translation, without a server -------------------------------------------------
+
+
+def test_a_refused_transaction_says_why_at_its_command():
+    """As a server that is out of memory, or a replica, refuses it."""
+    known = Known()
+    batch = [("MULTI",), ("JSON.SET", "k", '$["a"]', b"1"), ("SMEMBERS", "{k}:ships"), ("EXEC",)]
+    steps = translated(batch, known, error_of)
+    assert next(steps) == [("WATCH", b"k"), ("GET", b"k")]
+    sent = steps.send([b"OK", b' {"a":0}'])
+    assert [command[0] for command in sent] == ["MULTI", "SET", "SMEMBERS", "EXEC"]
+    oom, aborted = error_of("OOM command not allowed"), error_of("EXECABORT Transaction discarded")
+    with pytest.raises(StopIteration) as end:
+        steps.send([b"OK", oom, b"QUEUED", aborted])
+    assert end.value.value == [b"OK", oom, b"QUEUED", aborted]
+
+
+def test_a_look_that_is_redirected_is_an_answer_of_the_node():
+    """A cluster's transport follows it: nothing was applied."""
+    moved = error_of("MOVED 5 127.0.0.1:7001")
+    steps = translated([("JSON.DEL", "k", '$["a"]')], Known(), error_of)
+    next(steps)
+    assert steps.send([moved, moved]) == [("UNWATCH",)]
+    with pytest.raises(StopIteration) as end:
+        steps.send([b"OK"])
+    assert end.value.value == [moved]
+
+
+def test_what_others_have_changed_meanwhile_is_tried_again():
+    steps = translated([("JSON.NUMINCRBY", "k", '$["a"]', b"1")], Known(), error_of)
+    next(steps)
+    steps.send([b"OK", b' {"a":0}'])
+    with pytest.raises(StopIteration) as end:
+        steps.send([b"OK", b"QUEUED", None])
+    assert end.value.value is None
+
+
+def test_a_large_array_gets_through_beside_a_busy_writer(server, raw):
+    """It is sent ahead, or the other one would be first each time."""
+    with contextlib.closing(reem.RedisInterface(server)) as one, contextlib.closing(reem.RedisInterface(server)) as two:
+        mine, theirs = reem.KeyValueStore(one)["busy"], reem.KeyValueStore(two)["busy"]
+        reem.KeyValueStore(one)["busy"] = {"n": 0}
+        over, count = threading.Event(), 0
+
+        def write():
+            nonlocal count
+            while not over.is_set():
+                theirs["n"] = count
+                count += 1
+
+        busy = threading.Thread(target=write)
+        busy.start()
+        try:
+            for number in range(5):
+                mine["image"] = np.full(1 << 20, number)
+        finally:
+            over.set()
+            busy.join()
+        value = mine.read()
+        assert value["n"] == count - 1
+        assert_same(value["image"], np.full(1 << 20, 4))
+    check_no_orphans(raw, "busy")
+
+
+def test_a_large_text_is_written_though_somebody_was_first(server, raw, monkeypatch):
+    """It is not sent ahead: there is no key of its own for it to go to."""
+    attempt, firsts = HeldText.attempt, []
+
+    async def overtaken(held, keys, commands, bulk):
+        if not firsts:
+            firsts.append(commands)
+            return None
+        return await attempt(held, keys, commands, bulk)
+
+    with contextlib.closing(reem.RedisInterface(server)) as interface:
+        reem.KeyValueStore(interface)["text"] = {"n": 0}
+        monkeypatch.setattr(HeldText, "attempt", overtaken)
+        reem.PublishSpace(interface)["text"]["long"] = "x" * 100_000
+        monkeypatch.undo()
+        assert reem.KeyValueStore(interface)["text"].read() == {"n": 0, "long": "x" * 100_000}
+    assert len(firsts) == 1
+
+
+def test_what_somebody_nested_too_deep_is_refused_and_breaks_no_connection(server, raw):
+    """Followers, whose reads go over the connection of all, are told as of any value that cannot be read."""
+    raw.set("deep", ' {"a":' + "[" * 300 + "]" * 300 + "}")
+    with contextlib.closing(reem.RedisInterface(server)) as interface:
+        kvs, states = reem.KeyValueStore(interface), []
+        interface.on_state(states.append)
+        kvs["beside"] = 1
+        with reem.SilentSubscriber("beside", interface) as beside:
+            for call in (lambda: kvs["deep"]["a"].read(), lambda: kvs["deep"]["b"].write(1)):
+                with pytest.raises(redis.ResponseError, match="nested over"):
+                    call()
+            with contextlib.suppress(redis.ResponseError, reem.ReemError), reem.SilentSubscriber("deep.a", interface):
+                pass
+            reem.PublishSpace(interface)["beside"] = 2
+            eventually(lambda: beside.value() == 2)
+        assert [each for each in states if "lost" in str(each)] == []
+
+
+def test_whether_there_must_be_a_look_is_decided_once():
+    """What is known of a key is known for some seconds: the second answer could be another."""
+    known = Known()
+    known.saw(b"k", True)
+    commands = [("MULTI",), ("JSON.SET", "k", "$", b"1"), ("PUBLISH", "c", b"x"), ("EXEC",)]
+    assert looked_at(commands, known) == []
+    known.saw(b"k", False)  # or its time is over
+    assert [command[0] for command in next(directly(commands, known, error_of))] == ["MULTI", "SET", "PUBLISH", "EXEC"]
+
+
+def test_what_is_sent_ahead_is_put_in_place(server, raw, monkeypatch):
+    """Somebody else is first once, for certain."""
+    attempt, firsts = HeldText.attempt, []
+
+    async def late(self, *batch):
+        if not firsts:
+            firsts.append(batch)
+            return None
+        return await attempt(self, *batch)
+
+    with contextlib.closing(reem.RedisInterface(server)) as interface:
+        store = reem.KeyValueStore(interface)
+        store["ahead"] = {"n": 0}
+        monkeypatch.setattr(HeldText, "attempt", late)
+        store["ahead"]["image"] = np.arange(1 << 15)
+        assert firsts
+        assert_same(store["ahead"].read(), {"n": 0, "image": np.arange(1 << 15)})
+        assert not list(raw.scan_iter("*:staged:*"))
+    check_no_orphans(raw, "ahead")
+
+
+def test_a_question_about_the_commands_of_the_server_is_asked():
+    """`reem doctor` asks it beside others: a server without JSON calls it unknown."""
+    batch = [("TYPE", "k"), ("JSON.GET",)]
+    assert next(translated(batch, Known(), error_of)) == [("TYPE", "k"), ("GETRANGE", b"k", "0", "0"), ("JSON.GET",)]
+
+
+def test_a_user_without_multi_is_told_that_it_was_done():
+    """The server carries out what was to be in the transaction, one by one."""
+    steps = translated([("JSON.DEL", "k", '$["a"]'), ("SMEMBERS", "{k}:ships")], Known(), error_of)
+    next(steps)
+    steps.send([b"OK", b' {"a":0}'])
+    denied, without = error_of("NOPERM User x has no permissions to run the 'multi' command"), error_of("ERR EXEC")
+    with pytest.raises(StopIteration) as end:
+        steps.send([denied, b"OK", without, []])
+    told, looked = end.value.value
+    assert isinstance(told, reem.PartialWrite)
+    assert looked == []

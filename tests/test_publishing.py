@@ -1,0 +1,101 @@
+"""Publishing: a change and its notice in one transaction, numbered in the order of the calls."""
+
+from __future__ import annotations
+
+import copy
+import operator
+
+import numpy as np
+import pytest
+
+import reem_async
+from reem_async.concurrency.queues import Every
+from reem_async.errors import MissingKey, PathRefused
+from reem_async.plan.arithmetic import calculate, compute
+from reem_async.plan.changes import EncodedAttachment
+from reem_async.plan.keys import keys_of
+from reem_async.plan.reads import read
+from reem_async.plan.shapes import ShapeCache
+from reem_async.plan.together import together
+from reem_async.plan.writes import append_change, change, delete_change, set_change, takes
+from reem_async.ships.registry import Ships, default_ships
+from reem_async.store.publish import UpdateNotifier
+from reem_async.transport.recorder import CommandRecorder
+
+KEYS = keys_of("a", "", 0, False)
+IMAGE = (EncodedAttachment(".x.image", "numpy", (("SET", "{a}.x.image", b"1"),), (b"1",)),)
+
+
+def full_cache():
+    """What an interface knows that has worked with a document for a while."""
+    cache = ShapeCache()
+    cache.saw_members("a", frozenset([b".x.image", b".y"]))
+    cache.saw_number("a", ("n",), 5)
+    cache.saw_shape("a", ("x",), frozenset([".x.image"]))
+    cache.saw_new("a")
+    return cache
+
+
+WRITES = {
+    "set": lambda telling, cache: change(set_change(KEYS, ("x",), b"1", IMAGE, notices=telling), cache),
+    "set in a list": lambda telling, cache: change(set_change(KEYS, ("l", -1), b"1", (), notices=telling), cache),
+    "delete": lambda telling, cache: change(delete_change(KEYS, (), notices=telling), cache),
+    "append": lambda telling, cache: change(append_change(KEYS, ("l",), [b"1"], IMAGE, notices=telling), cache),
+    "update": lambda telling, cache: together([set_change(KEYS, ("y",), b"1", (), notices=telling)], cache),
+    "increment": lambda telling, cache: calculate(
+        KEYS, ("n",), "JSON.NUMINCRBY", operator.add, 1, b"1", telling, cache
+    ),
+    "divide": lambda telling, cache: compute(KEYS, ("n",), abs, telling, cache),
+    "look for the place": lambda _, cache: takes(KEYS, ("x",), IMAGE, cache),
+    "read": lambda _, cache: read(KEYS, ("x",), Ships(default_ships(), CommandRecorder), cache),
+}
+
+
+@pytest.mark.parametrize("kind", WRITES)
+@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
+async def test_plans_change_nothing_while_they_are_built(known, kind):
+    """Neither what is known of documents nor a publisher's numbers: a plan may be built and never sent."""
+    session = reem_async.RedisInterface("127.0.0.1").session  # never connected
+    cache = full_cache() if known else ShapeCache()
+    turn = UpdateNotifier(session, KEYS).turn
+    for telling in (turn().with_value(b"1", IMAGE), turn().without_value(), turn().without_value(deleted=True)):
+        before = copy.deepcopy(vars(cache)), copy.deepcopy(session._numbers._last)
+        plan = WRITES[kind](telling, cache)
+        assert plan is None or plan.commands
+        assert (vars(cache), session._numbers._last) == before
+
+
+@pytest.mark.parametrize(
+    ("refused", "error"),
+    [
+        (lambda place: place["l"][-1].write(1), PathRefused),
+        (lambda place: place["l"][-1].delete(), MissingKey),
+        (lambda place: place["n"].divide(2), MissingKey),
+        (lambda place: place["no"]["image"].write(np.zeros(3)), PathRefused),
+    ],
+    ids=["write", "delete", "divide", "array"],
+)
+async def test_what_is_refused_before_it_is_sent_uses_no_number(apspace, akvs, ainterface, key, refused, error):
+    """A number that no update has would be a gap for subscribers, who would read the whole key anew."""
+    await apspace[key()].write({"l": []})
+    async with akvs[key()].watch(Every(10)) as watch:
+        await anext(watch)
+        with pytest.raises(error):
+            await refused(apspace[key()])
+        await apspace[key()]["n"].write(1)
+        update = await anext(watch)
+        assert (update.path, update.sequence, update.gap, update.missed) == (f"{key()}.n", 2, False, 0)
+
+
+@pytest.mark.parametrize("told", [True, False], ids=["published", "stored"])
+async def test_a_small_change_is_over_when_its_replies_are_read(apspace, akvs, key, told):
+    """What a look at the registry finds is still seen to: here an array that another program put there."""
+    space = apspace if told else akvs
+    await space[key()].write({"a": 1})
+    async with reem_async.RedisInterface(space.interface._given[0]) as other:
+        await reem_async.KeyValueStore(other)[key()]["a"].write(np.arange(3))
+    await space[key()]["a"].write(2)
+    assert await akvs[key()].read() == {"a": 2}
+    keys = space.interface.session.keys(key())
+    replies = await space.interface.session.transport.roundtrip([("SMEMBERS", keys.registry)])
+    assert list(replies[0]) == []

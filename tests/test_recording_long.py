@@ -1,0 +1,145 @@
+"""Long recordings of many keys: what is asked of one does not read all of it."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from reem_async.tools.recording import open_log
+from reem_async.tools.recording.container import Container
+from reem_async.tools.recording.layout import to_json
+from reem_async.tools.recording.roles import Kind, Role
+from reem_async.tools.recording.sink import TOTALS, Sink
+
+KEYS, CHUNKS = 20, 400
+START, STEP = 1_700_000_000_000_000_000, 250_000_000
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """An update of each key in each chunk, two of the first; and a key that is in one chunk only."""
+    file = tmp_path_factory.mktemp("long") / "run.mcap"
+    sink = Sink(file, "zstd", {}, overwrite=False)
+    for chunk in range(CHUNKS):
+        now = START + chunk * STEP
+        for key in [*range(KEYS), 0]:
+            now += 1000
+            sink.json((f"k{key}",), Role.UPDATE, Kind.PUBLISHED, to_json({"n": chunk}), (now, now, chunk + 1))
+        if chunk == 100:
+            sink.json(("rare",), Role.UPDATE, Kind.PUBLISHED, to_json({"n": chunk}), (now + 1, now, 1))
+        sink.tick(now=True)
+    sink.finish({})
+    return file
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """The numbers of the chunks of which the index was read."""
+    numbers, read = [], Container._read_index
+
+    def noted(self, info):
+        numbers.append(info.number)
+        return read(self, info)
+
+    monkeypatch.setattr(Container, "_read_index", noted)
+    return numbers
+
+
+def test_the_totals_of_channels_are_not_counted_but_read(file, reads, tmp_path):
+    """For 100 keys and 18 minutes to be counted channel by channel took minutes."""
+    with open_log(file) as log:
+        said = log.channels()
+        assert reads == []
+        by_path = {each.path: each for each in said}
+        assert (by_path["k0"].messages, by_path["k7"].messages, by_path["rare"].messages) == (2 * CHUNKS, CHUNKS, 1)
+    killed = tmp_path / "killed.mcap"  # nobody could write the totals
+    data = file.read_bytes()
+    killed.write_bytes(data[: data.index(b"reem.totals") - 13])
+    done = []
+    with open_log(killed, progress=lambda *it: done.append(it)) as log:
+        assert not log.indexed
+        size = killed.stat().st_size
+        assert done == sorted(done)
+        assert done[-1][1] == size
+        chunks = []
+        counted = log.channels(lambda *it: chunks.append(it))
+        assert chunks == [(number + 1, CHUNKS) for number in range(CHUNKS)]
+    assert sorted(reads) == list(range(CHUNKS)), "each index is read once, whatever the number of channels"
+    assert [each.messages for each in counted] == [each.messages for each in said]
+    assert [(each.first, each.last) for each in counted] == [(each.first, each.last) for each in said]
+    exact = {each.path: each.bytes for each in said}
+    assert all(each.bytes - exact[each.path] in range(5000) for each in counted), "schemas count with what is before"
+
+
+def test_an_instant_takes_the_index_of_its_own_chunk(file, reads):
+    with open_log(file) as log:
+        at = log.start + 200 * STEP / 1e9
+        assert log["k3"]["n"].at(at + 0.1) == 200
+        assert set(reads) == {200}
+        assert log["k5"]["n"].at(at - 0.1) == 199
+        assert set(reads) == {199, 200}
+        assert log["rare"]["n"].at(log.end) == 100
+        assert {name: tree["n"] for name, tree in log.tree_at(at + 0.1).items()} == {
+            **{f"k{key}": 200 for key in range(KEYS)},
+            "rare": 100,
+        }
+        assert set(reads) <= {100, 199, 200, CHUNKS - 1}
+        reads.clear()
+        assert [update.value for update in log.updates(patterns=["rare"])] == [{"n": 100}]
+        assert set(reads) <= {100}
+        assert next(log.updates(at)).value == {"n": 200}
+        assert set(reads) <= {200, 201}
+        whole = log.changes(log.start, log.end)
+        assert whole == {("rare",), *[(f"k{key}",) for key in range(KEYS)]}
+        assert set(reads) <= {0, 200, 201}
+
+
+def test_what_the_index_says_is_what_there_is(file):
+    with open_log(file) as log:
+        assert len(log.news_times(("k0",))) == log.news_count(("k0",), log.start - 1, log.end) == 2 * CHUNKS
+        assert len(log.news_times(())) == (KEYS + 1) * CHUNKS + 1
+        assert (np.diff(log.news_times(())) >= 0).all()
+        assert log.last_news(("rare",), log.end) == pytest.approx(log.start + 100 * STEP / 1e9, abs=0.01)
+        assert log.last_news(("rare",), log.start) is None
+        times, values = log["k0"]["n"].history()
+        assert values.tolist() == [chunk for chunk in range(CHUNKS) for _ in range(2)]
+        assert len(times) == 2 * CHUNKS
+
+
+def test_cut_short_while_it_is_open_it_raises(file, tmp_path):
+    """Mapped into memory, it would kill the process: the system has no page to give."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(file.read_bytes())
+    with open_log(cut) as log:
+        os.truncate(cut, 3000)
+        for ask in (
+            lambda: log["k3"].at(log.end),
+            lambda: list(log.updates()),
+            log.verify,
+            lambda: log.tree_at(log.end),
+        ):
+            with pytest.raises(OSError, match="cut short while it was being read") as caught:
+                ask()
+            assert caught.value.filename == str(cut)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [5, {"a": 1}, [[1, 2]], [["x", 1, 2, 3, 4]], [[1, -5, 0, 0, 0]], [[1, None, 0, 0, 0]], [[1, 1.5, 0, 0, 0]], [5]],
+    ids=str,
+)
+def test_totals_that_cannot_be_are_counted_anew(tmp_path, rows):
+    """As somebody else's program may write them: their checksum is right."""
+    file = tmp_path / "run.mcap"
+    sink = Sink(file, "none", {}, overwrite=False)
+    for number in range(3):
+        now = START + number * STEP
+        sink.json(("k",), Role.UPDATE, Kind.PUBLISHED, to_json({"n": number}), (now, now, number + 1))
+    sink.tick(now=True)
+    sink._about_channels(TOTALS, rows)
+    sink._writer.finish()
+    sink.close()
+    with open_log(file) as log:
+        assert [(it.path, it.messages, it.last) for it in log.channels()] == [("k", 3, (START + 2 * STEP) / 1e9)]

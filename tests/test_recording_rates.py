@@ -1,0 +1,11 @@
+"""A recording at a robot's rates; `make recording` runs the same for ten minutes."""
+
+from __future__ import annotations
+
+from rates.measure import run
+
+
+def test_at_a_robot_s_rates_all_is_as_published_or_skipped(tmp_path):
+    """Each update in order, each instant as the publishers' own log has it, and played it ends the same."""
+    outcome = run(seed=1, seconds=10.0, instants=500, folder=tmp_path)
+    assert outcome.faults == []

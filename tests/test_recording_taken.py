@@ -1,0 +1,264 @@
+"""Somebody else is at the file of a recording: another recorder, or a program that deletes, replaces or cuts it."""
+
+from __future__ import annotations
+
+import gc
+import os
+import pathlib
+import resource
+import signal
+import socket
+import time
+
+import numpy as np
+import pytest
+from conftest import aeventually, line_of
+from test_cli_record import begins, is_recording, started
+
+import reem.recording
+import reem_async
+from reem_async.errors import BadValue
+from reem_async.recording import Recorder, RecordingFailed, open_log
+from reem_async.tools.partfile import PartFile
+from reem_async.tools.recording.output import Output
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "run.mcap"
+
+
+async def test_what_is_to_be_replaced_stays_until_the_new_one_has_begun(key, apspace, binterface, file):
+    async with Recorder(binterface, [key("*")], file):
+        await apspace[key("arm")].write({"joint": 1})
+    old = file.read_bytes()
+    nobody = reem_async.RedisInterface("redis://127.0.0.1:1")
+    with pytest.raises(reem_async.NotConnected):
+        await Recorder(nobody, path=file, overwrite=True).start()
+    Recorder(binterface, [key("*")], file, overwrite=True)  # never begun
+    gc.collect()
+    assert [each.read_bytes() for each in file.parent.iterdir()] == [old]
+    recorder = Recorder(binterface, [key("*")], file, overwrite=True)
+    assert file.read_bytes() == old
+    async with recorder:
+        assert file.read_bytes() != old
+        await apspace[key("arm")].write({"joint": 2})
+    assert list(file.parent.iterdir()) == [file]
+    with open_log(file) as log:
+        assert log[key("arm.joint")].at(log.end) == 2
+
+
+async def test_a_link_stays_a_link(key, apspace, binterface, file):
+    link = file.with_name("newest.mcap")
+    file.write_bytes(b"old")
+    link.symlink_to(file)
+    async with Recorder(binterface, [key("*")], link, overwrite=True):
+        await apspace[key("arm")].write(1)
+    assert link.is_symlink()
+    with open_log(file) as log:
+        assert log.names() == [key("arm")]
+
+
+def test_a_part_file_leaves_a_link_a_link(tmp_path):
+    """Also one that leads nowhere yet: a snapshot or an export took the place of the link itself."""
+    link = tmp_path / "newest"
+    (tmp_path / "there").mkdir()
+    link.symlink_to(tmp_path / "there" / "file")
+    for content in (b"first", b"second"):
+        part = PartFile(link)
+        assert part.path.parent == tmp_path / "there"
+        part.path.write_bytes(content)
+        part.finish()
+        assert link.is_symlink()
+        assert link.read_bytes() == content
+
+
+async def test_what_is_being_recorded_is_not_replaced(key, apspace, binterface, file):
+    file.write_bytes(b"old")
+    late = Recorder(binterface, [key("*")], file, overwrite=True)  # before the other one has begun
+    async with Recorder(binterface, [key("*")], file, overwrite=True):
+        with pytest.raises(BadValue, match="is being recorded by another recorder"):
+            Recorder(binterface, [key("*")], file, overwrite=True)
+        with pytest.raises(BadValue, match="is being recorded by another recorder"):
+            await late.start()
+        await apspace[key("arm")].write(1)
+    assert list(file.parent.iterdir()) == [file]
+    with open_log(file) as log:
+        assert log[key("arm")].at(log.end) == 1
+    async with Recorder(binterface, [key("*")], file, overwrite=True):
+        pass
+
+
+def append(file):
+    with file.open("ab") as stream:
+        stream.write(b"x")
+
+
+def replace(file):
+    other = file.with_name("other")
+    other.write_bytes(b"somebody else's")
+    other.replace(file)
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (lambda file: os.truncate(file, 100), "cut short"),
+        (append, "written to"),
+        (os.unlink, "deleted or replaced"),
+        (replace, "deleted or replaced"),
+    ],
+    ids=["truncated", "appended", "deleted", "replaced"],
+)
+async def test_a_file_of_somebody_else_s_ends_the_recording(key, apspace, binterface, file, harm, said):
+    recorder = Recorder(binterface, [key("*")], file)
+    await recorder.start()
+    await apspace[key("arm")].write(1)
+    await aeventually(lambda: is_recording(file))
+    harm(file)
+    left = file.read_bytes() if file.exists() else b""
+    await apspace[key("arm")].write(2)
+    with pytest.raises(RecordingFailed, match=said) as caught:
+        await recorder.wait(10)
+    with pytest.raises(RecordingFailed, match=said):
+        await recorder.stop()
+    assert "can be read" not in str(caught.value), "nobody knows that"
+    assert (file.read_bytes() if file.exists() else b"") == left, "nor is it touched"
+
+
+async def test_it_is_noticed_at_the_end_at_the_latest(key, apspace, binterface, file):
+    recorder = Recorder(binterface, [key("*")], file)
+    await recorder.start()
+    file.unlink()
+    with pytest.raises(RecordingFailed, match="deleted"):
+        await recorder.stop()
+
+
+async def test_another_error_has_a_note_of_it(key, binterface, file):
+    async def work():
+        async with Recorder(binterface, [key("*")], file):
+            file.unlink()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        await work()
+    assert "deleted" in caught.value.__notes__[0]
+
+
+def test_another_error_has_a_note_of_it_in_the_blocking_front_too(key, interface, file):
+    def work():
+        with reem.recording.Recorder(interface, [key("*")], file):
+            file.unlink()
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        work()
+    assert "deleted" in caught.value.__notes__[0]
+
+
+def test_the_command_exits_with_1(key, server_url, pspace, file):
+    pspace[key("a")] = 1
+    with started(server_url, file.parent, "record", key("*"), "-o", file) as process:
+        begins(process)
+        file.unlink()
+        process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=20)
+    assert "deleted or replaced" in errors
+    assert process.returncode == 1
+
+
+def test_a_hangup_ends_a_recording_as_ctrl_c_does(key, server_url, pspace, file):
+    """The terminal is closed: nobody reads what is said, but the index is written."""
+    pspace[key("a")] = 1
+    ours, its = os.openpty()
+    with started(server_url, file.parent, "record", key("*"), "-o", file, stdout=its, stderr=its) as process:
+        os.close(its)
+        assert line_of(ours).startswith("recording into ")
+        os.close(ours)
+        for _ in range(3):  # one is of the kernel, another of the shell
+            process.send_signal(signal.SIGHUP)
+            time.sleep(0.02)
+        process.wait(timeout=20)
+    with open_log(file) as log:
+        assert (log.indexed, log[key("a")].at(log.end)) == (True, 1)
+
+
+def test_a_part_file_is_removed_only_if_nobody_has_it(tmp_path):
+    part = PartFile(tmp_path / "a")
+    PartFile(tmp_path / "a").close()
+    assert list(tmp_path.iterdir()) == [part.path]
+    os.write(part.descriptor, b"whole")
+    part.finish()
+    assert [each.read_bytes() for each in tmp_path.iterdir()] == [b"whole"]
+    dropped = PartFile(tmp_path / "b")
+    del dropped
+    assert list(tmp_path.iterdir()) == [tmp_path / "a"]
+
+
+def test_of_two_recorders_that_make_the_same_file_one_is_refused(tmp_path, monkeypatch):
+    file = tmp_path / "run.mcap"
+    with monkeypatch.context() as patched:
+        patched.setattr(type(file), "is_file", lambda self: False)  # as both of them saw it
+        first = Output(file, overwrite=True)
+        first.write(b"first")
+        first.flush()
+        with pytest.raises(BadValue, match="is being recorded by another recorder"):
+            Output(file, overwrite=True)
+    first.write(b" of all")
+    first.flush()
+    first.close()
+    assert file.read_bytes() == b"first of all"
+
+
+def test_two_recorders_may_write_to_a_device():
+    for each in [Output(pathlib.Path(os.devnull), overwrite=True) for _ in range(2)]:
+        each.write(b"x")
+        each.flush()
+        each.close()
+
+
+def test_ctrl_c_before_it_has_begun_is_no_recording(tmp_path):
+    """A server that does not answer keeps the recorder from beginning."""
+    file = tmp_path / "run.mcap"
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"redis://127.0.0.1:{silent.getsockname()[1]}"
+        with started(url, tmp_path, "record", "-o", file, "--url", url) as process:
+            silent.settimeout(30)
+            with silent.accept()[0]:
+                process.send_signal(signal.SIGINT)
+                out, err = process.communicate(timeout=30)
+    assert (process.returncode, out, err) == (130, "", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_who_cannot_begin_says_nothing_of_the_old_recording(tmp_path):
+    file = tmp_path / "run.mcap"
+    file.write_bytes(b"old")
+    with started("redis://127.0.0.1:1", tmp_path, "record", "-o", file, "--force") as process:
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (1, ""), err
+    assert file.read_bytes() == b"old"
+
+
+async def test_what_replaces_a_recording_has_something_in_it(key, apspace, binterface, file):
+    """The old one must not be gone by a `kill -9` before the first data of the new one were written."""
+    file.write_bytes(b"old")
+    await apspace[key("arm")].write({"joint": 1})
+    async with Recorder(binterface, [key("*")], file, overwrite=True):
+        with open_log(file) as log:
+            assert log[key("arm.joint")].at(log.end) == 1
+
+
+def test_what_a_full_disk_cannot_replace_stays(key, pspace, server_url, file):
+    file.write_bytes(b"old")
+    pspace[key("image")] = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8)
+
+    def most():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+
+    with started(server_url, file.parent, "record", key("*"), "-o", file, "--force", preexec_fn=most) as process:
+        out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (1, "")
+    assert "cannot be replaced" in err
+    assert "File too large" in err
+    assert [each.read_bytes() for each in file.parent.iterdir()] == [b"old"]

@@ -1,0 +1,315 @@
+"""Updates told before the server has them, against the model of a server of test_replica.py: no server, no clock."""
+
+from __future__ import annotations
+
+import os
+import random
+from dataclasses import dataclass, field
+
+import pytest
+from test_replica import PATHS, PUBLISHERS, Faults, Made, World, has_bytes, value_at
+
+from reem_async.plan.copies import concerns
+from reem_async.plan.notices import ANNOUNCED, Notice, note_of
+from reem_async.plan.slots import Slot
+from reem_async.plan.trees import MISSING
+from reem_async.pubsub.replica import Read, Skipped, Snapshot, State, Updated
+
+SEEDS = int(os.environ.get("REEM_TEST_SCHEDULES", "60"))
+UPDATES = 12
+
+
+@dataclass
+class Fates:
+    """How often what becomes of an update that was told early, and how they come.
+
+    Attributes:
+        refused: It is not sent after all: its number is the next update's.
+        dies: Its publisher is gone.
+        taken: Its slot was written again before the notice was read: that says nothing but where it was.
+        late: It waits for other things to happen.
+        plain: An update is not told early.
+        publishers: Who publishes.
+        paths: Where.
+    """
+
+    refused: float = 0.0
+    dies: float = 0.0
+    taken: float = 0.0
+    late: float = 0.7
+    plain: float = 0.3
+    publishers: str = PUBLISHERS
+    paths: list = field(default_factory=lambda: PATHS)
+
+
+class EarlyWorld(World):
+    """A world whose publishers tell of updates before they send them."""
+
+    beats = 5  # three until one that is not confirmed is given up
+
+    def __init__(self, seed, path, fates, faults):
+        self.fates, self.pending, self.stamps, self.dead = fates, {}, 0, 0
+        self.early, self.made_of, self.reads = [], {}, []
+        self.begun_with = faults
+        super().__init__(seed, path, faults)
+
+    @property
+    def ends(self):
+        """Whether this is the last phase, in which nothing goes wrong any more."""
+        return self.faults is not self.begun_with
+
+    def step(self):
+        if self.pending and self.rng.random() >= self.fates.late:
+            self.end_one()
+            return True
+        return super().step() or bool(self.pending and self.end_one())
+
+    def publish(self, publisher=None, path=None):
+        rng, fates = self.rng, self.fates
+        publisher = publisher or rng.choice(fates.publishers)
+        path = rng.choice(fates.paths) if path is None else path
+        if publisher in self.pending:  # its calls wait for each other
+            self.end(publisher)
+        if self.ends or rng.random() < fates.plain:
+            self.send(self.prepared(publisher, path, deleted=rng.random() < 0.2 and path != ("z",)))
+            return
+        if rng.random() < fates.dies:
+            self.dead += 1
+            publisher = f"dead {self.dead}"
+        self.stamps += 1
+        slot = Slot("here", 1, 2, 3, self.stamps % 6, self.stamps)
+        self.pending[publisher] = made = self.prepared(publisher, path, deleted=False, slot=slot)
+        if self.up:
+            self.stream.append(("early", made))
+
+    def prepared(self, publisher, path, *, deleted, slot=None):
+        number = self.model.numbers[publisher] + 1
+        large = self.rng.random() < 0.4
+        value = None if deleted else value_at(path, 10 + self.stamps + 1000 * len(self.model.made), large=large)
+        told = None if deleted else ANNOUNCED if slot is None and large and has_bytes(value) else value
+        return Made(Notice(publisher, number, float(self.stamps), path, deleted, told, 0, slot), value, None, False)
+
+    def end_one(self):
+        self.end(self.rng.choice([*self.pending]))
+        return True
+
+    def end(self, publisher):
+        made = self.pending.pop(publisher)
+        if not publisher.startswith("dead") and self.rng.random() >= self.fates.refused:
+            if self.rng.random() < self.fates.taken:
+                made.notice = made.notice._replace(value=ANNOUNCED)
+            self.send(made)
+
+    def send(self, made):
+        """The server gets an update; one that it refuses is told of again, for all to look."""
+        notice, model = made.notice, self.model
+        model.numbers[notice.publisher] = notice.sequence
+        made.refused = not model.change(notice.path, MISSING if notice.deleted else made.value)
+        made.tree = model.tree
+        self.tell_of(made)
+        if made.refused:
+            again = notice._replace(sequence=notice.sequence + 1, value=ANNOUNCED, slot=None, deleted=False)
+            model.numbers[notice.publisher] = again.sequence
+            self.tell_of(Made(again, None, model.tree, True))
+
+    def tell_of(self, made):
+        notice, model = made.notice, self.model
+        model.note = note_of(notice.publisher, notice.sequence).encode()
+        model.made.append(made)
+        model.changes.clear()
+        if self.up:
+            self.stream.append(("notice", made))
+
+    def deliver(self):
+        if self.stream[0][0] != "early":
+            super().deliver()
+            return
+        _, made = self.stream.popleft()
+        if self.rng.random() < self.faults.loses:
+            return
+        for _ in range(2 if self.rng.random() < self.faults.repeats else 1):
+            self.replica.on_early(made.notice._replace(early=True))
+            self.drain()
+
+    def drain(self):
+        before = len(self.events)
+        reads = [output for output in self.replica.outputs if isinstance(output, Read)]
+        super().drain()
+        if reads:
+            self.reads.append(before)
+
+    def live(self, updates):
+        """Publish, deliver and break at random; where nothing is lost all is settled without another update."""
+        while updates:
+            if self.rng.random() < 0.3:
+                self.publish()
+                updates -= 1
+            elif self.rng.random() < 0.05:
+                self.beat()
+            else:
+                self.step()
+        self.rest()
+        if self.faults in (Faults(), Faults(slow=self.faults.slow)):
+            self.check()
+        super().live(0)
+
+    # --- what must be true
+
+    def gaps_after(self, place):
+        return any(isinstance(event, Updated | Snapshot) and event.missed != 0 for event in self.events[place + 1 :])
+
+    def check(self):
+        assert self.replica.state is State.CURRENT
+        assert self.replica.at() == self.followed(self.model.tree)
+        assert not self.replica._early
+        self.check_told_last()
+        sent = {self.name(made.notice) for made in self.model.made}
+        places = {}
+        for place, event in enumerate(self.events):
+            if not isinstance(event, Updated | Skipped):
+                continue
+            name = self.name(event.notice)
+            if event.notice.early and name not in sent:
+                assert self.gaps_after(place), f"{event} was never sent, and no gap says so"
+            if name in places:
+                first = places[name]
+                assert self.events[first].notice.early, f"{event} was told twice"
+                assert any(first < at <= place for at in self.reads), f"{event} was told twice with no read between"
+                assert not event.notice.early
+            places[name] = place
+        for place, event in enumerate(self.events):
+            if isinstance(event, Updated) and event.notice.early and self.is_overtaken(place, event.notice):
+                assert self.gaps_after(place), f"{event} came in another order, and no gap says so"
+
+    def is_overtaken(self, place, early):
+        """Whether the server had another update of the same place between, which was told later."""
+        told = [event.notice for event in self.events[place + 1 :] if isinstance(event, Updated)]
+        names = [self.name(made.notice) for made in self.model.made]
+        own = names.index(self.name(early)) if self.name(early) in names else len(names)
+        return any(
+            (concerns(each, early.path) or concerns(early, each.path))
+            and each.publisher != early.publisher
+            and not each.early
+            and self.name(each) in names[:own]
+            for each in told
+        )
+
+    def check_told_last(self):
+        told = [event.data for event in self.events if isinstance(event, Updated | Snapshot)]
+        if told:
+            assert told[-1] == self.replica.at()
+
+    @staticmethod
+    def name(notice):
+        return notice.publisher, notice.sequence, notice.slot, notice.path
+
+
+FATES = {
+    "confirmed": Fates(),
+    "one publisher": Fates(publishers="p", plain=0.0),
+    "one place": Fates(paths=[("a",)]),
+    "places in each other": Fates(paths=[(), ("a",), ("a", "n"), ("a", "n", "x")]),
+    "places beside each other": Fates(paths=[("a", "b"), ("a", "n"), ("z",)]),
+    "items": Fates(paths=[("l",), ("l", 0), ("l", 1, "x")]),
+    "not sent": Fates(refused=0.3),
+    "dead": Fates(dies=0.3, publishers="pq"),
+    "slots taken": Fates(taken=0.4),
+    "at once": Fates(late=0.0),
+    "everything": Fates(refused=0.2, dies=0.2, taken=0.2),
+}
+FAULTS = {
+    "quiet": Faults(),
+    "slow ships": Faults(slow=0.8),
+    "lost and repeated": Faults(loses=0.2, repeats=0.2),
+    "everything": Faults(loses=0.1, repeats=0.1, garbles=0.1, breaks=0.05, fails=0.1, slow=0.5),
+}
+
+
+@pytest.mark.parametrize("faults", FAULTS)
+@pytest.mark.parametrize("fates", FATES)
+def test_a_copy_that_is_told_early_is_that_of_the_server_whatever_comes_when(fates, faults):
+    """At rest they are equal; what was told wrongly is followed by a gap, and nothing told twice without a read."""
+    for seed in range(SEEDS):
+        for path in [(), ("a",), ("a", "n"), ("l", 0), ("l", -1)]:
+            world = EarlyWorld(seed, path, FATES[fates], FAULTS[faults])
+            try:
+                world.live(world.rng.randint(1, UPDATES))
+                world.check()
+            except AssertionError as error:
+                raise AssertionError(f"seed {seed}, path {path}: {error}") from error
+
+
+def test_alone_every_update_is_told_once_early_and_without_a_gap():
+    for seed in range(SEEDS):
+        world = EarlyWorld(seed, (), Fates(publishers="p", plain=0.0, paths=[(), ("a",), ("z",)]), Faults())
+        world.rest()
+        world.send(world.prepared("p", (), deleted=False))
+        world.rest()
+        world.events.clear()
+        reads = len(world.reads)
+        for _ in range(random.Random(seed).randint(1, UPDATES)):
+            world.publish("p")
+        world.rest()
+        told = [event for event in world.events if isinstance(event, Updated | Skipped | Snapshot)]
+        assert [event.notice.sequence for event in told] == [made.notice.sequence for made in world.model.made][
+            -len(told) :
+        ]
+        assert all(event.notice.early and not event.missed for event in told)
+        assert len(world.reads) == reads
+        world.check()
+
+
+@pytest.fixture
+def world():
+    """One that is current, and in which nothing happens by itself."""
+    world = EarlyWorld(1, (), Fates(), Faults())
+    world.send(world.prepared("p", (), deleted=False))
+    world.rest()
+    world.events.clear()
+    return world
+
+
+def early(world, publisher, path, stamp):
+    made = world.prepared(publisher, path, deleted=False, slot=Slot("here", 1, 2, 3, 0, stamp))
+    world.replica.on_early(made.notice._replace(early=True))
+    world.drain()
+    return made
+
+
+def test_what_is_never_confirmed_is_told_with_a_gap_though_others_go_on(world):
+    early(world, "q", ("a",), 1)
+    for stamp in range(2, 6):
+        world.send(early(world, "p", ("z",), stamp))
+        world.beat()
+        while world.step():
+            pass
+    assert any(isinstance(event, Snapshot) and event.missed is None for event in world.events)
+    assert world.replica.at() == world.model.tree
+
+
+def test_what_is_not_sent_is_told_with_a_gap_though_it_was_read_in_between(world):
+    refused = early(world, "q", ("a",), 1)
+    announced = world.prepared("p", ("z",), deleted=False)
+    announced.notice = announced.notice._replace(value=ANNOUNCED)
+    world.send(announced)
+    while world.step():
+        pass
+    assert world.replica.at() == world.model.tree
+    assert not world.gaps_after(-1)
+    world.send(world.prepared("q", ("l",), deleted=False))  # with the same number
+    while world.step():
+        pass
+    assert world.events[0].notice.publisher == refused.notice.publisher
+    assert world.gaps_after(0)
+
+
+def test_what_comes_early_with_its_value_cannot_be_known_again_and_is_not_told(world):
+    """A stranger's: it would be taken for the update itself, which then would not be told."""
+    made = world.prepared("p", ("a",), deleted=False)
+    world.replica.on_early(made.notice._replace(value="a stranger's", early=True))
+    world.drain()
+    assert not world.events
+    world.send(made)
+    while world.step():
+        pass
+    assert world.replica.at() == world.model.tree
