@@ -497,9 +497,16 @@ class World:
         assert numbers == concerned
         if self.model.stored:
             return
+        trees = [self.followed(made.tree) for made in self.model.made]
+        newest = MISSING  # a tree that was told of, if it was newer than the update
         for event in told:
             place = int(event.notice.time)
-            assert event.data in [self.followed(made.tree) for made in self.model.made[place:]]
+            assert event.data in trees[place:]
+            if isinstance(event, Updated):
+                assert newest is MISSING or event.data in trees[trees.index(newest) :], "no copy after a newer one"
+                if event.notice.path == () and event.notice.value is not ANNOUNCED and newest is MISSING:
+                    assert same(event.data, trees[place]), "what replaces the whole key is told with itself"
+                newest = MISSING if same(event.data, trees[place]) else event.data
             if isinstance(event, Skipped):
                 assert event.notice.value is ANNOUNCED
                 later = [made.notice for made in self.model.made[place + 1 :]]

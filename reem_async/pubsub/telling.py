@@ -19,6 +19,10 @@ from .outputs import Output, Skipped, Snapshot, Stored, Updated
 __all__ = ["Teller", "Told"]
 
 
+_UNKNOWN: Any = object()
+"""A copy of which it is not known what it was."""
+
+
 class Told(Enum):
     """As what the next snapshot is told."""
 
@@ -84,9 +88,8 @@ class Teller:
         """
         told, self.told = self.told, Told.UPDATES
         if told is Told.UPDATES:
-            if stored:
-                before, covered = self._in_turn(before, covered)
-            self._updates(covered, tree)
+            # Where only what is published is followed, the copy may lack what is stored.
+            self._updates(before if stored else _UNKNOWN, covered, tree)
             if stored and self.missed == 0:  # else the snapshot is told of
                 self._stored(self._expected(before, tree, covered), tree)
         elif told is Told.GAP:
@@ -99,48 +102,53 @@ class Teller:
             missed, self.missed = self.missed, 0
             self._outputs.append(Snapshot(data, False, missed))
 
-    def _in_turn(self, before: Any, covered: Sequence[Heard[Notice]]) -> tuple[Any, Sequence[Heard[Notice]]]:
-        """Tell of updates that say all that they wrote as if nothing had been read, each with the tree it led to.
-
-        Returns the last of these trees, and the updates from the first one on that only what was read can tell.
-        """
-        for place, heard in enumerate(covered):
-            notice = heard.update
-            if notice is None or heard.missed != 0 or not heard.follows:
-                return before, covered[place:]
-            if not concerns(notice, self._path):
-                continue
-            if not is_whole(notice, self._path, before):
-                return before, covered[place:]
-            try:
-                after = applied(before, notice, self._path)
-            except CannotApply:
-                return before, covered[place:]
-            if not self._rest or get(after, self._rest) is not get(before, self._rest):
-                self.update(notice, after)
-            before = after
-        return before, ()
-
-    def _updates(self, covered: Sequence[Heard[Notice]], tree: Any) -> None:
+    def _updates(self, before: Any, covered: Sequence[Heard[Notice]], tree: Any) -> None:
         """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
 
         `plan/overtaken.py` says which. What came with its value has that, whatever came later. What was lost may
-        have changed any of those announced before.
+        have changed any of those announced before. Each is told with the copy that it led to, as long as that is known;
+        from the first one on of which it is not, with the snapshot: no copy is told after a newer one.
         """
         notices = [each.update if each.update and concerns(each.update, self._path) else None for each in covered]
         newest = {notice.path: notice for notice in notices if notice is not None}
         # The place of the last loss: an update that was announced before it may have been changed by what was lost.
         loss = max([place for place, each in enumerate(covered) if each.missed != 0], default=-1)
+        copy, snapshot_told = before, False
         for place, (heard, notice) in enumerate(zip(covered, notices, strict=True)):
             self.miss([heard])
+            last, copy = copy, self._led_to(copy, heard)
             if notice is None:
                 continue
-            if notice.deleted or notice.value is not ANNOUNCED:
+            if copy is not _UNKNOWN and not snapshot_told:
+                if not self._rest or last is _UNKNOWN or get(copy, self._rest) is not get(last, self._rest):
+                    self.update(notice, copy)
+            elif notice.deleted or notice.value is not ANNOUNCED:
+                snapshot_told = True
                 self.update(notice, tree, self._written(notice))
             elif place >= loss and is_own(notice.path, [later for later in notices[place + 1 :] if later is not None]):
+                snapshot_told = True
                 self.update(notice, tree)
             else:
                 self._outputs.append(Skipped(notice, get(tree, self._rest), newest[notice.path] is notice))
+
+    def _led_to(self, copy: Any, heard: Heard[Notice]) -> Any:
+        """Return the copy after an update, given the one before; _UNKNOWN if only what was read can tell."""
+        notice = heard.update
+        if notice is None or not heard.follows:
+            return _UNKNOWN
+        before = _UNKNOWN if heard.missed != 0 else copy
+        if not concerns(notice, self._path):
+            return before
+        if before is _UNKNOWN:
+            if len(notice.path) > len(self._path):
+                return _UNKNOWN
+            before = MISSING  # all of it is replaced
+        if not is_whole(notice, self._path, before):
+            return _UNKNOWN
+        try:
+            return applied(before, notice, self._path)
+        except CannotApply:
+            return _UNKNOWN
 
     def _written(self, notice: Notice) -> Any:
         """Return what an update wrote, as far as it is below what is followed; MISSING if the copy says so."""
