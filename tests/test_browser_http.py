@@ -242,6 +242,8 @@ def test_search_finds_keys_and_what_is_below(ask, robot, key):
         f"{robot}.nested[1]",
         f"{robot}.nested[1].a",
     ]
+    found = [row["address"] for row in ask.json("search", q=f"{robot}.nested[1]")["found"]]
+    assert found == [f"{robot}.nested[1]", f"{robot}.nested[1].a"]
     assert ask.json("search", q="no such thing")["found"] == []
     assert ask.json("search", q="")["found"] == []
 

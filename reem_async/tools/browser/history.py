@@ -267,13 +267,15 @@ class History:
         earlier = [when for when in times if when < at - 1e-6]
         return earlier[-1] if earlier else None
 
-    def matching(self, needle: str, at: float) -> Iterator[tuple[str, Any]]:
-        """Yield the keys, and what they held, that may have `needle` in the name of something below."""
-        needle_bytes = needle.encode()
+    def matching(self, words: Iterable[str], at: float) -> Iterator[tuple[str, Any]]:
+        """Yield the keys, and what they held, that may have all of these words in their name or in names below it."""
+        needed = [word.encode() for word in words]
         for name, line in list(self._lines.items()):
-            # The text of a document is searched before it is parsed: most do not have the word.
-            if not line.changes and line.text is not None and needle_bytes not in line.text.lower():
-                continue
+            # The text of a document is searched before it is parsed: most do not have the words.
+            if not line.changes and line.text is not None:
+                text = name.encode().lower() + b" " + line.text.lower()
+                if not all(word in text for word in needed):
+                    continue
             tree = line.state(at)
             if tree is not UNKNOWN and tree is not MISSING:
                 yield name, tree

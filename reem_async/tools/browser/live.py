@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -282,9 +283,8 @@ class LiveSource:
         """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""
         needle = text.lower()
         found: dict[Path, None] = {(name,): None for name in self._names(at) if needle in address((name,)).lower()}
-        last = needle.replace("[", ".").replace('"', "").split(".")[-1]
         walked = 0
-        for name, tree in self.history.matching(last, time.time() if at is None else at):
+        for name, tree in self.history.matching(_words(needle), time.time() if at is None else at):
             for path, _ in walk(tree, (name,)):
                 walked += 1
                 if len(found) >= most or walked > _WALKED:
@@ -292,3 +292,10 @@ class LiveSource:
                 if len(path) > 1 and needle in address(path).lower():
                     found[path] = None
         return list(found)[:most]
+
+
+def _words(needle: str) -> list[str]:
+    """Return the words that the names in a path must have for `needle` to be in it: no indices, nothing escaped."""
+    if "\\" in needle:
+        return []
+    return [word for word in re.findall("[a-z0-9_]+", needle) if not word.isdigit()]
