@@ -40,7 +40,7 @@ ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", "2000"))
 """How many documents (and a fifth of it, arrays) the property tests try; the full promise is 100000."""
 
-PATIENCE = 10.0
+PATIENCE = 30.0
 """Seconds after which something that must happen is given up on."""
 
 

@@ -85,7 +85,7 @@ def test_a_slow_callback_holds_up_nobody_else(interface, kvs, pspace, key):
         began = time.monotonic()
         eventually(lambda: mirror.value() == 49)
         assert kvs[key()].read() == 49
-        assert time.monotonic() - began < PATIENCE / 2
+        assert time.monotonic() - began < 5
         release.set()
         eventually(lambda: seen and seen[-1] == 49)
         assert seen == sorted(seen)

@@ -26,7 +26,7 @@ from reem_async.transport.options import Options
 from reem_async.transport.packing import Packer
 
 SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**6))
-PATIENCE = 10.0
+PATIENCE = 30.0
 
 
 def elsewhere(work):
