@@ -308,10 +308,33 @@ def test_without_the_extra(missing):
     assert "Traceback" not in run.stderr
 
 
-def test_a_cluster_until_told_to_stop():
+def test_a_plain_server_is_started_when_told():
+    """It has no module, is said to have none, and takes the same documents."""
     import reem
 
-    with up("--cluster") as (process, said):
+    with up("--plain", "--port", "0") as (process, said):
+        port = port_in(said)
+        assert "documents as text: the server has no JSON module" in said
+        with redis.Redis(port=port) as client:
+            assert client.module_list() == []
+            with pytest.raises(redis.ResponseError, match="unknown command"):
+                client.execute_command("JSON.SET", "k", "$", "1")
+        with reem.RedisInterface(f"redis://localhost:{port}") as interface:
+            store = reem.KeyValueStore(interface)
+            store["a"] = {"x": 1, "l": [1]}
+            store["a"]["x"] = 2
+            assert store["a"].read() == {"x": 2, "l": [1]}
+        process.send_signal(signal.SIGINT)
+        rest, errors = process.communicate(timeout=10)
+        assert (process.returncode, errors) == (0, "")
+        assert "Stopped." in rest
+
+
+@pytest.mark.parametrize("options", [["--cluster"], ["--cluster", "--plain"]], ids=" ".join)
+def test_a_cluster_until_told_to_stop(options):
+    import reem
+
+    with up(*options) as (process, said):
         url = re.search(r"address +(redis\+cluster://\S+)\n", said)[1]
         assert said.count("process ") == 6
         with reem.RedisInterface(url) as interface:

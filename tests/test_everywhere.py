@@ -187,6 +187,42 @@ def test_whatever_is_published_is_heard_recorded_and_played(interface, command, 
         assert_same(kvs[name].read(), {**value_of(number), "n": 3})
 
 
+def test_live_commands_count_what_is_published_and_what_is_stored(interface, going_on):
+    """`reem hz` and `reem top`, of keys on every node."""
+    kvs, space, published, stored = (
+        reem.KeyValueStore(interface),
+        reem.PublishSpace(interface),
+        NAMES[:12],
+        NAMES[12:24],
+    )
+    ended = threading.Event()
+
+    def work():
+        for number in range(10**6):
+            for name in published:
+                space[name]["n"] = number
+            for name in stored:
+                kvs[name]["n"] = -number
+            if ended.wait(0.05):
+                return
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        with going_on("hz", "--every", "0.5", "--json") as hz, going_on("top", "--every", "0.5", "--json") as top:
+            counts, keys = Lines(hz), Lines(top)
+            wanted = {f"{name}.n" for name in published} | {f"{name}.n (stored)" for name in stored}
+            eventually(lambda: wanted <= {row["path"] for row in counts.rows() if row["hz"]}, STARTING)
+            eventually(lambda: set(published) <= {row["path"] for row in keys.rows() if row["hz"]}, STARTING)
+            assert {row["path"] for row in keys.rows()} == set(published), "what a store writes is not heard"
+            for process in (hz, top):
+                process.send_signal(signal.SIGINT)
+            assert (hz.wait(PATIENCE), top.wait(PATIENCE)) == (0, 0)
+    finally:
+        ended.set()
+        worker.join()
+
+
 def test_the_page_shows_every_key(interface, url):
     with browsing("--url", url, "--namespace", SPACE, "--port", "0", "--no-open") as (_, said):
         answer = httpx.get(f"{address_in(said)}api/tree", params={"open": "100:0:"}, timeout=PATIENCE, trust_env=False)
