@@ -504,7 +504,8 @@ class World:
             assert event.data in trees[place:]
             if isinstance(event, Updated):
                 assert newest is MISSING or event.data in trees[trees.index(newest) :], "no copy after a newer one"
-                if event.notice.path == () and event.notice.value is not ANNOUNCED and newest is MISSING:
+                whole = event.notice.path == () and event.notice.value is not ANNOUNCED
+                if whole and newest is MISSING and event.data is not MISSING:
                     assert same(event.data, trees[place]), "what replaces the whole key is told with itself"
                 newest = MISSING if same(event.data, trees[place]) else event.data
             if isinstance(event, Skipped):
