@@ -187,7 +187,8 @@ def teach(client):
             words = [word for word in words if not re.match(r"[+-]json\.", str(word))]
         if name == "TYPE":
             kind = send(self, *words, **options)
-            if kind in ("string", b"string") and send(self, "GETRANGE", words[1], 0, 0, **raw) == MARK:
+            is_text = kind in ("string", b"string") and "{" not in redis.utils.str_if_bytes(words[1])
+            if is_text and send(self, "GETRANGE", words[1], 0, 0, **raw) == MARK:
                 return "ReJSON-RL" if decoded else b"ReJSON-RL"
             return kind
         if not name.startswith("JSON."):

@@ -72,12 +72,17 @@ class _Kept(NamedTuple):
 
 
 class _Out:
-    """A top-level key that is out of reach, and what is kept of it: by path, in the order of the calls."""
+    """A top-level key that is out of reach, and what is kept of it: by path, in the order of the calls.
+
+    Attributes:
+        sending: How many are on their way and not among those kept.
+    """
 
     def __init__(self, writer: DocumentWriter) -> None:
         self.writer = writer
         self.kept: dict[Path, _Kept] = {}
         self.size = 0
+        self.sending = 0
 
     def put(self, it: _Kept) -> None:
         self.kept[it.assignment.path] = it
@@ -134,8 +139,8 @@ class Outage:
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept to be sent."""
-        return sum([len(out.kept) for out in list(self._out.values())])
+        """How many updates are kept to be sent, or on their way and not answered yet."""
+        return sum([len(out.kept) + out.sending for out in list(self._out.values())])
 
     # Calls.
 
@@ -283,6 +288,7 @@ class Outage:
         """Send what is kept of a key, in its turn. If that is broken off, what is left stays."""
         keys = out.writer.keys
         while out.kept:
+            out.sending = 1
             it = out.pop(next(iter(out.kept)))  # first: whatever happens now, it is not sent twice
             turn.time = it.time
             try:
@@ -300,6 +306,7 @@ class Outage:
                 where = show((keys.name, *it.assignment.path))
                 logger.warning("%s: kept in an outage, and refused now: %s", where, error)
             finally:
+                out.sending = 0
                 turn.settle()
         turn.time = None
         self._out.pop(keys.document, None)

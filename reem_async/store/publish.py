@@ -357,7 +357,7 @@ class PublishSpace(KeyValueStore):
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept until the server is back."""
+        """How many updates are kept until the server is back, or on their way then and not answered yet."""
         return 0 if self._outages is None else self._outages.waiting
 
     async def get(self, path: str, default: Any = None) -> Any:
