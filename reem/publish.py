@@ -54,7 +54,7 @@ class PublishSpace(KeyValueStore):
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept until the server is back."""
+        """How many updates are kept until the server is back, or on their way then and not answered yet."""
         return self._core.waiting
 
     def get(self, path: str, default: Any = None) -> Any:
