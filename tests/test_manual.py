@@ -242,7 +242,7 @@ def test_the_image_processing_system(opened, key):
     assert not wrong
     numbers = [number for number, _, _ in acted]
     assert numbers == sorted(set(numbers)), "in order, none twice"
-    assert all(number == mean and 0 <= latency < PATIENCE for number, mean, latency in acted)
+    assert all(number == mean and 0 <= latency < 10 for number, mean, latency in acted)
 
 
 def _set_points(space, name):
@@ -363,7 +363,7 @@ def test_the_overhead_of_subscribers(opened, key):
         publisher[key("overhead")] = {"timestamp": time.time()}
         time.sleep(0.002)
     eventually(lambda: all(len(times) == 50 for times in subscribers))
-    assert all(0 <= latency < PATIENCE for times in subscribers for latency in times)
+    assert all(0 <= latency < 10 for times in subscribers for latency in times)
 
 
 def test_a_deep_dictionary_and_one_entry_of_it(opened, key):
