@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, assert_no_orphans, assert_same, eventually
+from conftest import assert_no_orphans, assert_same, eventually
 
 import reem
 from reem.connection import RedisInterface
