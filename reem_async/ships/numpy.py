@@ -42,7 +42,7 @@ _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
 # All that a header is made of. There are no names, operators or f-strings, and integers are short.
 _TOKEN = re.compile(
     r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>\d{1,15}(?![\w'"])|True|False)"""
-    r"""|(?P<opening>[\[({])|(?P<closing>[\])}])|(?P<between>[,:])|[ \n]+"""
+    r"""|(?P<opening>[\[({])|(?P<closing>[\])}])|(?P<between>[,:])|[ \n]+|(?P<other>[\s\S])"""
 )
 # The escapes that `repr` writes; others, such as \N{...}, are refused.
 _ESCAPE = re.compile(r"\\(?:x([0-9a-f]{2})|u([0-9a-f]{4})|U([0-9a-f]{8})|(.))")
@@ -224,34 +224,41 @@ def _literal(text: str) -> Any:
     # One level for each open bracket: the bracket, and the items found in it so far. No recursion, so depth costs no
     # stack.
     levels: list[tuple[str, list[Any]]] = [("", [])]
-    position, complete = 0, False  # whether an item is there that a comma or the end has to follow
-    while position < len(text):
-        token = _TOKEN.match(text, position)
-        if token is None or len(levels) > _DEEPEST:
-            raise ValueError(text)
-        position, (kind, items) = token.end(), levels[-1]
-        if token.lastgroup is None:
+    kind, items = levels[0]
+    complete = False  # whether an item is there that a comma or the end has to follow
+    for token in _TOKEN.finditer(text):
+        what = token.lastgroup
+        if what is None:
             continue
-        # Two items in a row without a comma between them.
-        if token.lastgroup in ("text", "word", "opening") and complete:
-            raise ValueError(text)
-        if token.lastgroup == "text":
-            items.append(_unquoted(token["text"]))
-        elif token.lastgroup == "word":
-            items.append(token["word"] == "True" if token["word"][0] in "TF" else int(token["word"]))
-        elif token.lastgroup == "opening":
-            levels.append((token["opening"], []))
-        elif token.lastgroup == "closing":
+        if what == "between":
+            # After nothing; or in a dict a colon where a value was complete, a comma where a key was.
+            if not complete or (kind == "{" and len(items) % 2 == 1) != (token["between"] == ":"):
+                raise ValueError(text)
+            complete = False
+        elif what == "closing":
             if _PAIRS.get(levels.pop()[0]) != token["closing"]:
                 raise ValueError(text)
-            levels[-1][1].append(_closed(kind, items, complete))
-        # A comma or colon after nothing; or in a dict a colon where a value was complete, a comma where a key was.
-        elif not complete or (kind == "{" and len(items) % 2 == 1) != (token["between"] == ":"):
+            item = _closed(kind, items, complete)
+            kind, items = levels[-1]
+            items.append(item)
+            complete = True
+        # Nothing that belongs here; two items in a row without a comma between them; too many; too deep.
+        elif what == "other" or complete or len(items) >= _MOST_FIELDS or len(levels) > _DEEPEST:
             raise ValueError(text)
-        complete = token.lastgroup not in ("opening", "between")
-    if len(levels) != 1 or len(levels[0][1]) != 1 or not complete:
+        elif what == "opening":
+            kind, items = token["opening"], []
+            levels.append((kind, items))
+        else:
+            items.append(_unquoted(token["text"]) if what == "text" else _word(token["word"]))
+            complete = True
+    if len(levels) != 1 or len(items) != 1 or not complete:
         raise ValueError(text)
-    return levels[0][1][0]
+    return items[0]
+
+
+def _word(text: str) -> int:
+    """Return the number, or the truth, that a word means."""
+    return text == "True" if text[0] in "TF" else int(text)
 
 
 def _closed(kind: str, items: list[Any], complete: bool) -> Any:
