@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -205,8 +207,14 @@ def check_recording(here: Server, there: Server, documents: dict[str, Any], work
             work()
         assert not recorder.status.dropped, recorder.status
         with reem.RedisInterface(there.url) as interface, recording.open_log(path) as log:
-            recording.Replayer(interface, log, rate=1e9).play()
-            _compare_all(interface, documents, "replayed")
+            played = recording.Replayer(interface, log, rate=1e9).play()
+            try:
+                _compare_all(interface, documents, "replayed")
+            except AssertionError as error:
+                kept = Path(tempfile.gettempdir()) / f"reem hunt {os.getpid()}.mcap"
+                shutil.copy(path, kept)
+                told = f"the recording is {kept}: {recorder.status}, {played}, of {log.names()}"
+                raise AssertionError(f"{error}; {told}; keys there: {there.raw.keys()}") from error
     there.check(documents)
 
 
