@@ -72,6 +72,46 @@ def test_search(visit, kvs, key):
     expect(row(page, key("beta"))).to_be_visible()
 
 
+SLOW_TREE = """() => {
+  const real = window.fetch;
+  window.fetch = async (...all) => {
+    const answer = await real(...all);
+    if (String(all[0]).includes("/api/tree")) await new Promise((done) => setTimeout(done, 700));
+    return answer;
+  };
+}"""
+
+
+def test_what_a_search_finds_has_its_whole_path_though_the_tree_comes_late(visit, pspace, key):
+    """Rows of a tree that was on its way were taken for what was found: `image`, `image`, of which robot?"""
+    name = key("robot")
+    pspace[name] = {"needle": 1}
+    page = visit.open(f"/view/{name}")
+    row(page, name).locator(".twist").click()
+    expect(row(page, f"{name}.needle").locator(".key")).to_have_text("needle")
+    page.evaluate(SLOW_TREE)
+    pspace[name]["needle"] = 2
+    time.sleep(0.3)
+    page.locator("#search").fill("NEEDLE")
+    expect(row(page, f"{name}.needle").locator(".key")).to_have_text(f"{name}.needle")
+    page.locator("#search").press("Escape")
+    expect(row(page, f"{name}.needle").locator(".key")).to_have_text("needle")
+
+
+def test_a_picture_that_is_on_its_way_is_not_drawn_as_a_broken_one(visit, kvs, key):
+    kvs[key()] = np.zeros((20, 30), np.uint8)
+    page = visit.open()
+    held = []
+    page.route("**/api/image*", lambda route: held.append(route))
+    page.goto(page.url + f"view/{key()}")
+    expect(page.locator(".picture img")).to_have_css("visibility", "hidden")
+    eventually(lambda: page.evaluate("1") and held)
+    page.unroute("**/api/image*")
+    for route in held:
+        route.continue_()
+    expect(page.locator(".picture img")).to_have_css("visibility", "visible")
+
+
 def test_dragging_the_slider_shows_the_past(visit, pspace, key):
     name = key("arm")
     pspace[name] = {"mode": "idle", "x": 0.0}
@@ -323,6 +363,10 @@ def test_search_on_a_phone_covers_the_value(visit, kvs, key):
     page = visit.open(f"/view/{key('arm')}.joint")
     page.set_viewport_size({"width": 390, "height": 844})
     page.locator("#search").fill(key("arm"))
+    expect(row(page, key("arm"))).to_be_visible()
+    columns = [page.locator(".columns span").last, row(page, key("arm")).locator(".age")]
+    ends = [box["x"] + box["width"] for box in [it.bounding_box() for it in columns]]
+    assert abs(ends[0] - ends[1]) < 1, "what was found stands below the heads of the columns"
     row(page, key("arm")).click()
     expect(page.locator("#view")).to_be_visible()
     expect(page.locator("h1")).to_have_text(key("arm"))

@@ -82,6 +82,7 @@ export class Tree {
     row.level = level;
     const container = node.kind === "dict" || node.kind === "list";
     const parts = row.parts;
+    this.label(parts, node.label);
     row.classList.toggle("changed", node.mark === "changed");
     row.classList.toggle("inside", node.mark === "inside");
     row.setAttribute("aria-level", level);
@@ -112,14 +113,21 @@ export class Tree {
     it.title = node.shared ? `${changed}; arrays also through shared memory` : changed;
   }
 
+  // A row is used again where the same place is found by a search, there with its whole path.
+  label(parts, label) {
+    if (parts.name.textContent === label) return;
+    parts.name.textContent = parts.key.title = label;
+    parts.twist.setAttribute("aria-label", `Open or close ${label}`);
+  }
+
   newRow(node) {
-    const twist = el("button", { class: "twist", tabIndex: -1, type: "button", "aria-label": `Open or close ${node.label}` }, icon(RIGHT));
-    const leaf = el("span", { class: "leaf" });
-    const key = el("span", { class: "key", title: node.label }, twist, leaf, el("bdi", {}, node.label));
+    const twist = el("button", { class: "twist", tabIndex: -1, type: "button" }, icon(RIGHT));
+    const leaf = el("span", { class: "leaf" }), name = el("bdi");
+    const key = el("span", { class: "key" }, twist, leaf, name);
     const value = el("bdi", { class: "value" }), size = el("span"), age = el("span", { class: "age" });
     const spark = new Spark();
     const row = el("div", { class: "row", role: "treeitem", tabIndex: -1, title: "" }, key, value, el("span", { class: "size" }, size, spark.canvas), age);
-    row.parts = { key, twist, leaf, value, size, spark, age };
+    row.parts = { key, name, twist, leaf, value, size, spark, age };
     row.address = node.address;
     row.dataset.address = node.address;
     return row;
