@@ -105,6 +105,8 @@ def test_the_table_fits_any_terminal(columns, lines, titles):
     assert "MB/s" in shown[1]
     assert any(line.startswith("! several publishers, each") for line in shown)
     assert any(line.startswith("… ") for line in shown) == (lines < 28)
+    whole = " ".join(ALL.remark.split()) in " ".join(" ".join(shown).split())
+    assert whole == (columns > 40), "what the columns mean is cut off only where rows need its place"
 
 
 def test_nan_is_called_by_its_name(cli):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -66,11 +67,15 @@ class Picture:
         return Group(self._table(rows), *notes)
 
     def _notes(self) -> list[Text]:
-        """Return what stands below the table, each in one line of the terminal."""
+        """Return what stands below the table: lines, each of which fits into one of the terminal or is cut."""
         board = self._board
         doubled = board.doubled() if board.measure is ALL else []
         notes = [_line(f"! several publishers, each overwrites the others: {', '.join(doubled)}", "yellow")]
-        return notes[: bool(doubled)] + ([_line(board.measure.remark, "dim")] if board.measure.remark else [])
+        remark = board.measure.remark
+        lines = textwrap.wrap(remark, max(self._console.width, 20))
+        if len(lines) > self._console.height // 4:  # the rows come first
+            lines = [remark]
+        return notes[: bool(doubled)] + [_line(line, "dim") for line in lines]
 
     def _table(self, rows: list[tuple[str, Window]]) -> Table:
         measure, now = self._board.measure, time.time()
