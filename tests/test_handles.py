@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import operator
 import pickle
 import threading
 from unittest import mock
@@ -41,6 +42,8 @@ MISTAKES = {
     "float": float,
     "int": int,
     "round": round,
+    "a range": range,
+    "an item of a list": lambda handle: [1, 2][handle],
     "a number format": lambda handle: f"{handle:.2f}",
 }
 
@@ -65,6 +68,27 @@ def test_a_handle_taken_for_its_value_says_how_to_read(kvs, pspace, akvs_handle,
 def akvs_handle(server_url, key):
     """A handle of the other front; nothing is ever sent."""
     return reem_async.KeyValueStore(reem_async.RedisInterface(server_url))[key()]["n"]
+
+
+@pytest.mark.parametrize("name", ["items", "values", "shape", "battery"])
+def test_an_attribute_that_the_value_would_have_says_how_to_read(kvs, akvs_handle, key, name):
+    """An AttributeError, so that `hasattr` works; names that only programs ask for are refused without more."""
+    for handle, remedy in [(kvs[key()]["n"], r"\.read\(\)"), (akvs_handle, r"await handle\.read\(\)")]:
+        assert not hasattr(handle, name)
+        with pytest.raises(
+            AttributeError, match=rf"\.n: a handle is a place.* no '{name}'; .* {remedy}, or .*\['{name}'\]"
+        ):
+            getattr(handle, name)
+        with pytest.raises(AttributeError, match=r"Accessor' object has no attribute '_repr_png_'$"):
+            handle._repr_png_  # noqa: B018
+
+
+def test_a_slice_says_to_read_the_whole_first(kvs, akvs_handle, key):
+    """Of arrays and lists, where a user of numpy types it."""
+    for handle in (kvs[key()]["n"], akvs_handle):
+        for wrong in (np.s_[0:1], np.s_[0, 1]):
+            with pytest.raises(BadType, match=r"\.n: one item is reached by its index.*; read the whole first"):
+                handle[wrong]
 
 
 def test_handles_of_one_place_are_equal_and_of_others_not(kvs, pspace, akvs_handle, key):
@@ -302,6 +326,14 @@ async def test_the_awaited_twins(akvs, key):
         (lambda: "a" in place, "await accessor.contains('a')"),
         (lambda: list(akvs), "await store.keys()"),
         (lambda: "a" in akvs, "await store.contains('a')"),
+        (lambda: len(place), "await accessor.length()"),
+        (
+            lambda: operator.iadd(place, 1),
+            "await accessor.increment(number), or of a list await accessor.extend(items)",
+        ),
+        (lambda: operator.isub(place, 1), "await accessor.increment(-number)"),
+        (lambda: operator.imul(place, 2), "await accessor.multiply(number)"),
+        (lambda: operator.itruediv(place, 2), "await accessor.divide(number)"),
     ]:
         with pytest.raises(TypeError) as caught:
             call()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -36,6 +36,18 @@ class Handle:
             f"{show(self._place[1])}: a handle is a place in the dictionary, not the value there, and has no {what}; "
             f"read it first, with {self._how_to_read}"
         )
+
+    if not TYPE_CHECKING:  # for which every attribute would be there
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name.startswith("_"):  # asked for by programs, which only want to know whether it is there
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}", name=name, obj=self)
+            raise AttributeError(
+                f"{show(self._place[1])}: a handle is a place in the dictionary, not the value there, and has no "
+                f"{name!r}; read it first, with {self._how_to_read}, or name a key in brackets, as in [{name!r}]",
+                name=name,
+                obj=self,
+            )
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, Handle):
@@ -81,7 +93,8 @@ def _number(self: Handle, *_: Any) -> Any:
 
 
 _NUMBERS = (
-    "int float complex neg abs round add radd sub rsub mul rmul truediv rtruediv floordiv rfloordiv mod rmod pow rpow"
+    "int index float complex neg abs round add radd sub rsub mul rmul truediv rtruediv floordiv rfloordiv mod rmod "
+    "pow rpow"
 )
 for _name in _NUMBERS.split():
     setattr(Handle, f"__{_name}__", _number)

@@ -55,6 +55,11 @@ def check_element(key: object, parent: Path) -> str | int:
                 "a backslash, both kinds of quotes, or half a surrogate pair); read or write the dict that holds it"
             )
         return key if type(key) is str else str.__str__(key)
+    if isinstance(key, slice | tuple):
+        raise BadType(
+            f"{show(parent)}: one item is reached by its index, not several by {shorten(key)}; read the whole first, "
+            "and take them of that"
+        )
     if isinstance(key, bool) or not hasattr(key, "__index__"):
         raise BadType(
             f"{show(parent)}: {shorten(key)} ({type(key).__name__}) is neither a key (str) nor a list index (int)"

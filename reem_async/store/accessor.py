@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 import operator
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
@@ -32,6 +32,10 @@ _NOTHING: Any = object()
 
 _TRIES = [False] * 49 + [True]
 """Tries of a call that reads and then writes; whether one is the last."""
+
+
+def _cannot_calculate(sign: str, call: str, more: str = "") -> str:
+    return f"`{sign}` cannot wait for the server; use: await accessor.{call}{more}"
 
 
 class Accessor(Handle):
@@ -65,6 +69,21 @@ class Accessor(Handle):
 
     def __contains__(self, key: object) -> bool:
         raise BadType(f"`in` cannot wait for the server; use: await accessor.contains({key!r}), or await .read()")
+
+    def __iadd__(self, number: Any) -> NoReturn:
+        raise BadType(_cannot_calculate("+=", "increment(number)", ", or of a list await accessor.extend(items)"))
+
+    def __isub__(self, number: Any) -> NoReturn:
+        raise BadType(_cannot_calculate("-=", "increment(-number)"))
+
+    def __imul__(self, number: Any) -> NoReturn:
+        raise BadType(_cannot_calculate("*=", "multiply(number)"))
+
+    def __itruediv__(self, number: Any) -> NoReturn:
+        raise BadType(_cannot_calculate("/=", "divide(number)"))
+
+    def __len__(self) -> int:
+        raise BadType("len() cannot wait for the server; use: await accessor.length()")
 
     @property
     def _place(self) -> tuple[object, Path]:
