@@ -72,11 +72,11 @@ def test_search(visit, kvs, key):
     expect(row(page, key("beta"))).to_be_visible()
 
 
-SLOW_TREE = """() => {
+SLOW = """([what, pause]) => {
   const real = window.fetch;
   window.fetch = async (...all) => {
     const answer = await real(...all);
-    if (String(all[0]).includes("/api/tree")) await new Promise((done) => setTimeout(done, 700));
+    if (String(all[0]).includes(what)) await new Promise((done) => setTimeout(done, pause));
     return answer;
   };
 }"""
@@ -89,7 +89,7 @@ def test_what_a_search_finds_has_its_whole_path_though_the_tree_comes_late(visit
     page = visit.open(f"/view/{name}")
     row(page, name).locator(".twist").click()
     expect(row(page, f"{name}.needle").locator(".key")).to_have_text("needle")
-    page.evaluate(SLOW_TREE)
+    page.evaluate(SLOW, ["/api/tree", 1500])
     pspace[name]["needle"] = 2
     time.sleep(0.3)
     page.locator("#search").fill("NEEDLE")
@@ -101,14 +101,9 @@ def test_what_a_search_finds_has_its_whole_path_though_the_tree_comes_late(visit
 def test_a_picture_that_is_on_its_way_is_not_drawn_as_a_broken_one(visit, kvs, key):
     kvs[key()] = np.zeros((20, 30), np.uint8)
     page = visit.open()
-    held = []
-    page.route("**/api/image*", lambda route: held.append(route))
-    page.goto(page.url + f"view/{key()}")
+    page.evaluate(SLOW, ["/api/image", 3000])
+    row(page, key()).click()
     expect(page.locator(".picture img")).to_have_css("visibility", "hidden")
-    eventually(lambda: page.evaluate("1") and held)
-    page.unroute("**/api/image*")
-    for route in held:
-        route.continue_()
     expect(page.locator(".picture img")).to_have_css("visibility", "visible")
 
 
