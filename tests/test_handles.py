@@ -340,6 +340,17 @@ async def test_the_awaited_twins(akvs, key):
         assert remedy in str(caught.value)
 
 
+def test_writing_an_item_of_an_array_says_to_write_it_as_a_whole(kvs, key):
+    """Its server knows the array as a text, and said that a list was too short."""
+    kvs[key()] = {"image": np.zeros((2, 2)), "l": [1]}
+    for place in (kvs[key()]["image"], kvs[key()]["l"]):
+        with pytest.raises(PathRefused, match=r"\[7\]: .*"):
+            place[7] = 3
+    if not PLAIN:
+        with pytest.raises(PathRefused, match="write an array as a whole"):
+            kvs[key()]["image"][0] = 3
+
+
 def test_a_key_with_a_dot_is_shown_quoted(kvs, key):
     """So that it cannot be taken for a path, and what is shown can be typed."""
     for path in [("m.a",), ("m.a", "x"), ("a[0]",), ('a"b', 3), ("plain", "x"), (".x",), ("a b", "c.d")]:

@@ -206,8 +206,11 @@ def diagnose(keys: Keys, path: Path) -> Plan:
 
 
 def out_of_range(keys: Keys, path: Path) -> PathRefused:
-    """Return the error for an item beyond the end of a list."""
-    return PathRefused(f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer")
+    """Return the error for an item beyond the end of a list, or of an array: to the server that is a short text."""
+    return PathRefused(
+        f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer, and write an "
+        "array as a whole"
+    )
 
 
 def type_name(reply: Reply) -> str | None:
