@@ -7,6 +7,7 @@ import os
 import numpy as np
 import pytest
 from conftest import assert_same, eventually
+from slotkit import in_slot
 
 import reem
 import reem_async
@@ -18,17 +19,6 @@ from reem_async.plan.slots import Slot
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
 
 IMAGE = np.arange(30_000, dtype=np.float64).reshape(100, 300)
-
-
-def in_slot(array):
-    """Whether an array looks into memory that somebody else writes: it is not its own, nor in bytes of this process."""
-    while isinstance(array, np.ndarray) and array.base is not None:
-        array = array.base
-    while isinstance(array, memoryview):
-        array = array.obj
-        while isinstance(array, np.ndarray) and array.base is not None:
-            array = array.base
-    return type(array).__name__ == "mmap"
 
 
 def fetched(raw):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import FRONTS, aeventually, assert_same, eventually
 from sentinelkit import Watched
-from test_local import in_slot
+from slotkit import in_slot
 
 import reem
 import reem_async

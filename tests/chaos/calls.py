@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from conftest import assert_no_orphans
+from slotkit import shared_in
 
 import reem
 import reem_async
@@ -18,20 +19,20 @@ from reem_async.concurrency.queues import Last
 from .proxy import Proxy
 from .scoreboard import Run, row, tell
 from .servers import PrivateServer
-from .tools import Log, background, became
+from .tools import Log, background, became, frame
 
 SLOTS = 50
 TOP = "storm"
 
 
-def tagged(number: int) -> dict[str, Any]:
+def tagged(number: int, array: Any = None) -> dict[str, Any]:
     """A value that shows in every part whose it is."""
-    return {"id": number, "array": np.full(8, number), "text": str(number)}
+    return {"id": number, "array": np.full(8, number) if array is None else array, "text": str(number)}
 
 
 def has_tag(value: Any, number: int) -> bool:
     """Whether a value is all of one slot."""
-    return value["id"] == number and value["text"] == str(number) and set(value["array"].tolist()) == {number}
+    return value["id"] == number and value["text"] == str(number) and bool((value["array"] == number).all())
 
 
 # --- 2: cancelled ----------------------------------------------------------------------------------
@@ -46,7 +47,13 @@ class _Storm:
         self._space = reem_async.PublishSpace(interface)
         self.wrong: list[Any] = []
         self.swallowed: list[Any] = []
-        self.cancelled = self.finished = 0
+        self.cancelled = self.finished = self.shared = 0
+
+    def see(self, value: Any, updated_path: str) -> None:
+        """What a subscriber near by gets of it: nothing of two slots, whatever was broken off."""
+        if value is not None:
+            self.shared += shared_in({slot: value[f"s{slot}"]["array"] for slot in range(SLOTS)}) > 0
+            self.wrong += [("heard", slot) for slot in range(SLOTS) if not has_tag(value[f"s{slot}"], slot)]
 
     async def prepare(self) -> None:
         await self._space[TOP].write({f"s{n}": tagged(n) for n in range(SLOTS)} | {"count": 0, "list": []})
@@ -64,7 +71,7 @@ class _Storm:
         elif kind == 5:
             await place.write(tagged(slot))
         elif kind == 6:
-            await self._space[TOP][f"s{slot}"].write(tagged(slot))
+            await self._space[TOP][f"s{slot}"].write(tagged(slot, frame(slot)))
         elif kind == 7:
             await self._kvs[TOP]["count"].increment()
         elif kind == 8:
@@ -110,18 +117,24 @@ def cancelled(run: Run) -> None:
 async def _cancelled(run: Run) -> None:
     count = run.size(20_000, 2_000)
     with PrivateServer() as server, server.raw() as raw:
-        async with reem_async.RedisInterface(server.url) as interface:
+        mode = run.rng.choice(["auto", "early"])
+        async with reem_async.RedisInterface(server.url, local=mode) as interface:
             storm = _Storm(run, interface)
             await storm.prepare()
             before, at_once = len(asyncio.all_tasks()), 50
-            for begun in range(0, count, at_once):
-                await asyncio.gather(*(storm.one(run.rng.random() < 0.5) for _ in range(at_once)))
-                if begun % 5000 == 0:
-                    tell(f"{begun} operations")
+            async with (
+                reem_async.RedisInterface(server.url) as following,
+                reem_async.CallbackSubscriber(TOP, following, storm.see),
+            ):
+                for begun in range(0, count, at_once):
+                    await asyncio.gather(*(storm.one(run.rng.random() < 0.5) for _ in range(at_once)))
+                    if begun % 5000 == 0:
+                        tell(f"{begun} operations")
             await became(lambda: len(asyncio.all_tasks()) <= before, 2)
             run.at_least("operations", count, count)
             run.at_least("of them ended cancelled", storm.cancelled, 0.2 * count)
             run.at_least("of them finished", storm.finished, 0.2 * count)
+            run.at_least("updates heard with frames in shared memory", storm.shared, count // 1000)
             run.none("wrong replies or errors", storm.wrong)
             run.none("cancels swallowed", storm.swallowed)
             run.none("tasks left over", len(asyncio.all_tasks()) - before)
@@ -165,6 +178,8 @@ class _Losses:
         """Compare what is stored with what the callers were told."""
         twice, lost, wrong_counts = [], [], []
         for place, tokens in value.items():
+            if isinstance(tokens, dict):  # the newest frame replaces the one before
+                continue
             if isinstance(tokens, int):
                 sure, maybe = self.known[place]["n"], self.unknown[place]["n"]
                 if not sure <= tokens <= sure + maybe:
@@ -190,7 +205,14 @@ def _with_array(token: str) -> dict[str, Any]:
     return {"token": token, "array": np.full(2000, len(token))}
 
 
-PLACES = {"lists": "appended", "arrays": "with arrays", "counts": "count", "told": "published", "edits": "edited"}
+PLACES = {
+    "lists": "appended",
+    "arrays": "with arrays",
+    "counts": "count",
+    "told": "published",
+    "edits": "edited",
+    "frames": "frame",
+}
 
 
 def _blocking_call(kind: str, token: str, kvs: reem.KeyValueStore, space: reem.PublishSpace) -> None:
@@ -202,6 +224,8 @@ def _blocking_call(kind: str, token: str, kvs: reem.KeyValueStore, space: reem.P
         kvs[TOP][PLACES[kind]].increment()
     elif kind == "told":
         space[TOP][PLACES[kind]].append(token)
+    elif kind == "frames":
+        space[TOP][PLACES[kind]] = {"token": token, "array": frame(len(token))}
     else:
         with kvs[TOP][PLACES[kind]] as items:
             items.append(token)
@@ -216,6 +240,8 @@ async def _async_call(kind: str, token: str, kvs: reem_async.KeyValueStore, spac
         await kvs[TOP][PLACES[kind]].increment()
     elif kind == "told":
         await space[TOP][PLACES[kind]].append(token)
+    elif kind == "frames":
+        await space[TOP][PLACES[kind]].write({"token": token, "array": frame(len(token))})
     else:
         async with kvs[TOP][PLACES[kind]].edit() as items:
             items.append(token)
@@ -227,7 +253,7 @@ MARKERS = {"counts": b"NUMINCRBY", "edits": b"EXEC"}
 
 @row(
     3,
-    "lost replies: append, arrays, increment, publish, edit; both fronts",
+    "lost replies: append, arrays, increment, publish, frame, edit; both fronts",
     "nothing applied twice or told twice, counters in [ok, ok + unknown]",
 )
 def lost_replies(run: Run) -> None:
@@ -241,7 +267,7 @@ async def _lost_replies(run: Run) -> None:
         losses = _Losses(proxy)
         async with reem_async.RedisInterface(proxy.url) as faulty, reem_async.RedisInterface(server.url) as direct:
             await reem_async.KeyValueStore(direct)[TOP].write(
-                {place: 0 if kind == "counts" else [] for kind, place in PLACES.items()}
+                {place: {"counts": 0, "frames": {}}.get(kind, []) for kind, place in PLACES.items()}
             )
             log = Log(reem_async.KeyValueStore(direct)[TOP].watch(Last(1_000_000)))
             await log.updates.listen()
@@ -261,6 +287,7 @@ async def _lost_replies(run: Run) -> None:
         run.at_least("calls of known outcome", sum(sum(it.values()) for it in losses.known.values()), count // 2)
         losses.judge(run, value)
         run.at_least("updates told", log.told, count // 10)
+        run.at_least("of them with frames in shared memory", log.shared, count // 20)
         run.none("updates told again or backwards", log.repeated + log.backward)
         run.none("losses not flagged", log.silent)
 

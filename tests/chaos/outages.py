@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from redis.exceptions import RedisError
+from slotkit import in_slot, shared_in
 
 import reem
 import reem_async
@@ -20,7 +21,7 @@ from reem_async.concurrency.queues import Last
 from .proxy import Proxy
 from .scoreboard import Run, row, tell
 from .servers import PrivateServer
-from .tools import Log, background, became, measured, order, program, quantile, said, state_of
+from .tools import Log, background, became, frame, measured, order, program, quantile, said, state_of
 
 TOP = "top"
 LARGE = np.zeros(300_000, np.uint8)
@@ -103,6 +104,7 @@ class _Victims:
         self.settled: list[float | None] = []
         self.token = itertools.count(1)
         self.sure: list[str] = []
+        self.shared = 0
         self.names = f"v{id(self)}"
 
     async def begin(self) -> None:
@@ -115,7 +117,12 @@ class _Victims:
         self.log = Log(self.mirror.watch(Last(1_000_000)))
         await self.mirror.listen()
         await self.log.updates.listen()
+        self.large = reem_async.CallbackSubscriber("large", self.following, self._see)
+        await self.large.listen()
         await self.work()
+
+    def _see(self, data: Any, updated_path: str) -> None:
+        self.shared += in_slot(data)
 
     async def work(self) -> None:
         """One call of each front that must work."""
@@ -175,6 +182,7 @@ def _judge(run: Run, victims: list[_Victims], times: int) -> None:
     def worst(values: list[float | None]) -> float:
         return float("inf") if not values or None in values else max(value for value in values if value is not None)
 
+    run.at_least("frames seen in shared memory", sum(it.shared for it in victims), 2 * len(victims))
     run.at_least("calls given up", sum(len(it.calls) for it in victims), 4 * times)
     run.at_most("s the longest", worst([call for it in victims for call in it.calls]), IN_TIME)
     run.none("calls that did not fail", [one for it in victims for one in it.unanswered])
@@ -267,6 +275,10 @@ async def _stopped_server(run: Run) -> None:
 # --- 20: resets without end ------------------------------------------------------------------------
 
 
+def _is_whole(value: Any, n: int) -> bool:
+    return value is not None and value["n"] == n and bool((value["frame"] == n).all())
+
+
 @row(20, "500 subscribes while the connection is reset every ~30 ms", "0 RuntimeErrors, 0 channels without updates")
 def resets(run: Run) -> None:
     """Whoever could not subscribe gets an error and tries again; whoever could must hear of everything later."""
@@ -311,13 +323,15 @@ async def _resets(run: Run) -> None:
                 taken = time.monotonic() - begun
             proxy.heal()
             for n in range(count):
-                await space[f"channel{n}"].write({"n": n})
-            missing = lambda: [m.channel for n, m in enumerate(mirrors) if m.value() != {"n": n}]  # noqa: E731
+                await space[f"channel{n}"].write({"n": n, "frame": frame(n)})
+            missing = lambda: [m.channel for n, m in enumerate(mirrors) if not _is_whole(m.value(), n)]  # noqa: E731
             settled = await became(lambda: not missing(), 5)
     run.at_least("subscribed", count - len(wrong), count)
     run.at_least("resets meanwhile", resets, run.size(50, 3))
     run.at_most("s", taken, 60.0)
     run.none("wrong errors", wrong)
     run.none("channels without updates", missing())
+    # Not of all: one interface has segments of 64 keys.
+    run.at_least("of them with frames in shared memory", sum(shared_in(m.value()) for m in mirrors), 50)
     run.at_most("s until all had theirs", settled if settled is not None else float("inf"), 2.0)
     tell(f"{attempts} attempts for {count} subscriptions")

@@ -30,6 +30,7 @@ def forks(run: Run) -> None:
         found = said(process)
     run.at_least("forks", found["worked"] + found["refused"], count)
     run.at_least("children that worked", found["worked"], 0)
+    run.at_least("frames seen in shared memory", found["shared"], count // 2)  # a busy machine may be too late
     run.at_most("s the slowest child", found["slowest"], 1.0)
     run.none("wrong", found["wrong"])
 

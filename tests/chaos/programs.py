@@ -22,12 +22,13 @@ from typing import Any
 
 import numpy as np
 from redis.exceptions import RedisError
+from slotkit import in_slot, shared_in
 
 import reem
 import reem_async
 from reem_async.concurrency.queues import Last
 
-from .tools import Log, background, became, descriptors, rss
+from .tools import Log, background, became, descriptors, frame, rss
 
 
 def say(**facts: Any) -> None:
@@ -85,13 +86,13 @@ class _Family:
     def __init__(self, url: str) -> None:
         self.interface = reem.RedisInterface(url)
         self.kvs, self.space = reem.KeyValueStore(self.interface), reem.PublishSpace(self.interface)
-        self.space["family"] = {f"s{n}": n for n in range(SLOTS)} | {"from": ""}
+        self.space["family"] = {f"s{n}": n for n in range(SLOTS)} | {"from": "", "frame": frame(0)[:1]}
         self.mirror = reem.SilentSubscriber("family", self.interface)
         self.mirror.listen()
         self.url = url
         self.wrong: list[str] = []
         self.slowest = 0.0
-        self.worked = self.refused = 0
+        self.worked = self.refused = self.shared = self.frames = 0
 
     def child(self, report: int) -> None:
         """What each child does with its parent's interface: read, write, publish, follow."""
@@ -104,11 +105,30 @@ class _Family:
             own = reem.SilentSubscriber("family", self.interface)
             own.listen()
             assert own["s1"].read() == 1, "the child's own copy is wrong"
+            # Its parent's slots are not its own, to read or to write: what it publishes is in memory of its own.
+            self.space["family"]["frame"] = frame(-1)
+            self.hear_frame(own, -1)
         except reem.Misuse as error:
             outcome = f"refused: {error}"
         except BaseException as error:
             outcome = f"wrong: {error!r}"
         os.write(report, json.dumps([outcome, time.monotonic() - begun]).encode())
+
+    def hear_frame(self, mirror: reem.SilentSubscriber, number: int) -> bool:
+        """Wait until a copy has a frame, which must be whole; returns whether that is in shared memory."""
+        deadline = time.monotonic() + CHILD_SECONDS
+        while (array := mirror["frame"].read())[0] != number:
+            assert time.monotonic() < deadline, "a frame was not told"
+            time.sleep(0.001)
+        assert (array == number).all(), "a frame is torn"
+        return in_slot(array)
+
+    def publish_frame(self) -> None:
+        """Publish one, and have the parent's copy look at it in shared memory while children are made."""
+        self.hear_frame(self.mirror, int(self.kvs["family"]["frame"].read()[0]))  # a child's, most of the time
+        self.frames += 1
+        self.space["family"]["frame"] = frame(self.frames)
+        self.shared += self.hear_frame(self.mirror, self.frames)
 
     def fork(self, way: str) -> None:
         """Fork one child, hear what became of it, and see that the parent was not disturbed."""
@@ -184,6 +204,7 @@ def forks(url: str, count: str) -> None:
     warnings.filterwarnings("ignore", category=DeprecationWarning, message=".*fork.*")  # it is what this is about
     family = _Family(url)
     for number in range(int(count)):
+        family.publish_frame()
         if number % 3 == 2:
             asyncio.run(_fork_from_a_loop(family))
         else:
@@ -195,7 +216,9 @@ def forks(url: str, count: str) -> None:
             family.wrong.append("the parent's subscription is dead")
             break
         time.sleep(0.01)
-    say(wrong=family.wrong, slowest=family.slowest, worked=family.worked, refused=family.refused)
+    family.publish_frame()
+    counts = {"worked": family.worked, "refused": family.refused, "shared": family.shared}
+    say(wrong=family.wrong, slowest=family.slowest, **counts)
     family.interface.close()
 
 
@@ -215,8 +238,8 @@ def _following(url: str) -> tuple[reem.RedisInterface, reem.KeyValueStore]:
     calls = reem.CallbackSubscriber("exit", interface, lambda data, updated_path: heard.append(data))
     mirror.listen()
     calls.listen()
-    space["exit"]["n"] = 1
-    while not heard:
+    while not (heard and heard[-1] and shared_in(heard[-1])):  # the end meets frames that are looked at
+        space["exit"]["frame"] = frame(1)
         time.sleep(0.001)
     KEPT.extend([interface, mirror, calls])
     return interface, reem.KeyValueStore(interface)
@@ -288,14 +311,16 @@ def exit_from_asyncio(url: str) -> None:
     async def main() -> None:
         interface = reem_async.RedisInterface(url)
         space = reem_async.PublishSpace(interface)
-        await space["exit"].write({"n": 0})
+        await space["exit"].write({"n": 0, "frame": frame(0)})
         mirror = reem_async.SilentSubscriber("exit", interface)
         await mirror.listen()
         log = Log(mirror.watch(Last(10)))
         await log.updates.listen()
         KEPT.extend([interface, mirror, log, asyncio.ensure_future(log.follow())])
         await became(lambda: log.told, 5)
-        say(bye=True)
+        await space["exit"].write({"n": 1, "frame": frame(1)})
+        await became(lambda: shared_in(mirror.value()), 5)
+        say(bye=bool(shared_in(mirror.value())))
 
     asyncio.run(main())
 
@@ -384,6 +409,7 @@ async def _soak(url: str, seconds: float) -> None:
             silent=log.silent,
             disordered=log.repeated + log.backward,
             torn=torn,
+            shared=log.shared,
         )
 
 

@@ -7,7 +7,6 @@ import contextlib
 import time
 from typing import Any
 
-import numpy as np
 from redis.exceptions import RedisError
 
 import reem
@@ -16,7 +15,7 @@ from reem_async.concurrency.queues import Last
 
 from .scoreboard import Run, row, tell
 from .servers import PrivateServer
-from .tools import Log, background, became, measured
+from .tools import Log, background, became, frame, measured
 
 CREW = 4
 TOP = "load"
@@ -39,7 +38,7 @@ class _Writer:
                 await asyncio.sleep(0.002)
                 continue
             self.tried += 1
-            value = {"n": self.tried, "array": np.full(16, self.tried)}
+            value = {"n": self.tried, "array": frame(self.tried)}
             with measured(self.calls):
                 try:
                     await self._place.write(value)
@@ -61,7 +60,7 @@ class _Follower:
 def _number(value: Any, name: str) -> int:
     """The number in an entry, whose array must be of the same write."""
     entry = value[name]
-    assert set(entry["array"].tolist()) == {entry["n"]}, f"torn: {entry}"
+    assert (entry["array"] == entry["n"]).all(), f"torn: {entry}"
     return entry["n"]
 
 
@@ -89,7 +88,7 @@ class _Crew:
         blocking = reem.RedisInterface(self._url)
         self._stack.callback(blocking.close)
         self.idle_blocking = reem.KeyValueStore(blocking)
-        await self.idle[TOP].write({f"w{me}": {"n": 0, "array": np.full(16, 0)} for me in range(CREW)})
+        await self.idle[TOP].write({f"w{me}": {"n": 0, "array": frame(0)} for me in range(CREW)})
         for me in range(CREW):
             self.writers.append(_Writer(reem_async.PublishSpace(await self._interface()), me))
             follower = _Follower(await self._interface())
@@ -167,6 +166,7 @@ async def _restarts(run: Run) -> None:
                 run.none("dead tasks", sum(task.done() for task in tasks))
     run.at_least("restarts", times, times)
     run.at_least("writes acknowledged", sum(writer.acknowledged for writer in crew.writers), 40 * times)
+    run.at_least("updates told with frames in shared memory", sum(log.shared for log in logs), 10 * times)
     run.at_least("writes failed", sum(writer.failed for writer in crew.writers), 1)
     run.at_most("s until all copies were right", max(crew.settling), 2.0)
     run.at_most("s the longest call", max(max(writer.calls) for writer in crew.writers), 1.1)

@@ -104,6 +104,7 @@ def soak(run: Run) -> None:
     run.at_least("faults", mischief.made, seconds / EVERY * 0.7)
     run.at_least("of the updates published", len(found["calls"]) / (seconds * RATE), 0.5)
     run.at_least("updates told", found["told"], 0.3 * len(found["calls"]))
+    run.at_least("of them with frames in shared memory", found["shared"], 0.5 * found["told"])
     run.at_least("calls failed", len(found["failed"]), run.size(5, 0))
     run.at_most("s the longest call", max(found["failed"] + [taken for _, taken in found["calls"]]), 1.1)
     run.at_least("gaps flagged", found["gaps"], 1)

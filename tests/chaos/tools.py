@@ -13,12 +13,21 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from slotkit import shared_in
+
 import reem_async
+from reem_async.local.path import LEAST
 
 from .scoreboard import ROOT
 
 PAUSE = 0.005
 """Seconds between two looks at a condition."""
+
+
+def frame(number: int) -> np.ndarray[Any, Any]:
+    """An array just so large that it goes through shared memory, and that shows in every item whose it is."""
+    return np.full(LEAST // 8, number)
 
 
 def rss() -> float:
@@ -129,11 +138,12 @@ class Log:
         repeated: Updates that came again.
         backward: Updates that came after newer ones of the same publisher.
         silent: Losses that were not flagged.
+        shared: Updates with arrays in the memory of their publisher.
     """
 
     def __init__(self, updates: reem_async.pubsub.subscribers.Watch) -> None:
         self.updates = updates
-        self.told = self.gaps = 0
+        self.told = self.gaps = self.shared = 0
         self.repeated: list[Any] = []
         self.backward: list[Any] = []
         self.silent: list[Any] = []
@@ -150,6 +160,7 @@ class Log:
         """Note one update."""
         self.told += 1
         self.gaps += update.gap
+        self.shared += shared_in(update.data) > 0
         if update.gap:
             self._excused = dict.fromkeys(self._last, True)
         publisher, sequence = update.publisher, update.sequence
