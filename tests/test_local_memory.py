@@ -284,18 +284,20 @@ def test_without_descriptors_there_is_no_slot_and_no_view_and_nothing_is_raised(
 # --- what a notice names
 
 
-def sealed(content, name="reem", seals=SEALS, size=None):
-    """A file in memory as somebody may make it."""
+def sealed(content, name="reem", seals=SEALS, size=None, sparse=False):
+    """A file in memory as somebody may make it; all its memory is taken, unless it is sparse."""
     descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     os.write(descriptor, content)
     if size is not None:
         os.ftruncate(descriptor, size)
+        if not sparse:
+            os.posix_fallocate(descriptor, 0, size)
     fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
     return descriptor
 
 
-def identity(slots, room):
-    return (IDENTITY.pack(MARK, slots, room).ljust(stamp_at(0), b"\0") + STAMP.pack(7) * 8).ljust(HEAD, b"\0")
+def identity(slots, room, stamp=7):
+    return (IDENTITY.pack(MARK, slots, room).ljust(stamp_at(0), b"\0") + STAMP.pack(stamp) * 8).ljust(HEAD, b"\0")
 
 
 def fifo(folder):
@@ -322,9 +324,20 @@ OPENED = {
     "too many slots": lambda _: sealed(identity(1 << 20, 0), size=HEAD),
     "no room": lambda _: sealed(identity(2, 0), size=HEAD),
     "too much room": lambda _: sealed(identity(1, (1 << 64) - 1), size=HEAD),
-    "of 100 GB": lambda _: sealed(identity(1, 100 << 30), size=HEAD + (100 << 30)),
-    "another stamp": lambda _: sealed(identity(1, 4096), size=2 * HEAD),
+    "of 100 GB": lambda _: sealed(identity(1, 100 << 30), size=HEAD + (100 << 30), sparse=True),
+    "of 1 GB that are not there": lambda _: sealed(identity(1, 1 << 30), size=HEAD + (1 << 30), sparse=True),
+    "another stamp": lambda _: sealed(identity(1, 4096, stamp=8), size=2 * HEAD),
 }
+
+
+def test_what_somebody_else_makes_as_a_publisher_does_is_a_segment():
+    """So that below it is what is named that decides."""
+    descriptor = sealed(identity(1, 4096), size=2 * HEAD)
+    try:
+        slot = Slot(host(), os.getpid(), descriptor, os.fstat(descriptor).st_ino, 0, 7)
+        assert bytes(LocalReader().view(slot, 1)) == b"\0"
+    finally:
+        os.close(descriptor)
 
 
 @pytest.mark.parametrize("what", OPENED)
@@ -332,7 +345,7 @@ def test_what_is_no_segment_is_not_looked_into(what, tmp_path):
     before, descriptor = descriptors(), OPENED[what](tmp_path)
     own = descriptors()
     try:
-        slot = Slot(host(), os.getpid(), descriptor, os.fstat(descriptor).st_ino, 0, 8)
+        slot = Slot(host(), os.getpid(), descriptor, os.fstat(descriptor).st_ino, 0, 7)
         reader = LocalReader()
         assert reader.view(slot, 1) is None
         assert reader.view(slot._replace(inode=slot.inode + 1), 1) is None

@@ -38,6 +38,8 @@ _IDLE = 10.0
 _MOST_SLOTS = 64
 _LARGEST = 1 << 34
 """Bytes of a segment: no publisher makes one of 16 GB."""
+_BLOCK = 512
+"""Bytes of what `st_blocks` counts, whatever the file system's blocks are."""
 
 
 class _Pin(NamedTuple):
@@ -141,6 +143,10 @@ def _checked(descriptor: int, slot: Slot) -> Shape:
         raise ValueError("it is no segment")
     if found.st_ino != slot.inode:
         raise ValueError("it is another file")
+    # Publishers take all memory of a segment at once. Of one that has none yet a few bytes may say that a text has
+    # gigabytes, and to copy it would take these from us. The seals keep it from being given back later.
+    if found.st_blocks * _BLOCK < found.st_size:
+        raise ValueError("its memory is not there")
     return shape
 
 
