@@ -58,7 +58,7 @@ watching: $(VENV)/ready  ## 100,000 random changes by four processes beside watc
 	$(BIN)/python -m tests.watchmodel $(WATCHING)
 
 slots: $(VENV)/ready  ## a million uses of slots of shared memory by processes that are killed; SLOTS="--seed 7 --uses 50000"
-	$(BIN)/python -m tests.slots $(SLOTS)
+	$(BIN)/python tests/slots.py $(SLOTS)
 
 mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCAP that Foxglove uses; needs npm
 	npm install --silent --no-fund --no-audit --no-package-lock --prefix tests/mcapcheck

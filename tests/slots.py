@@ -1,12 +1,13 @@
 """Slots of shared memory in the hands of processes that are killed: none torn, nothing left, mirrors that are right.
 
-    python -m tests.slots [--seed N] [--uses N] [--rounds N] [--within SECONDS]
+    python tests/slots.py [--seed N] [--uses N] [--rounds N] [--within SECONDS]
 
 First without a server: two publishers of one path and four readers, some of whom keep what they see for a while. Each
 frame says its own checksum, which is compared when it is seen and again before it is let go. A party at random is
 killed (kill -9) every few milliseconds, and another takes its place. Then with a server: two publishers of one path,
 one of them early, and mirrors and slow callbacks in four processes; in each round some are killed, and then all mirrors
-must have what the server has.
+must have what the server has. One more publisher and one of the readers are never killed: they must have lost no
+descriptor and little memory by the others at the end.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ import time
 import traceback
 import zlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from slotkit import in_slot
 
 import reem
 from reem.server import EmbeddedServer
 from reem_async.local.host import reason_against
-from reem_async.local.path import LocalPath
+from reem_async.local.path import LEAST, LocalPath
 from reem_async.local.reader import LocalReader
 from reem_async.local.segment import SLOTS
 from reem_async.plan.keys import keys_of
@@ -48,7 +50,9 @@ LARGEST = 1 << 16
 """Bytes of a frame; most are shorter, so that a processor makes many."""
 PATIENCE = 60.0
 """Seconds in which something must come about that takes some milliseconds on a machine with nothing else to do."""
-COUNTED = "written", "full", "seen", "gone", "torn", "left"
+COUNTED = "written", "full", "seen", "gone", "torn", "left", "shared"
+MODES = "auto", "early", "auto"
+"""Of the publishers with a server; the last one is never killed."""
 
 
 class Party:
@@ -117,9 +121,9 @@ class Count:
         return sum(row[COUNTED.index(what)] for row in self._rows)
 
 
-def frame(rng: random.Random, source: np.ndarray, largest: int = LARGEST) -> list[Any]:
+def frame(rng: random.Random, source: np.ndarray, smallest: int = 256, largest: int = LARGEST) -> list[Any]:
     """Return the pieces of a frame: its checksum, and bytes that are not those of any other."""
-    size = int(largest ** rng.uniform(0.5, 1))
+    size = int(smallest * (largest / smallest) ** rng.random())
     start = rng.randrange(len(source) - size)
     body = source[start : start + size].data
     return [zlib.crc32(body).to_bytes(8, "little"), body]
@@ -269,8 +273,8 @@ def without_server(seed: int, uses: int, say: Callable[[str], None]) -> Count:
 
 
 def shot(rng: random.Random, source: np.ndarray) -> dict[str, Any]:
-    """Return a document that can be told from any other, and from a torn one."""
-    checksum, body = frame(rng, source)
+    """Return a document that can be told from any other, and from a torn one; most go through shared memory."""
+    checksum, body = frame(rng, source, LEAST // 2, 4 * LEAST)
     return {"image": np.frombuffer(body, np.uint8), "sum": int.from_bytes(checksum, "little"), "id": rng.random()}
 
 
@@ -279,21 +283,67 @@ def is_whole_shot(data: Any) -> bool:
     return zlib.crc32(data["image"].data) == data["sum"]
 
 
+class Costs:
+    """What a party has lost from its beginning to its end.
+
+    Args:
+        url: Of a server; what a process needs once, such as threads, is there when it was used once.
+    """
+
+    def __init__(self, url: str) -> None:
+        with reem.RedisInterface(url) as interface:
+            reem.SilentSubscriber("cam", interface).listen()
+        self._descriptors, self._memory, self.grown = open_files(), 0.0, 0.0
+
+    def look(self) -> None:
+        """Look at the memory; what is needed is there the first time."""
+        self._memory = self._memory or resident()
+        self.grown = resident() - self._memory
+
+    def end(self) -> tuple[int, float]:
+        """Return how many descriptors more there are, once all was let go, and how many megabytes there were."""
+        deadline = time.monotonic() + PATIENCE
+        while (left := open_files() - self._descriptors) > 0 and time.monotonic() < deadline:
+            time.sleep(0.01)  # threads are ending
+        return left, self.grown
+
+
+def resident() -> float:
+    """Return the megabytes of this process's own, without what it shares with others."""
+    with open("/proc/self/status", encoding="ascii") as file:
+        return next(int(line.split()[1]) for line in file if line.startswith("RssAnon:")) / 1024
+
+
 def publish_through(end: Any, url: str, mode: str) -> None:
-    """Publish between "go" and "pause"."""
+    """Publish between "go" and "pause", until "end"."""
+    costs = Costs(url)
+    _publish_through(end, url, mode, costs)
+    end.send(costs.end())
+
+
+def _publish_through(end: Any, url: str, mode: str, costs: Costs) -> None:
     rng = random.Random(secrets.randbits(64))
     source = np.frombuffer(rng.randbytes(8 * LARGEST), np.uint8)
     with reem.RedisInterface(url, local=mode) as interface:
-        space, goes = reem.PublishSpace(interface), True
+        space, said = reem.PublishSpace(interface), "go"
         while True:
-            while end.poll(0 if goes else None):
-                goes = end.recv() == "go"
-                end.send(goes)
+            while end.poll(0 if said == "go" else None):
+                said = end.recv()
+                costs.look()
+                if said == "end":
+                    return
+                end.send(said)
             space["cam"] = shot(rng, source)
 
 
 def mirror_through(end: Any, url: str, place: int, count: Count) -> None:
     """Follow, and answer with the id of what the mirror has; every other one keeps frames and looks at them slowly."""
+    costs = Costs(url)
+    _mirror_through(end, url, place, count, costs)
+    end.send(costs.end())
+
+
+def _mirror_through(end: Any, url: str, place: int, count: Count, costs: Costs) -> None:
     logging.getLogger("reem").setLevel(logging.ERROR)  # it says that callbacks are behind
     kept: list[Any] = []
 
@@ -301,6 +351,7 @@ def mirror_through(end: Any, url: str, place: int, count: Count) -> None:
         if data is None:
             return
         count.add(place, "seen")
+        count.add(place, "shared", in_slot(data["image"]))
         count.add(place, "torn", not is_whole_shot(data))
         if place % 2:
             kept.append(data)
@@ -314,48 +365,67 @@ def mirror_through(end: Any, url: str, place: int, count: Count) -> None:
         mirror.listen()
         calls = reem.CallbackSubscriber("cam", interface, see)
         calls.listen()
-        while True:
-            end.recv()
+        while end.recv() != "end":
             data = mirror.value()
             end.send((data["id"], is_whole_shot(data)) if data else (None, True))
             del data
+            costs.look()
 
 
-def with_server(seed: int, rounds: int, say: Callable[[str], None]) -> float:
-    """Publish, kill and pause; returns the most seconds until all mirrors had what the server has."""
+class Result(NamedTuple):
+    """What came out with a server.
+
+    Attributes:
+        count: What all have counted.
+        killed: Parties.
+        slowest: The most seconds until all mirrors had what the server has.
+        descriptors: Left in the two that were not killed.
+        grown: Megabytes more in one of them.
+    """
+
+    count: Count
+    killed: int
+    slowest: float
+    descriptors: int
+    grown: float
+
+
+def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) -> Result:
+    """Publish, kill and pause."""
     rng, count, slowest, kills = random.Random(seed), Count(), 0.0, 0
-    with EmbeddedServer() as server, reem.RedisInterface(server.url) as interface:
+    with reem.RedisInterface(url) as interface:
         kvs = reem.KeyValueStore(interface)
         reem.PublishSpace(interface)["cam"] = shot(rng, np.frombuffer(rng.randbytes(8 * LARGEST), np.uint8))
-        publishers = [Party(lambda end, it=it: publish_through(end, server.url, it)) for it in ("auto", "early")]
-        mirrors = [
-            Party(lambda end, it=it: mirror_through(end, server.url, PUBLISHERS + it, count)) for it in range(READERS)
-        ]
+        publishers = [Party(lambda end, it=it: publish_through(end, url, it)) for it in MODES]
+        mirrors = [Party(lambda end, it=it: mirror_through(end, url, PUBLISHERS + it, count)) for it in range(READERS)]
+        mortal = publishers[:-1] + mirrors[:-1]
         for _ in range(rounds):
             for publisher in publishers:
                 publisher.ask("go")
             for _ in range(rng.randrange(4)):
                 time.sleep(rng.uniform(0.0, 0.3))
-                rng.choice([*publishers, *mirrors]).kill()
+                rng.choice(mortal).kill()
                 kills += 1
             time.sleep(rng.uniform(0.0, 0.3))
-            paused = [publisher.ask("pause") for publisher in publishers]
-            assert paused == [False, False]
+            assert {publisher.ask("pause") for publisher in publishers} == {"pause"}
             wanted, begun = kvs["cam"].read()["id"], time.monotonic()
             for party in mirrors:
                 while (found := party.ask("what?")) != (wanted, True):
                     assert found[1], "a mirror has a torn frame"
                     assert time.monotonic() < begun + PATIENCE, "a mirror has something else than the server"
             slowest = max(slowest, time.monotonic() - begun)
-        for party in [*publishers, *mirrors]:
+        for party in mortal:
             party.stop(signal.SIGKILL)
             party.end()
+        lasting = [party.ask("end") for party in (mirrors[-1], publishers[-1])]
+        assert [party.end() for party in (mirrors[-1], publishers[-1])] == [0, 0]
+    result = Result(count, kills, slowest, sum(it[0] for it in lasting), max(it[1] for it in lasting))
     say(
-        f"{rounds} rounds, {count['seen']:,} updates seen, {kills} parties killed, {count['torn']} torn; "
-        f"all mirrors were equal to the server's value within {slowest:.2f} s"
+        f"{rounds} rounds, {count['seen']:,} updates seen, {count['shared']:,} of them in shared memory; "
+        f"{kills} parties killed; {count['torn']} torn; all mirrors were equal to the server's within {slowest:.2f} s; "
+        f"{result.descriptors} descriptors left and at most {result.grown:.1f} MB more in those that were not killed"
     )
-    assert count["torn"] == 0
-    return slowest
+    return result
 
 
 def main() -> None:
@@ -377,7 +447,12 @@ def main() -> None:
 
     LocalReader()
     without_server(options.seed, options.uses, say)
-    slowest = with_server(options.seed, options.rounds, say)
+    with EmbeddedServer() as server:
+        result = with_server(server.url, options.seed, options.rounds, say)
+    assert result.count["torn"] == 0
+    assert result.count["shared"] > 0, "no frame went through shared memory"
+    assert result.descriptors == 0
+    slowest = result.slowest
     if slowest > options.within:
         sys.exit(f"a mirror was behind for more than {options.within:g} s; is the machine busy?")
 

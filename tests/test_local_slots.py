@@ -17,7 +17,7 @@ def test_no_frame_is_torn_and_nothing_is_left_whoever_is_killed():
     """And all mirrors have what the server has at each pause."""
     words = "--seed", "31", "--uses", "8000", "--rounds", "3", "--within", str(6 * PATIENCE)
     done = subprocess.run(
-        [sys.executable, "-m", "tests.slots", *words],
+        [sys.executable, str(ROOT / "tests/slots.py"), *words],
         cwd=ROOT, capture_output=True, text=True, timeout=240, check=False,
     )  # fmt: skip
     assert done.returncode == 0, f"{done.stdout[-6000:]}\n{done.stderr[-3000:]}"
