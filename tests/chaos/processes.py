@@ -26,7 +26,7 @@ from .tools import program, said
 def forks(run: Run) -> None:
     """The children use the interface, the stores and the subscription that they have inherited."""
     count = run.size(100, 9)
-    with PrivateServer() as server, program("forks", server.url, count) as process:
+    with PrivateServer() as server, program("forks", server.url, count, module="family") as process:
         found = said(process)
     run.at_least("forks", found["worked"] + found["refused"], count)
     run.at_least("children that worked", found["worked"], 0)

@@ -3,6 +3,7 @@
 from . import (  # noqa: F401
     atomic,
     calls,
+    frames,
     hostile,
     model,
     outages,

@@ -97,9 +97,9 @@ def measured(times: list[float]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def program(name: str, *arguments: Any, flags: tuple[str, ...] = ("-W", "error")):
+def program(name: str, *arguments: Any, module: str = "programs", flags: tuple[str, ...] = ("-W", "error")):
     """Start one of the programs; both ways of talking to it are pipes."""
-    command = [sys.executable, *flags, "-m", "tests.chaos.programs", name, *map(str, arguments)]
+    command = [sys.executable, *flags, "-m", f"tests.chaos.{module}", name, *map(str, arguments)]
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
@@ -123,6 +123,16 @@ def order(process: subprocess.Popen[str], word: object) -> None:
     """Tell a program to go on."""
     process.stdin.write(f"{word}\n")
     process.stdin.flush()
+
+
+def say(**facts: Any) -> None:
+    """Tell the row: what a program does."""
+    print(json.dumps(facts), flush=True)
+
+
+def heard() -> str:
+    """Wait for the row's next word: what a program does."""
+    return sys.stdin.readline().strip()
 
 
 class Log:
