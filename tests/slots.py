@@ -378,7 +378,8 @@ class Result(NamedTuple):
     Attributes:
         count: What all have counted.
         killed: Parties.
-        slowest: The most seconds until all mirrors had what the server has.
+        slowest: The most seconds until all mirrors had what the server has,
+        slowest_early: and where the early publisher was killed, whose last update may be nowhere.
         descriptors: Left in the two that were not killed.
         grown: Megabytes more in one of them.
     """
@@ -386,13 +387,14 @@ class Result(NamedTuple):
     count: Count
     killed: int
     slowest: float
+    slowest_early: float
     descriptors: int
     grown: float
 
 
 def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) -> Result:
     """Publish, kill and pause."""
-    rng, count, slowest, kills = random.Random(seed), Count(), 0.0, 0
+    rng, count, slowest, kills = random.Random(seed), Count(), [0.0, 0.0], 0
     with reem.RedisInterface(url) as interface:
         kvs = reem.KeyValueStore(interface)
         reem.PublishSpace(interface)["cam"] = shot(rng, np.frombuffer(rng.randbytes(8 * LARGEST), np.uint8))
@@ -402,10 +404,13 @@ def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) ->
         for _ in range(rounds):
             for publisher in publishers:
                 publisher.ask("go")
+            early = False
             for _ in range(rng.randrange(4)):
                 time.sleep(rng.uniform(0.0, 0.3))
-                rng.choice(mortal).kill()
+                victim = rng.choice(mortal)
+                victim.kill()
                 kills += 1
+                early = early or victim is publishers[MODES.index("early")]
             time.sleep(rng.uniform(0.0, 0.3))
             assert {publisher.ask("pause") for publisher in publishers} == {"pause"}
             wanted, begun = kvs["cam"].read()["id"], time.monotonic()
@@ -413,16 +418,17 @@ def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) ->
                 while (found := party.ask("what?")) != (wanted, True):
                     assert found[1], "a mirror has a torn frame"
                     assert time.monotonic() < begun + PATIENCE, "a mirror has something else than the server"
-            slowest = max(slowest, time.monotonic() - begun)
+            slowest[early] = max(slowest[early], time.monotonic() - begun)
         for party in mortal:
             party.stop(signal.SIGKILL)
             party.end()
         lasting = [party.ask("end") for party in (mirrors[-1], publishers[-1])]
         assert [party.end() for party in (mirrors[-1], publishers[-1])] == [0, 0]
-    result = Result(count, kills, slowest, sum(it[0] for it in lasting), max(it[1] for it in lasting))
+    result = Result(count, kills, *slowest, sum(it[0] for it in lasting), max(it[1] for it in lasting))
     say(
         f"{rounds} rounds, {count['seen']:,} updates seen, {count['shared']:,} of them in shared memory; "
-        f"{kills} parties killed; {count['torn']} torn; all mirrors were equal to the server's within {slowest:.2f} s; "
+        f"{kills} parties killed; {count['torn']} torn; all mirrors were equal to the server's within "
+        f"{slowest[0]:.2f} s, {slowest[1]:.2f} where the early publisher was killed; "
         f"{result.descriptors} descriptors left and at most {result.grown:.1f} MB more in those that were not killed"
     )
     return result
