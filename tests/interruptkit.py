@@ -14,6 +14,7 @@ import contextlib
 import faulthandler
 import gc
 import logging
+import os
 import random
 import signal
 import sys
@@ -25,11 +26,16 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from slotkit import in_slot
 
 import reem
 from reem import recording, snapshots
 from reem.errors import Conflict, InterfaceClosed, PartialWrite
 from reem.server import EmbeddedServer
+from reem_async.local.host import reason_against
+from reem_async.local.reader import LocalReader
+from reem_async.local.segment import SLOTS
+from reem_async.plan.slots import Slot
 
 STUCK = 15.0
 """Seconds after which a call has not ended: all limits of the calls below are far shorter."""
@@ -177,7 +183,46 @@ class Work:
 
 CALLS = [name for name in vars(Work) if name not in ("renew", "prepare", "name", "check") and name[0] != "_"]
 SLOW = ("record", "snapshot")
-QUICK = ("read", "write", "publish", "watch", "mirror", "state", "calculate", "append")
+QUICK = ("read", "write", "publish", "publish_array", "watch", "mirror", "state", "calculate", "append")
+
+
+class Witness:
+    """A program near by that looks at the arrays in shared memory, and is not interrupted."""
+
+    def __init__(self, host, prefix):
+        self.interface = reem.RedisInterface(host, namespace=prefix)
+        self.mirror = reem.CallbackSubscriber("big", self.interface, self.see)
+        self.mirror.listen()
+        self.shared, self.problems = 0, []
+
+    def see(self, data, updated_path):
+        if data is None:
+            return
+        self.shared += in_slot(data["image"])
+        if data["name"] != "big" or not np.array_equal(data["image"], ARRAY):
+            self.problems.append(f"heard {data!r:.100}")
+
+    def look_at_locks(self, work):
+        """Nobody looks at any slot any more: each can be written, and is free when it was looked at."""
+        until = time.monotonic() + STUCK
+        while not self.shared and time.monotonic() < until:  # a short run on a busy machine
+            work.publish_array()
+        work.publish_array()
+        self.interface.close()
+        self.mirror = None  # it has the last one
+        gc.collect()
+        for segment in work.interface._direct.session.local._segments.values():
+            for _ in range(2):
+                views = []
+                for _ in range(SLOTS):
+                    where = segment.put([b"x"], [1]) or (0, 0)
+                    slot = Slot("", os.getpid(), segment.descriptor, segment.inode, *where)
+                    views.append(LocalReader().view(slot, 1))
+                if None in views:
+                    self.problems.append(f"of {SLOTS} slots {views.count(None)} cannot be written, or read")
+                del views
+        if not self.shared:
+            self.problems.append("nothing has gone through shared memory")
 
 
 class Stress:
@@ -279,11 +324,16 @@ def main():
         folder = stack.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
         work = Work(host, given.prefix, folder)
         work.prepare()
+        witness = Witness(host, given.prefix)
         stress = Stress(work, given.mode, given.calls.split(","), given.seed)
         steps = stress.run(given.seconds)
+        if not reason_against():
+            witness.look_at_locks(work)
+        stress.problems += witness.problems
         work.interface.close()
         gc.collect()
     print(f"seed {given.seed}: {steps} calls, {sum(stress.hits.values())} signals while one was under way")
+    print(f"{witness.shared} arrays were seen in shared memory by another interface")
     for name in given.calls.split(","):
         print(f"  {name:15}", *(f"{mode} {stress.hits[name, mode]:6}" for mode in stress.modes))
     print(*stress.problems, sep="\n")

@@ -405,7 +405,7 @@ def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) ->
             for publisher in publishers:
                 publisher.ask("go")
             early = False
-            for _ in range(rng.randrange(4)):
+            for _ in range(rng.randrange(1, 4)):
                 time.sleep(rng.uniform(0.0, 0.3))
                 victim = rng.choice(mortal)
                 victim.kill()

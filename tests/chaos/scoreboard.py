@@ -28,7 +28,7 @@ class Row:
     """One line of the scoreboard.
 
     Attributes:
-        number: As in research/reliability.md, section 3.
+        number: Up to 20 as in research/reliability.md, section 3.
         what: What is done.
         target: What must come out, for people; the bounds themselves are in the row's function.
         function: Does it.
