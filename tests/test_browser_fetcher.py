@@ -16,10 +16,14 @@ from reem_async.tools.browser.history import History
 LARGE = np.zeros((300, 300))
 
 
+async def touch(path, tree):
+    """Nobody tells of what is only stored."""
+
+
 def fetcher_of(interface, name, fence, last_note=""):
     history = History(1000.0, 1 << 24)
     history.begin(name, b"{}")
-    return Fetcher(interface.session, history, Allowance(1e9, 1e9), lambda name: last_note, fence), history
+    return Fetcher(interface.session, history, Allowance(1e9, 1e9), lambda name: last_note, fence, touch), history
 
 
 async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(key, apspace, binterface):

@@ -373,9 +373,8 @@ def test_the_past_of_what_is_only_stored_is_not_the_present(page, ask, kvs, key,
         before = len(source.history.times((name,)))
         kvs[name] = make(number)
         eventually(lambda before=before: len(source.history.times((name,))) > before)
-        now = time.time()
-        eventually(lambda now=now: content(ask, name, now) is not None)
-        known[now] = number
+        eventually(lambda: not source.history.kept((name,), time.time()).late)  # an array is known a moment later
+        known[time.time()] = number
     found = {at: content(ask, name, at) for at in known}
     assert found == {at: content_of(make(number)) for at, number in known.items()}
 

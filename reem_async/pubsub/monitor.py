@@ -89,6 +89,7 @@ class Monitor(Stream[Event]):
 
     Attributes:
         doubted: Called with a top-level key of which a message could not be read.
+        broken: Called when updates of any key may be lost: a connection broke.
 
     A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
     other: they come from different nodes. There, whose servers have no patterns for what only one node is told,
@@ -121,6 +122,7 @@ class Monitor(Stream[Event]):
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
         self._doubts: set[str] = set()  # keys of which a message could not be read: the next one has a gap
         self.doubted: Callable[[str], None] = lambda name: None
+        self.broken: Callable[[], None] = lambda: None
 
     @property
     def _following(self) -> bool:
@@ -175,6 +177,7 @@ class Monitor(Stream[Event]):
 
     def _lost(self) -> None:
         self._gaps = set()
+        self.broken()
 
     def _doubt(self, channel: bytes) -> None:
         place = self._split(channel)

@@ -28,7 +28,7 @@ from .partial_reads import noted_text
 from .timeline import PENDING
 from .trees import Leaf, changed, framed, leaf_of, tree_of, walk
 
-__all__ = ["Allowance", "Fetcher", "array_bytes"]
+__all__ = ["Allowance", "Fetcher", "hear", "reading_after", "rebased"]
 
 _RECENT = 16
 """Updates that are known again if they come twice while something is read."""
@@ -78,9 +78,11 @@ class Fetcher:
         allowance: Bytes of arrays that may be read.
         last_note: Returns the note of the last notice of a key that was heard.
         fence: Returns when all that was published before has been `heard`.
+        touch: Called with a path, and what is known of it, directly before the arrays there are read.
 
     Attributes:
         behind: Keys with an announcement that has not been answered.
+        finished: Keys of which something was read; whoever wants to know empties it before.
     """
 
     def __init__(
@@ -90,12 +92,14 @@ class Fetcher:
         allowance: Allowance,
         last_note: Callable[[str], str],
         fence: Callable[[], Awaitable[None]],
+        touch: Callable[[Path, Any], Awaitable[None]],
     ) -> None:
         self._session = session
         self._history = history
         self._allowance = allowance
         self._last_note = last_note
         self._fence = fence
+        self._touch = touch
         self._paths: dict[Path, None] = {}
         self._owed: dict[Path, int] = {}  # whose arrays are to be read, and how many bytes they have
         self._rested = 0.0  # the instant from which on arrays may be read again, on the monotonic clock
@@ -103,6 +107,11 @@ class Fetcher:
         self._name = ""  # what is being read, and what is heard of it meanwhile
         self._division: Division[Event] = Division()
         self.behind: set[str] = set()
+        self.finished: set[str] = set()
+
+    def concerns(self, name: str) -> bool:
+        """Return whether a part of a key is being read, is about to be, or was read since `finished` was emptied."""
+        return name == self._name or name in self.finished or any(path[0] == name for path in self._paths)
 
     def want(self, path: Path, when: float) -> None:
         """Note that the buffer lacks what is at a path since an instant."""
@@ -113,8 +122,8 @@ class Fetcher:
 
     def heard(self, event: Event) -> None:
         """Take notice of an update, whatever it is."""
-        if event.name == self._name and self._division.gaps.count(event) is not None:
-            self._division.hear(Heard(event, None if event.gap else 0))
+        if event.name == self._name:
+            hear(self._division, event)
 
     async def run(self) -> None:
         """Read what is wanted, for ever."""
@@ -145,14 +154,14 @@ class Fetcher:
 
     async def _fetch_one(self, path: Path, with_arrays: bool) -> None:
         self._name = name = str(path[0])
-        self._division = Division(GapDetector(_RECENT))
-        self._division.gaps.begin_with(self._last_note(name).encode())
+        self._division = reading_after(self._last_note(name))
         try:
             tree = await divided_read(self._division, partial(self._read, path, with_arrays), self._fence)
         finally:
             self._name = ""
+            self.finished.add(name)
         later = [each.update for each in self._division.take()[1] if each.update is not None]
-        tree = _rebased(tree, path, later)
+        tree = rebased(tree, path, later)
         self._history.add_read(path, tree, time.time(), answer=True)
         if not any(event.value is ANNOUNCED for event in later):
             self.behind.discard(name)
@@ -164,13 +173,14 @@ class Fetcher:
         if text is None:
             return MISSING, note
         tree = tree_of(text, str(path[0]))
-        size = array_bytes(tree) if marked(text) else 0
+        size = _array_bytes(tree) if marked(text) else 0
         if not size or self._allowance.wait(size) == math.inf:
             return tree, note
         if not with_arrays or self._until_turn(size) > 0 or not self._allowance.take(size):
             self._owed.setdefault(path, size)
             return tree, note
         began = time.monotonic()
+        await self._touch(path, tree)
         self._division.asked(in_order=False)
         value, _, note = await fetch(self._session, self._session.keys(path[0]), path[1:])
         now = time.monotonic()
@@ -178,12 +188,25 @@ class Fetcher:
         return await asyncio.to_thread(framed, value), note
 
 
-def array_bytes(tree: Any) -> int:
+def _array_bytes(tree: Any) -> int:
     """Return how many bytes the arrays in a tree have."""
     return sum([leaf_of(it).size for _, it in walk(tree, ()) if isinstance(it, Leaf | np.ndarray | bytes)])
 
 
-def _rebased(tree: Any, path: Path, later: Iterable[Event]) -> Any:
+def reading_after(note: str) -> Division[Event]:
+    """Return what tells the updates that are in what is read from those that are not, given the last one's note."""
+    division: Division[Event] = Division(GapDetector(_RECENT))
+    division.gaps.begin_with(note.encode())
+    return division
+
+
+def hear(division: Division[Event], event: Event) -> None:
+    """Take notice of an update of what is read."""
+    if division.gaps.count(event) is not None:
+        division.hear(Heard(event, None if event.gap else 0))
+
+
+def rebased(tree: Any, path: Path, later: Iterable[Event]) -> Any:
     """Return what was read at a path with the updates applied that it does not include; those announced are to come."""
     for event in later:
         value = MISSING if event.deleted else event.value

@@ -39,6 +39,11 @@ _SHORT = 128
 # Places that are looked at for one search, so that the program answers others meanwhile.
 _WALKED = 200_000
 
+_UNTOLD = (
+    "what is only stored is looked for once a second, and overwritten arrays are not noticed: the server does not tell"
+)
+"""Said where it is so: the user lacks a right, and a warning has said which."""
+
 _AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
 """What is raised while the server cannot be asked: its past is known all the same."""
 
@@ -46,10 +51,11 @@ _AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
 class LiveSource:
     """What a server holds, and what it held in the last seconds.
 
-    Sees every update that is published. What a KeyValueStore writes is seen when the server is looked
-    at, about twice a second for some hundreds of keys, long documents and arrays as often as 1 MB a second
-    allows; its arrays only while their key is not published. Arrays of the past are kept as far as the
-    budget allows.
+    Sees every update that is published, and what is only stored, by whomever, a moment after the server has said that a
+    key was changed: some hundredths of a second, half a second for a key that is published all the time, and as long as
+    8 MB a second of documents take. Keys that are new and only stored are found within a second. A server that does not
+    tell, for want of the right to CLIENT TRACKING, is looked at once a second: arrays that are overwritten by others of
+    their shape are not noticed then, and `status` says so. Arrays of the past are kept as far as the budget allows.
 
     Args:
         interface: The server; closed with the source.
@@ -82,6 +88,8 @@ class LiveSource:
         notes = ["the buffer is full: it reaches back less far than asked for"] if self.history.dropped else []
         if self._follower.skipped:
             notes.append(f"{self._follower.skipped} updates came too fast to be kept")
+        if not self._follower.hears_of_changes:
+            notes.append(_UNTOLD)
         end = time.time()
         return Status(
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
@@ -111,7 +119,6 @@ class LiveSource:
         return [self._stamped(found[path], last, when, live=at is None) for path in paths]
 
     async def _peek(self, paths: Sequence[Path]) -> list[Node | None]:
-        self._follower.shown([str(path[0]) for path in paths])
         return await peek(self.interface.session, paths)
 
     def _past(self, path: Path, at: float) -> Node | None:
@@ -167,8 +174,8 @@ class LiveSource:
     async def value(self, path: Path, at: float | None) -> Sample:
         """Return the value at a path, arrays included; readings of the same moment are shared."""
         name = str(path[0])
-        # A doubtful key may have changed without a word that could be heard: its present does not speak for its past.
-        if at is None or (self.history.unchanged(name, at) and name not in self._follower.doubtful):
+        # Of arrays that the server does not tell of, the present does not speak for the past.
+        if at is None or (self.history.unchanged(name, at) and self._follower.is_told(name)):
             try:
                 return Sample(await self._read(path), 0.0, self._age(path, at))
             except _AWAY:

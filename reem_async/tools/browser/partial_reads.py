@@ -20,7 +20,7 @@ from .addresses import is_addressable
 from .nodes import Node, node_of, shown_text
 from .trees import tree_of
 
-__all__ = ["document_texts", "keys_at", "noted_text", "noted_texts", "peek"]
+__all__ = ["keys_at", "noted_text", "noted_texts", "peek"]
 
 _LONGEST = 2048
 """Bytes of a text that are fetched to show its beginning; placeholders are shorter."""
@@ -134,30 +134,23 @@ async def keys_at(session: Session, path: Path) -> list[str] | int | None:
     return None
 
 
-async def document_texts(session: Session, names: Sequence[str]) -> list[bytes | None]:
-    """Return the text of each top-level key's document, None if it has none. One round trip."""
-    documents = [session.keys(name) for name in names]
-    replies = await _ask(session, [("JSON.GET", keys.document) for keys in documents])
-    return [_text(reply, keys) for keys, reply in zip(documents, replies, strict=True)]
+async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[bytes | None, Reply] | None]:
+    """Return the text at each path, None if nothing is there, and the note of the last update that is in it.
 
-
-async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[bytes | None, str]]:
-    """Return the text at each path with the note of the last notice that it includes. One round trip.
-
-    The text is None if nothing is there. The note is "" if there is none, and if something was published
-    while the text was read.
+    One round trip. None in place of both if something was published while the text was read.
     """
     documents = [session.keys(path[0]) for path in paths]
     commands: list[Command] = []
     for keys, path in zip(documents, paths, strict=True):
         commands += [("GET", keys.last), get_command(keys, path[1:]), ("GET", keys.last)]
     replies = await _ask(session, commands)
-    found: list[tuple[bytes | None, str]] = []
-    for keys, before, reply, after in zip(documents, replies[::3], replies[1::3], replies[2::3], strict=True):
-        # The note before and after the text: if they are equal, that update is in it, and no later one.
-        noted = before if before == after and isinstance(before, bytes | bytearray) else b""
-        found.append((_found(reply, keys), bytes(noted).decode(errors="replace")))
-    return found
+    # Who may not read the notes has none of them.
+    notes = [None if isinstance(reply, Exception) else reply for reply in replies]
+    # The note before and after the text: if they are equal, that update is in it, and no later one.
+    return [
+        (_found(reply, keys), before) if before == after else None
+        for keys, before, reply, after in zip(documents, notes[::3], replies[1::3], notes[2::3], strict=True)
+    ]
 
 
 async def noted_text(session: Session, path: Path) -> tuple[bytes | None, Reply]:

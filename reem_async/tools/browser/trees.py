@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,11 +46,13 @@ class Leaf:
         label: The ship's label, such as "numpy".
         summary: What it is, for people.
         size: Bytes.
+        suffix: Which key on the server has it: its name after the tag; None if that is not known.
     """
 
     label: str
     summary: str
     size: int
+    suffix: str | None = field(default=None, compare=False)
 
 
 class Frame:
@@ -125,7 +127,7 @@ def tree_of(text: bytes, name: str) -> Any:
         raise BadData(f"{name}: what the server sent is not JSON: {error}") from None
     for slot in find(holder, name) if marked(text) else ():
         it = slot.placeholder
-        slot.container[slot.key] = Leaf(it.label, it.summary, it.size)
+        slot.container[slot.key] = Leaf(it.label, it.summary, it.size, it.suffix)
     return holder[0]
 
 
