@@ -26,7 +26,7 @@ from ..recording.fetch import fetch
 from .history import History
 from .partial_reads import noted_text
 from .timeline import PENDING
-from .trees import Leaf, changed, framed, leaf_of, tree_of, walk
+from .trees import Leaf, changed, framed, identical, leaf_of, tree_of, walk
 
 __all__ = ["Allowance", "Fetcher", "hear", "reading_after", "rebased"]
 
@@ -101,6 +101,7 @@ class Fetcher:
         self._fence = fence
         self._touch = touch
         self._paths: dict[Path, None] = {}
+        self._checks: set[Path] = set()  # those of them that may be what the buffer has
         self._owed: dict[Path, int] = {}  # whose arrays are to be read, and how many bytes they have
         self._rested = 0.0  # the instant from which on arrays may be read again, on the monotonic clock
         self._news = asyncio.Event()
@@ -117,8 +118,16 @@ class Fetcher:
         """Note that the buffer lacks what is at a path since an instant."""
         self._history.add(path, PENDING, 0, when)
         self.behind.add(str(path[0]))
+        self._checks.discard(path)
         self._paths.setdefault(path)
         self._news.set()
+
+    def check(self, path: Path) -> None:
+        """Read what is at a path: the buffer may have another array there."""
+        if path not in self._paths and path not in self._owed:
+            self._checks.add(path)
+            self._paths[path] = None
+            self._news.set()
 
     def heard(self, event: Event) -> None:
         """Take notice of an update, whatever it is."""
@@ -162,9 +171,17 @@ class Fetcher:
             self.finished.add(name)
         later = [each.update for each in self._division.take()[1] if each.update is not None]
         tree = rebased(tree, path, later)
-        self._history.add_read(path, tree, time.time(), answer=True)
+        self._note(path, tree)
         if not any(event.value is ANNOUNCED for event in later):
             self.behind.discard(name)
+
+    def _note(self, path: Path, tree: Any) -> None:
+        if path not in self._checks:
+            self._history.add_read(path, tree, time.time(), answer=True)
+        elif path not in self._owed:  # else its turn comes
+            self._checks.discard(path)
+            if not identical(tree, self._history.tree(path, time.time())):
+                self._history.add_read(path, tree, time.time())
 
     async def _read(self, path: Path, with_arrays: bool) -> tuple[Any, Reply]:
         """Return the document's part, with its arrays if it is their turn, and the note of what it includes."""

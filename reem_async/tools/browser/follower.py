@@ -190,10 +190,11 @@ class Follower:
             began = time.monotonic()
             try:
                 await self._find()
-                self.lost = self._ended()
             except (RedisError, ReemError, OSError) as error:
                 self.lost = str(error)
-            await asyncio.sleep(_FIND_PAUSE * (time.monotonic() - began))
+            else:
+                self.lost = self._ended()
+                await asyncio.sleep(_FIND_PAUSE * (time.monotonic() - began))
 
     def _ended(self) -> str:
         """Return why following ended, if it did: what is shown would no longer be news."""

@@ -2,7 +2,7 @@
 
 The server tells once of each key that was touched, so a key is touched directly before it is read. What differs then
 from all that was published was stored. An array that is stored over another one leaves the document's text as it is:
-that its own key was changed is all that tells of it, unless a published update has changed it.
+that its own key was changed is all that tells of it. So arrays that were changed are read and compared.
 
 What the server does not tell of, since it may not be asked or the connection for it is broken, is read each second.
 """
@@ -23,7 +23,7 @@ from ...plan.trees import MISSING
 from ...pubsub.division import Division
 from ...pubsub.looks import Looks
 from ...pubsub.manager import manager_of
-from ...pubsub.monitor import Event
+from ...pubsub.monitor import ANNOUNCED, Event
 from ...session import Session
 from .addresses import is_addressable
 from .fetcher import Allowance, Fetcher, hear, reading_after, rebased
@@ -124,13 +124,13 @@ class StoredChanges:
         self._ask(name)
 
     def heard(self, event: Event) -> None:
-        """Take notice of a published update: it explains what was changed at its place until now."""
+        """Take notice of a published update: what is to be fetched explains what was changed at its place until now."""
         name, arrays = event.name, self._arrays.get(event.name, {})
         if name in self._reading:
             hear(self._reading[name], event)
         if name in self._looks:
             self._looks[name].heard += 1
-        for key in [key for key in self._changed if key in arrays] if arrays else ():
+        for key in [key for key in self._changed if key in arrays] if event.value is ANNOUNCED else ():
             if below(arrays[key], event.path) or below(event.path, arrays[key]):
                 self._changed.discard(key)
         if event.gap:
@@ -232,6 +232,7 @@ class StoredChanges:
             with suppress(BadData):
                 later = divisions[name].take()[1]
                 self._compare(name, it[0], [each.update for each in later if each.update is not None])
+            self._unseen.discard(name)
         return sum([len(it[0] or b"") for it in found.values() if it])
 
     def _compare(self, name: str, text: bytes | None, later: Sequence[Event]) -> None:
@@ -244,7 +245,6 @@ class StoredChanges:
         """
         if not self._history.knows(name):
             self._history.begin(name, text if name in self._unseen else None)
-        self._unseen.discard(name)
         has_arrays, when = text is not None and marked(text), time.time()
         # Not if it is not needed: most are what they were.
         tree = tree_of(text, name) if text is not None and (has_arrays or later) else MISSING
@@ -262,7 +262,7 @@ class StoredChanges:
         elif differs:
             self._history.add((name,), PENDING, 0, when)
         for path in () if differs else changed:
-            self._fetcher.want(tuple(takewhile(is_addressable, path)), when)
+            self._fetcher.check(tuple(takewhile(is_addressable, path)))
         if not later:
             self._history.remember(name, text)
         if (differs or changed) and name in self._looks:
@@ -275,8 +275,11 @@ class StoredChanges:
             self._arrays[name] = arrays
         self._told -= before - arrays.keys()
         self._changed -= before - arrays.keys()
-        if not arrays.keys() <= before and self._document(name) in self._told:
-            self._ask(name)  # the server is to tell of the new ones too
+        new = arrays.keys() - before
+        if new and self._document(name) in self._told:
+            self._ask(name)  # the server is to tell of them too
+        if name not in self._unseen:  # they may have been stored anew since they were published
+            self._changed |= new
         # Those that were touched since: the next change of the others would be missed.
         changed = [key for key in arrays if key in self._changed and key in self._told]
         self._changed.difference_update(changed)
