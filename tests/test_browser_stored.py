@@ -1,0 +1,260 @@
+"""What is only stored reaches the page's past when the server says that it was changed: nothing is read at rest."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+
+import numpy as np
+import pytest
+import redis
+from conftest import LOOKING, aeventually, commands_run, same_bits, subscribed, url_of_user
+
+import reem_async
+from reem_async.plan.trees import MISSING
+from reem_async.server.embedded import EmbeddedServer
+from reem_async.tools.browser import LiveSource, follower
+from reem_async.tools.browser.source import NotKept
+from reem_async.tools.browser.trees import thawed
+
+
+@contextlib.asynccontextmanager
+async def past_of(url, *names, **options):
+    """A page's source, once the server tells it when these keys are changed."""
+    source = LiveSource(reem_async.RedisInterface(url, **options), 60.0, 64 << 20)
+    try:
+        await source.start()
+        await told(source, *names)
+        yield source
+    finally:
+        await source.close()
+
+
+async def told(source, *names):
+    """Wait until the server tells of the next change of these keys and their arrays, and none is about to be read."""
+    stored = source._follower._stored
+    await aeventually(
+        lambda: (
+            all(stored._document(name) in stored._told and stored.is_told(name) for name in names)
+            and not stored._due
+            and not any(looks.due for looks in stored._looks.values())
+        )
+    )
+
+
+def content(source, *path):
+    """What the past has as of now."""
+    return thawed(source.history.tree(path, time.time()))
+
+
+async def seen(source, value, *path):
+    """Wait until the past has a value."""
+    await aeventually(lambda: alike(content(source, *path), value))
+
+
+def alike(one, other):
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return same_bits(one, other)
+    return type(one) is type(other) and bool(one is other or one == other)
+
+
+@pytest.fixture
+def nobody_looks(monkeypatch):
+    """The keys are listed at the beginning only: what is seen is what the server has told."""
+    monkeypatch.setattr(follower, "_FIND_SECONDS", 600.0)
+
+
+async def test_at_rest_only_the_names_of_keys_are_asked_for(server_url, key, akvs, apspace, raw):
+    await akvs[key("a")].write({"x": {"y": 1}, "image": np.zeros((30, 30))})
+    await akvs[key("b")].write(np.zeros(5))
+    await apspace[key("c")].write({"x": 1, "image": np.zeros((300, 300))})
+    async with past_of(server_url, key("a"), key("b"), key("c")):
+        before = commands_run(raw)
+        await aeventually(lambda: commands_run(raw)["scan"] >= before["scan"] + 3)
+        sent = {name for name, count in commands_run(raw).items() if count != before.get(name)}
+        assert sent <= LOOKING
+
+
+async def test_each_way_of_storing_is_seen_when_the_server_tells_of_it(server_url, key, akvs, raw, nobody_looks):
+    await akvs[key()].write({"x": {"a": 0}, "image": np.zeros((30, 30))})
+    await akvs[key("array")].write(np.zeros(5))
+    await akvs[key("gone")].write(1)
+    async with past_of(server_url, key(), key("array"), key("gone")) as source:
+        began = time.time()
+        await akvs[key()]["x"]["a"].write(1)
+        await seen(source, 1, key(), "x", "a")
+        raw.execute_command("JSON.SET", key(), "$.x.a", "2")
+        await seen(source, 2, key(), "x", "a")
+        for number in range(1, 4):
+            await akvs[key()]["image"].write(np.full((30, 30), float(number)))
+            await akvs[key("array")].write(np.full(5, float(number)))
+            await seen(source, np.full((30, 30), float(number)), key(), "image")
+            await seen(source, np.full(5, float(number)), key("array"))
+        raw.delete(key("gone"))
+        await seen(source, MISSING, key("gone"))
+        await akvs[key("gone")].write(2)
+        await seen(source, 2, key("gone"))
+        raw.pexpire(key("gone"), 1)
+        await seen(source, MISSING, key("gone"))
+        assert source.history.tree((key(), "x", "a"), began) == 0
+        assert source.history.tree((key("gone"),), began) == 1
+
+
+async def test_all_at_once(nobody_looks):
+    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        for number in range(250):
+            await kvs[f"k{number}"].write({"n": number})
+        names = [f"k{number}" for number in range(250)]
+        async with past_of(server.url, *names) as source:
+            with redis.Redis(port=server.port) as raw:
+                raw.flushall()
+            await aeventually(lambda: all(content(source, name) is MISSING for name in names))
+            await kvs["k7"].write(7)
+            await seen(source, 7, "k7")
+
+
+async def test_a_key_that_is_new_is_found_by_its_name(server_url, key, akvs):
+    async with past_of(server_url) as source:
+        await akvs[key()].write({"x": 1, "image": np.zeros(3)})
+        await seen(source, 1, key(), "x")
+        await seen(source, np.zeros(3), key(), "image")
+        assert key() in source._follower.names
+        await told(source, key())
+        await akvs[key()].delete()
+        await aeventually(lambda: key() not in source._follower.names)
+
+
+@pytest.mark.parametrize("size", [3, 100_000])
+async def test_an_array_that_is_stored_right_behind_a_published_one_is_seen(
+    server_url, key, akvs, apspace, nobody_looks, size
+):
+    """The word that it was changed is not taken for that of the published one."""
+    await apspace[key()].write({"x": 1, "array": np.zeros(size)})
+    async with past_of(server_url, key()) as source:
+        for number in range(1, 16):
+            await apspace[key()]["array"].write(np.full(size, number))
+            await akvs[key()]["array"].write(np.full(size, -number))
+            await seen(source, np.full(size, -number), key(), "array")
+        await apspace[key()]["new"].write(np.full(size, 1))
+        await akvs[key()]["new"].write(np.full(size, 2))
+        await seen(source, np.full(size, 2), key(), "new")
+
+
+async def test_what_is_stored_anew_as_it_was_is_no_change(server_url, key, akvs, nobody_looks):
+    await akvs[key()].write({"array": np.zeros(5)})
+    async with past_of(server_url, key()) as source:
+        await akvs[key()]["array"].write(np.ones(5))
+        await seen(source, np.ones(5), key(), "array")
+        times = source.history.times((key(),))
+        await told(source, key())
+        await akvs[key()]["array"].write(np.ones(5))
+        await told(source, key())
+        await akvs[key()]["array"].write(np.zeros(5))
+        await seen(source, np.zeros(5), key(), "array")
+        assert len(source.history.times((key(),))) == len(times) + 1
+
+
+async def test_what_is_published_all_the_time_is_read_now_and_then(server_url, key, apspace, raw):
+    """Not after each update, though each is a change."""
+    await apspace[key()].write({"x": 0})
+    async with past_of(server_url, key()) as source:
+        before = commands_run(raw)
+        for number in range(1, 501):
+            await apspace[key()]["x"].write(number)
+        await seen(source, 500, key(), "x")
+        await told(source, key())
+        read = max(commands_run(raw).get(name, 0) - before.get(name, 0) for name in ("json.get", "type"))
+        assert read < 250
+
+
+@pytest.mark.parametrize("right", ["client|tracking", "type"])
+async def test_who_may_not_track_looks_once_a_second_and_says_so(caplog, right):
+    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
+        with contextlib.closing(redis.Redis(port=server.port)) as raw:
+            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", f"-{right}")
+        kvs = reem_async.KeyValueStore(own)
+        await kvs["a"].write({"n": 1, "array": np.zeros(5)})
+        with caplog.at_level(logging.WARNING, "reem"):
+            async with past_of(url_of_user(server.url, "robot", "pw")) as source:
+                await seen(source, 1, "a", "n")
+                at = time.time()
+                for number in range(2, 4):
+                    await kvs["a"]["n"].write(number)
+                    await seen(source, number, "a", "n")
+                await kvs["b"].write(3)
+                await seen(source, 3, "b")
+                await kvs["b"].delete()
+                await seen(source, MISSING, "b")
+                assert "once a second" in source.status().note
+                assert source.history.tree(("a", "n"), at) == 1
+    (warning,) = [record.getMessage() for record in caplog.records if record.name.startswith("reem")]
+    assert f"+{right}," in warning
+
+
+async def test_who_may_not_track_is_not_shown_the_present_of_an_array_for_its_past():
+    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
+        with contextlib.closing(redis.Redis(port=server.port)) as raw:
+            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-client|tracking")
+        kvs = reem_async.KeyValueStore(own)
+        await kvs["a"].write({"n": 1, "array": np.zeros(5)})
+        async with past_of(url_of_user(server.url, "robot", "pw")) as source:
+            await seen(source, 1, "a", "n")
+            at = time.time()
+            await kvs["a"]["array"].write(np.ones(5))
+            try:
+                sample = await source.value(("a", "array"), at)
+            except NotKept:
+                return
+            assert not isinstance(sample.value, np.ndarray)
+
+
+async def test_where_it_is_not_the_first_database_nor_without_namespace(nobody_looks):
+    async with EmbeddedServer() as server:
+        url = f"{server.url.rstrip('/').removesuffix('/0')}/3"
+        async with reem_async.RedisInterface(url, namespace="robots/1:") as interface:
+            kvs = reem_async.KeyValueStore(interface)
+            await kvs["a"].write({"n": 0, "array": np.zeros(5)})
+            async with past_of(url, "a", namespace="robots/1:") as source:
+                await kvs["a"]["n"].write(1)
+                await seen(source, 1, "a", "n")
+                await kvs["a"]["array"].write(np.ones(5))
+                await seen(source, np.ones(5), "a", "array")
+
+
+async def test_all_nodes_of_a_cluster_tell(cluster, key, nobody_looks):
+    async with reem_async.RedisInterface(cluster.url) as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        names = [key(f"k{number}") for number in range(20)]
+        for name in names:
+            await kvs[name].write({"n": 0, "array": np.zeros(5)})
+        async with past_of(cluster.url, *names) as source:
+            for name in names:
+                await kvs[name]["n"].write(1)
+                await kvs[name]["array"].write(np.ones(5))
+            for name in names:
+                await seen(source, 1, name, "n")
+                await seen(source, np.ones(5), name, "array")
+            for name in names:
+                await kvs[name].delete()
+            for name in names:
+                await seen(source, MISSING, name)
+
+
+async def test_what_is_stored_while_the_connection_is_broken_is_seen(server_url, key, akvs, raw):
+    """An array leaves no trace in its document's text."""
+    names = [key("a"), key("b")]
+    for name in names:
+        await akvs[name].write({"n": 0, "array": np.zeros(5)})
+    async with past_of(server_url, *names) as source:
+        for number in range(1, 5):
+            for connection in subscribed(raw):
+                raw.client_kill_filter(_id=connection)
+            for name in names:
+                await akvs[name]["array"].write(np.full(5, float(number)))
+                await akvs[name]["n"].write(number)
+            for name in names:
+                await seen(source, number, name, "n")
+                await seen(source, np.full(5, float(number)), name, "array")
+            await told(source, *names)
