@@ -36,7 +36,8 @@ async def told(source, *names):
     stored = source._follower._stored
     await aeventually(
         lambda: (
-            all(stored._document(name) in stored._told and stored.is_told(name) for name in names)
+            all(stored.is_new(name) and source.history.knows(name) and stored.is_told(name) for name in names)
+            and all(stored._document(name) in stored._told for name in names)
             and not stored._due
             and not any(looks.due for looks in stored._looks.values())
         )

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import RedisError, ReemError
+from ...errors import BadData, RedisError, ReemError, WrongKind
 from ...plan import Reply
 from ...plan.paths import Path, below
 from ...plan.placeholders import marked
@@ -32,6 +32,9 @@ __all__ = ["Allowance", "Fetcher", "hear", "reading_after", "rebased"]
 
 _RECENT = 16
 """Updates that are known again if they come twice while something is read."""
+
+_PAUSE = 0.1
+"""Seconds after a read that failed."""
 
 _REST = 4
 """How many times as long as reading arrays took nothing of the kind is read: a slow connection is left to others."""
@@ -83,6 +86,7 @@ class Fetcher:
     Attributes:
         behind: Keys with an announcement that has not been answered.
         finished: Keys of which something was read; whoever wants to know empties it before.
+        failed: Called with a key of which something could not be read, and may be later.
     """
 
     def __init__(
@@ -109,6 +113,7 @@ class Fetcher:
         self._division: Division[Event] = Division()
         self.behind: set[str] = set()
         self.finished: set[str] = set()
+        self.failed: Callable[[str], None] = lambda name: None
 
     def concerns(self, name: str) -> bool:
         """Return whether a part of a key is being read, is about to be, or was read since `finished` was emptied."""
@@ -138,8 +143,14 @@ class Fetcher:
         """Read what is wanted, for ever."""
         while True:
             path, with_arrays = await self._next()
-            with suppress(ReemError, RedisError, OSError):
+            try:
                 await self._fetch_one(path, with_arrays)
+            except (BadData, WrongKind):  # it is no value, now and later
+                self._checks.discard(path)
+            except (ReemError, RedisError, OSError):
+                self._checks.discard(path)
+                self.failed(str(path[0]))
+                await asyncio.sleep(_PAUSE)
 
     async def _next(self) -> tuple[Path, bool]:
         """Return what is to be read next, and whether the turn of its arrays has come."""

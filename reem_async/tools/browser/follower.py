@@ -78,7 +78,8 @@ class Follower:
             session, history, self._fetcher, allowance, self._last_note, self._pump, self._fence
         )
         self._monitor = Monitor(interface, policy=Last(_WAITING))
-        self._monitor.doubted, self._monitor.broken = self._stored.doubt, self._stored.lost
+        self._fetcher.failed = self._monitor.doubted = self._stored.doubt
+        self._monitor.broken = self._stored.lost
         self._tasks: list[asyncio.Task[None]] = []
         self._heard: dict[str, Heard] = {}
         self.names: list[str] = []

@@ -38,6 +38,8 @@ __all__ = ["StoredChanges"]
 _BATCH = 100
 _REST = 4
 """How many times as long as reading documents took none are read: others ask the server, and this program, too."""
+_PAUSE = 0.1
+"""Seconds after a read that failed."""
 _LOOK_BYTES = 8 << 20
 """Bytes of documents a second that are read, a quarter of them of one."""
 _LARGE = 1 << 18
@@ -124,15 +126,16 @@ class StoredChanges:
         self._ask(name)
 
     def heard(self, event: Event) -> None:
-        """Take notice of a published update: what is to be fetched explains what was changed at its place until now."""
+        """Take notice of a published update."""
         name, arrays = event.name, self._arrays.get(event.name, {})
         if name in self._reading:
             hear(self._reading[name], event)
         if name in self._looks:
             self._looks[name].heard += 1
-        for key in [key for key in self._changed if key in arrays] if event.value is ANNOUNCED else ():
+        for key in arrays.keys() - self._told:
             if below(arrays[key], event.path) or below(event.path, arrays[key]):
-                self._changed.discard(key)
+                # It is touched before it is fetched. Else it may have been stored anew behind the update already.
+                (self._changed.discard if event.value is ANNOUNCED else self._changed.add)(key)
         if event.gap:
             self.doubt(name)
         elif self._document(name) not in self._told:
@@ -175,8 +178,9 @@ class StoredChanges:
                 began, size = time.monotonic(), 0
                 try:
                     size = await self._look_at(batch)
-                except (RedisError, ReemError, OSError):  # they are due again when the keys are listed
-                    self._told.difference_update(map(self._document, batch))
+                except (RedisError, ReemError, OSError):
+                    self._read_soon(batch)
+                    await asyncio.sleep(_PAUSE)
                 took = time.monotonic() - began
                 # At the beginning the page waits for it; what it asks for goes first.
                 await asyncio.sleep(0.002 if self._unseen else max(_REST * took, size / _LOOK_BYTES))
