@@ -16,12 +16,10 @@ from hypothesis import given, settings
 import reem_async
 from reem_async.errors import InterfaceClosed
 from reem_async.plan.notices import Notice
-from reem_async.plan.patterns import parse_pattern
 from reem_async.pubsub import reorder as handover
 from reem_async.pubsub.manager import manager_of
 from reem_async.pubsub.monitor import Monitor
 from reem_async.pubsub.reorder import ReorderBuffer
-from reem_async.tools.recording.subscription import Subscription
 
 CHANNEL = b"{key}:notices"
 
@@ -257,34 +255,26 @@ async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pai
         assert [event.value for event in waiting if event.name == name][-100:] == list(range(1, 101))
 
 
-class Recorder:
-    """Who counts how often it is said that updates were lost."""
-
-    def __init__(self, session, name):
-        self.session, self.patterns, self.count = session, [parse_pattern(name)], 0
-
-    def lost(self):
-        self.count += 1
-
-
-async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_followed_over_it(cluster, pair, key):
+@pytest.mark.parametrize("spelled_out", [False, True], ids=["a pattern", "names"])
+async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_followed_over_it(
+    cluster, pair, key, spelled_out
+):
     """And nobody listens less afterwards."""
     space, other = pair
     names = on_each_node(cluster, key, 5)
     for name in names:
         await space[name].write(0)
-    recorder = Recorder(other.session, key("*"))
-    line, manager = Subscription(recorder), manager_of(other.session)
-    await manager.follow(line)
-    for node in cluster.nodes:
-        before, count = {*manager._wires.values()}, recorder.count
-        with raw_of(node) as raw:
-            raw.client_kill_filter(_type="pubsub")
-        await aeventually(lambda before=before: len({*manager._wires.values()} - before) == 1)
-        await aeventually(lambda: not manager._missing() and line.wire is not None)
-        assert recorder.count == count + 1
-    assert len(manager._subscribed) == len(names) + 1
-    await manager.unfollow(line)
+    losses, manager = [], manager_of(other.session)
+    async with Monitor(other, names if spelled_out else [key("*")]) as monitor:
+        monitor.begun_anew = lambda: losses.append(1)
+        for node in cluster.nodes:
+            before, count = {*manager._wires.values()}, len(losses)
+            with raw_of(node) as raw:
+                raw.client_kill_filter(_type="pubsub")
+            await aeventually(lambda before=before: len({*manager._wires.values()} - before) == 1)
+            await aeventually(lambda: not manager._missing() and monitor.connected)
+            assert len(losses) == count + 1
+        assert len(manager._subscribed) == len(names) + (not spelled_out)
 
 
 async def test_a_connection_that_is_made_while_the_interface_closes_is_closed_too(server_url, key):

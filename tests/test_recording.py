@@ -21,7 +21,7 @@ from reem_async.pubsub.manager import manager_of
 from reem_async.tools.recording import ArrayHandle, Recorder, Replayer, open_log
 from reem_async.tools.recording.key_reader import KeyReader
 from reem_async.tools.recording.recorder import _TICK
-from reem_async.tools.recording.subscription import HURRIED, PATIENCE
+from reem_async.tools.recording.times import HURRIED, PATIENCE
 
 IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64, 3)
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)

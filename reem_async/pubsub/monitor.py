@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..concurrency.queues import Every, Policy
+from ..concurrency.queues import Every, Policy, unheard
 from ..concurrency.streams import Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, is_namespace, show
 from ..plan.patterns import Pattern, channel_pattern, fits, name_of, parse_pattern
+from ..transport.wire import Wire
 from .gaps import Numbers
-from .listeners import ForwardingListener
+from .listeners import Beginning, ForwardingListener
 from .manager import SubscriptionManager, Topic, manager_of
 
 __all__ = ["ANNOUNCED", "Event", "Monitor"]
@@ -90,6 +92,8 @@ class Monitor(Stream[Event]):
     Attributes:
         doubted: Called with a top-level key of which a message could not be read.
         broken: Called when updates of any key may be lost: a connection broke.
+        begun_anew: Called when it is followed again after a loss, once for each connection, whatever that concerned.
+        changed: Called with each key that the server says was changed, None for all, after `watch_changes`.
 
     A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
     other: they come from different nodes. There, whose servers have no patterns for what only one node is told,
@@ -122,7 +126,10 @@ class Monitor(Stream[Event]):
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
         self._doubts: set[str] = set()  # keys of which a message could not be read: the next one has a gap
         self.doubted: Callable[[str], None] = lambda name: None
-        self.broken: Callable[[], None] = lambda: None
+        self.broken: Callable[[], None] = unheard
+        self.begun_anew: Callable[[], None] = unheard
+        self.changed: Callable[[str | None], None] = lambda key: None
+        self._telling = False  # that it begins anew, in this turn of the event loop
 
     @property
     def _following(self) -> bool:
@@ -145,12 +152,28 @@ class Monitor(Stream[Event]):
             self._manager, self._ears = None, []
             raise
 
+    async def watch_changes(self) -> None:
+        """Be told by `changed` of keys that were read over a connection of notices and then changed."""
+        assert self._manager is not None
+        await self._manager.watch(self._ears[0])
+
     async def close(self) -> None:
         """Stop following and end the loop. Idempotent."""
         await super().close()
         for ear in self._ears:
             if self._manager is not None:
+                self._manager.unwatch(ear)
                 await self._manager.unfollow(ear)
+
+    @property
+    def connected(self) -> bool:
+        """Whether all that it follows is subscribed to, as far as is known."""
+        return all(ear.wire is not None for ear in self._ears)
+
+    @property
+    def leisurely(self) -> bool:
+        """Whether nobody waits for the notices."""
+        return any(ear.wire is not None and ear.wire.leisurely for ear in self._ears)
 
     def _topic(self, pattern: Pattern) -> bytes:
         """Return the pattern of the channels of the keys that `pattern` names."""
@@ -178,6 +201,15 @@ class Monitor(Stream[Event]):
     def _lost(self) -> None:
         self._gaps = set()
         self.broken()
+
+    def _begun_anew(self) -> None:
+        if not self._telling:  # all patterns of one connection begin in the same turn
+            self._telling = True
+            asyncio.get_running_loop().call_soon(self._told)
+            self.begun_anew()
+
+    def _told(self) -> None:
+        self._telling = False
 
     def _doubt(self, channel: bytes) -> None:
         place = self._split(channel)
@@ -222,16 +254,33 @@ class Monitor(Stream[Event]):
 
 
 class _PatternListener(ForwardingListener):
-    """One subscription of a monitor: a listener of the subscription manager, which holds it weakly."""
+    """One subscription of a monitor: a listener of the subscription manager, which holds it weakly.
+
+    Attributes:
+        wire: The connection, in a cluster one of them; None while there is none.
+    """
 
     def __init__(self, monitor: Monitor, topic: Topic) -> None:
         super().__init__(topic, monitor.patience, [monitor.queue])
         self._monitor = monitor
+        self.wire: Wire | None = None
+
+    def start(self, wire: Wire, beginning: Beginning) -> None:
+        """Take the connection; after a broken one, say so."""
+        self.wire = wire
+        if beginning is Beginning.AFTER_LOSS:
+            self._monitor._begun_anew()
+        super().start(wire, beginning)
 
     def lost(self, reason: Exception) -> None:
         """Remember that updates may be lost. Whoever waits for the beginning gets `reason`."""
+        self.wire = None
         self._monitor._lost()
         super().lost(reason)
+
+    def changed(self, key: str | None) -> None:
+        """Hand it on."""
+        self._monitor.changed(key)
 
     def doubt(self, channel: bytes) -> None:
         """Remember that an update of a key was lost."""

@@ -28,8 +28,7 @@ from .recorded_keys import RecordedKeys
 from .roles import Role
 from .sample import Sampler, samples_of
 from .sink import Sink
-from .subscription import HURRIED, PATIENCE, Subscription
-from .times import Arrivals, Clock
+from .times import HURRIED, PATIENCE, Arrivals, Clock
 from .writer_thread import Operation, WriterThread
 
 __all__ = ["Recorder", "RecorderStatus"]
@@ -147,7 +146,8 @@ class Recorder:
         self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
         if self._monitor is not None:
             self._monitor.doubted = lambda name: self._key_recorder(name).lost(None)
-        self._subscription = Subscription(self) if tops else None
+            self._monitor.begun_anew = self._keys.lost
+            self._monitor.changed = self._keys.changed
         self._sampler = Sampler(self.session, self._samples, self._sampled)
         self._tasks: list[asyncio.Task[None]] = []
         self._begun = self._ended = 0.0
@@ -166,11 +166,9 @@ class Recorder:
         self.writer_thread.start()
         self._begun = time.monotonic()
         try:
-            if self._monitor is not None and self._subscription is not None:
+            if self._monitor is not None:
                 await self._monitor.listen()
-                manager = manager_of(self.session)
-                await manager.follow(self._subscription)
-                await manager.watch(self._subscription)
+                await self._monitor.watch_changes()
                 self._begin(self._listen)
                 for name in await self._keys.present():
                     self._key_recorder(name).read()
@@ -230,9 +228,6 @@ class Recorder:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         self._keys.cancel()
         with contextlib.suppress(InterfaceClosed):
-            if self._subscription is not None:
-                manager_of(self.session).unwatch(self._subscription)
-                await manager_of(self.session).unfollow(self._subscription)
             if self._monitor is not None:
                 await self._monitor.close()
         ended = {"ended": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "seconds": f"{self.status.seconds:.3f}"}
@@ -291,7 +286,7 @@ class Recorder:
         assert self._monitor is not None
         async for event in self._monitor:
             self._key_recorder(event.name).on_event(event)
-            if self._subscription is not None and self._subscription.leisurely:
+            if self._monitor.leisurely:
                 give_way()
 
     def _pump(self) -> None:
@@ -307,7 +302,7 @@ class Recorder:
 
     async def fence(self) -> None:
         """Wait until everything published before now has been handed to the feeds."""
-        if self._subscription is not None:
+        if self._monitor is not None:
             with contextlib.suppress(InterfaceClosed):
                 await manager_of(self.session).fence()
         self._pump()
@@ -316,10 +311,6 @@ class Recorder:
     def hears_of_changes(self) -> bool:
         """Whether the server tells which keys are changed."""
         return manager_of(self.session).hears_of_changes
-
-    def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed, None for every key."""
-        self._keys.changed(key)
 
     def hurry(self) -> None:
         """Look more often at what was published: large updates come fast."""
@@ -330,13 +321,18 @@ class Recorder:
         self._failure = error
         self._done.set()
 
+    @property
+    def _connected(self) -> bool:
+        """Whether there is anything to hear, and a connection that it comes on."""
+        return self._monitor is not None and self._monitor.connected
+
     async def _settled(self, patience: float) -> None:
         """Wait until nothing is being fetched, but not for ever."""
         await self._keys.settled(patience)
 
     async def _complete(self, deadline: float) -> None:
         """Read anew what was dropped at the last moment: the file is to end with what is there."""
-        while self._subscription is not None and self._subscription.wire is not None:
+        while self._connected:
             await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
             if not self.writer_thread.behind or self.writer_thread.failure is not None or time.monotonic() > deadline:
                 return
@@ -381,29 +377,17 @@ class Recorder:
         if self._monitor is not None and self._monitor.dropped > self._dropped:
             self.writer_thread.counts.dropped += self._monitor.dropped - self._dropped
             self._dropped = self._monitor.dropped
-            self.lost()
-        if (
-            self._subscription is not None
-            and self._subscription.wire is not None
-            and self.writer_thread.waiting < (1 << 20)
-        ):
+            self._keys.lost()
+        if self._connected and self.writer_thread.waiting < (1 << 20):
             for name in list(self.writer_thread.behind):
                 self.writer_thread.behind.discard(name)
-                if self._monitor is not None and self._keys.concerns(name):
+                if self._keys.concerns(name):
                     self._key_recorder(name).read()
-
-    def lost(self) -> None:
-        """Note that updates of any key may be lost, and read all keys anew."""
-        self._keys.lost()
 
     async def _look_once_more(self) -> None:
         """Read what is there at the end: somebody may have stored something since the last keyframe."""
         self._keys.forget_news()
-        if (
-            self._subscription is not None
-            and self._subscription.wire is not None
-            and self.writer_thread.failure is None
-        ):
+        if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
                 if self.hears_of_changes:
                     await self._find()

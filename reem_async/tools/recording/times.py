@@ -11,13 +11,30 @@ import numpy as np
 from ...errors import BadType, BadValue
 from ...plan.paths import shorten
 
-__all__ = ["AFTER", "STEP", "Arrivals", "Clock", "Instant", "nanoseconds", "published", "seconds"]
+__all__ = [
+    "AFTER",
+    "HURRIED",
+    "PATIENCE",
+    "STEP",
+    "Arrivals",
+    "Clock",
+    "Instant",
+    "nanoseconds",
+    "published",
+    "seconds",
+]
 
 Instant = float | np.datetime64
 """A point in time: seconds since 1970, or a numpy datetime64."""
 
 STEP = 2000
 """Nanoseconds between two log times at least: whole microseconds, which seconds as float tell apart until 2100."""
+
+PATIENCE = 0.01
+"""Seconds that updates may wait to be recorded, several at once. The publisher's time in them is not touched."""
+
+HURRIED = 0.002
+"""The same, once large updates were seen to come fast: each is to be fetched before the next one replaces it."""
 
 # Nanoseconds: what readers of MCAP that use signed numbers can take.
 _LATEST = 2**63 - 1
