@@ -61,6 +61,9 @@ class Collector(Protocol):
     async def fence(self) -> None:
         """Wait until everything published before now has been handed to the feeds."""
 
+    def look_for_losses(self) -> None:
+        """Note it if updates were dropped that nobody had taken yet."""
+
     def hurry(self) -> None:
         """Look more often at what was published: large updates come fast."""
 
@@ -215,6 +218,7 @@ class KeyRecorder:
         self._complaint = ""
         if head.is_whole:
             self.looks.earliest = asyncio.get_running_loop().time() + found.size / _READ_RATE
+        self._collector.look_for_losses()  # what it has of them was published
         if self._queue.settle(found.value, found.size):
             self.read()
         return True

@@ -374,15 +374,19 @@ class Recorder:
 
     def _catch_up(self) -> None:
         """Read the keys anew of which something is missing, if there is room for it."""
-        if self._monitor is not None and self._monitor.dropped > self._dropped:
-            self.writer_thread.counts.dropped += self._monitor.dropped - self._dropped
-            self._dropped = self._monitor.dropped
-            self._keys.lost()
+        self.look_for_losses()
         if self._connected and self.writer_thread.waiting < (1 << 20):
             for name in list(self.writer_thread.behind):
                 self.writer_thread.behind.discard(name)
                 if self._keys.concerns(name):
                     self._key_recorder(name).read()
+
+    def look_for_losses(self) -> None:
+        """Note it if updates were dropped that nobody had taken yet: they may be of any key."""
+        if self._monitor is not None and self._monitor.dropped > self._dropped:
+            self.writer_thread.counts.dropped += self._monitor.dropped - self._dropped
+            self._dropped = self._monitor.dropped
+            self._keys.lost()
 
     async def _look_once_more(self) -> None:
         """Read what is there at the end: somebody may have stored something since the last keyframe."""

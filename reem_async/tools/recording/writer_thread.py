@@ -107,7 +107,7 @@ class WriterThread:
     Attributes:
         counts: What was written and what was not.
         failure: Why writing ended, None while it goes on.
-        behind: Keys of which the tree kept here is not what the server has.
+        behind: Keys of which the tree kept here is not what the server has; whoever reads them anew takes them out.
         stored: Keys of which something was written that was only stored; whoever takes note takes them out.
     """
 
@@ -124,6 +124,10 @@ class WriterThread:
         self._size = 0
         # Guards the queue and its size. The event loop holds it for a few steps only, never while something is written.
         self._changed = threading.Condition()
+        # Keys whose next whole differs in more than what was only stored, since something published is missing in the
+        # tree: what was not put in, and what turned out when it was written. Each is known in the order of the queue.
+        self._dropped: set[str] = set()
+        self._lacking: set[str] = set()
         self._ending = False
         self._flushed = threading.Event()
         # What each key held after the last operation: keyframes are made of it, and reads are compared with it.
@@ -143,7 +147,7 @@ class WriterThread:
     def put(self, operation: Operation, size: int) -> bool:
         """Hand over an operation of about `size` bytes; returns whether there was room. Never waits for the disk."""
         # What an operation costs besides its value: so many small ones are bounded too.
-        size += 200
+        name, size = str(operation.path[0]), size + 200
         with self._changed:
             if self.failure is not None or self._ending:
                 return False
@@ -153,8 +157,14 @@ class WriterThread:
             if operation.role in _LARGE and self._size and self._size + size > self._limit:
                 self.counts.drop(operation.path)
                 # The tree lacks this update, so the key has to be read again.
-                self.behind.add(str(operation.path[0]))
+                self.behind.add(name)
+                self._dropped.add(name)
                 return False
+            if operation.role in (Role.STATE, Role.STORED):
+                self.behind.discard(name)  # it has what was missing
+                if name in self._dropped:
+                    self._dropped.discard(name)
+                    operation = _as_state(operation)
             self._queue.append((operation, size))
             self._size += size
             # Else the thread wakes by itself in a moment, and takes many at once.
@@ -237,7 +247,12 @@ class WriterThread:
         except FullError:  # reading it again would not help
             self.counts.lose(it.path)
         except NotWritten:
-            self.behind.add(str(it.path[0]))
+            self._fall_behind(str(it.path[0]))
+
+    def _fall_behind(self, name: str) -> None:
+        """Note that the tree of a key lacks something."""
+        self.behind.add(name)
+        self._lacking.add(name)
 
     def _write_update(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
@@ -252,7 +267,7 @@ class WriterThread:
         try:
             self._trees[name] = replaced(before, rest, tree)
         except CannotApply:  # the server has refused it too, or an update is missing here
-            self.behind.add(name)
+            self._fall_behind(name)
 
     def _write_delete(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
@@ -279,9 +294,11 @@ class WriterThread:
         if it.value is MISSING:
             if before is not MISSING:
                 self._write_delete(it._replace(role=Role.DELETE))
+            self._lacking.discard(name)
             return
         before = self._settled(it, before)
         tree = self._extracted(it, before)
+        self._lacking.discard(name)
         # A state that is what is known already says nothing: no keyframe.
         if before is MISSING or not same(tree, before):
             self._trees[name] = tree
@@ -289,8 +306,8 @@ class WriterThread:
 
     def _write_stored(self, it: Operation) -> None:
         name = str(it.path[0])
-        if name in self.behind:  # it may differ in what was published
-            self._write_state(it._replace(role=Role.STATE, kind=Kind.READ))
+        if name in self._lacking:  # it may differ in what was published
+            self._write_state(_as_state(it))
             return
         before = self._trees.get(name, MISSING)
         before = before if before is MISSING else self._settled(it, before)
@@ -374,6 +391,11 @@ def _described(label: str, path: Path, at: int, data: Any, content: Content) -> 
         numbers = data if label == "list" else None
         return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
     return Stored(label, path, at, len(data), label, content=content)
+
+
+def _as_state(it: Operation) -> Operation:
+    """Return what is there now as something of which nobody knows who wrote it."""
+    return it._replace(role=Role.STATE, kind=Kind.READ)
 
 
 def _as_list(it: Stored) -> Any:

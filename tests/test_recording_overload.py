@@ -1,0 +1,127 @@
+"""A recorder that cannot keep up: what it drops is read anew, and never taken for something that was only stored."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+from conftest import aeventually
+from test_recording_stored import is_followed, news, recording
+
+import reem_async
+from reem_async.concurrency.queues import BoundedQueue, Last
+from reem_async.plan.patterns import parse_pattern
+from reem_async.tools.recording.roles import Kind, Role
+from reem_async.tools.recording.sink import Sink
+from reem_async.tools.recording.writer_thread import Operation, WriterThread
+
+
+class Writing:
+    """A writing thread that begins when all has been handed over: whatever becomes of it is one order of events."""
+
+    def __init__(self, file):
+        self._file = file
+        ships = reem_async.RedisInterface("redis://127.0.0.1:1").session.ships  # of one that never connects
+        self.thread = WriterThread(Sink(file, "none", {}, overwrite=False), ships, 1 << 20, [parse_pattern("*")])
+        self._time = 0
+
+    def put(self, role, value, *path, kind=Kind.PUBLISHED, room=True):
+        """Hand over a change of the key `a`; without room it is dropped."""
+        self._time += 1_000_000
+        self.thread._limit = 1 << 20 if room else 0
+        stamp = (self._time, self._time, 0)
+        assert self.thread.put(Operation(role, ("a", *path), value, stamp, kind), 0) is room
+        if not room:
+            assert self.thread.behind == {"a"}
+            self.thread.behind.clear()  # the recorder takes note, and has the key read anew
+
+    def told(self):
+        """What is in the file after all."""
+        self.thread.start()
+        self.thread.stop({})
+        assert self.thread.failure is None
+        return news(self._file)
+
+
+def test_what_was_dropped_is_no_stored_change_though_the_key_is_about_to_be_read_anew(file):
+    """A look that was under way has it too; from the next read of all on, stored changes are told as such again."""
+    writing = Writing(file)
+    writing.put(Role.STATE, {"n": 0, "p": 0}, kind=Kind.READ)
+    writing.put(Role.UPDATE, 1, "p", room=False)
+    writing.put(Role.STORED, {"n": 0, "p": 1}, kind=Kind.STORED)
+    writing.put(Role.STORED, {"n": 1, "p": 1}, kind=Kind.STORED)
+    assert writing.told() == [
+        ("a", "kvs", {"n": 0, "p": 0}),
+        ("a", "kvs", {"n": 0, "p": 1}),
+        ("a.n", "stored", 1),
+    ]
+
+
+def test_what_was_stored_before_something_was_dropped_is_told_as_stored(file):
+    """It waits to be written, and lacks nothing."""
+    writing = Writing(file)
+    writing.put(Role.STATE, {"n": 0, "p": 0}, kind=Kind.READ)
+    writing.put(Role.STORED, {"n": 1, "p": 0}, kind=Kind.STORED)
+    writing.put(Role.UPDATE, 1, "p", room=False)
+    writing.thread.behind.add("a")  # the recorder has not taken note yet
+    assert writing.told() == [("a", "kvs", {"n": 0, "p": 0}), ("a.n", "stored", 1)]
+
+
+def test_what_could_not_be_applied_makes_no_stored_change_of_what_is_read_next(file):
+    """Something published is missing then, or the server has refused the update."""
+    writing = Writing(file)
+    writing.put(Role.STATE, {"n": 0}, kind=Kind.READ)
+    writing.put(Role.UPDATE, 1, "x", "y")
+    writing.put(Role.STORED, {"n": 0, "x": {"y": 1}}, kind=Kind.STORED)
+    writing.put(Role.STORED, {"n": 1, "x": {"y": 1}}, kind=Kind.STORED)
+    assert writing.told()[-2:] == [("a", "kvs", {"n": 0, "x": {"y": 1}}), ("a.n", "stored", 1)]
+
+
+async def test_what_is_published_and_dropped_before_it_is_taken_is_no_stored_change(
+    key, akvs, apspace, server_url, binterface, file
+):
+    """The look that finds it may come before anybody has noticed."""
+    await akvs[key()].write({"x": 0, "y": 0, "z": 0})
+    async with reem_async.RedisInterface(server_url) as another, recording(binterface, [key()], file) as recorder:
+        await aeventually(lambda: is_followed(recorder, key()))
+        reading, monitor = recorder._key_recorder(key()), recorder._monitor
+        waits = reading._reader._limit = asyncio.Semaphore(0)
+        recorder._tasks[0].cancel()  # nothing takes updates out but a look that has to know of all
+        recorder._catch_up = lambda: None  # and nobody sees that one was dropped
+        monitor.queue = BoundedQueue(Last(1))
+        await apspace[key()]["x"].write(1)
+        await reem_async.PublishSpace(another)[key()]["y"].write(2)
+        await aeventually(lambda: monitor.dropped == 1)
+        await akvs[key()]["z"].write(3)
+        await aeventually(lambda: reading.busy)
+        waits.release()
+        await aeventually(lambda: not reading.busy)
+        del recorder._catch_up
+        waits.release()
+    told = news(file)
+    assert [kind for _, kind, _ in told if kind == "stored"] == []
+    assert told[-1] == (key(), "kvs", {"x": 1, "y": 2, "z": 3})
+
+
+@pytest.mark.parametrize("published", [False, True])
+async def test_after_an_overload_stored_changes_are_told_again(key, akvs, apspace, binterface, file, published):
+    """Whatever was dropped; the recording ends with what is there."""
+    await akvs[key()].write({"n": 0, "p": ""})
+    async with recording(binterface, [key()], file) as recorder:
+        await aeventually(lambda: is_followed(recorder, key()))
+        thread = recorder.writer_thread
+        with thread._changed:  # so it writes nothing for a moment
+            thread._limit, before = 1, thread.counts.dropped
+            thread._size += 1
+        await (apspace if published else akvs)[key()]["p"].write("x")
+        await aeventually(lambda: thread.counts.dropped > before)
+        with thread._changed:
+            thread._limit = 1 << 20
+            thread._size -= 1
+        await aeventually(lambda: thread._trees.get(key()) == {"n": 0, "p": "x"})
+        await aeventually(lambda: is_followed(recorder, key()) and not thread.behind)
+        await akvs[key()]["n"].write(1)
+        await recorder.written(key())
+    told = news(file)
+    assert (f"{key()}.n", "stored", 1) in told
+    assert not [each for each in told if each[1] == "stored" and "p" in each[0].removeprefix(key())]
