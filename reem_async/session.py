@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import math
 import os
 import secrets
 import threading
@@ -30,10 +31,12 @@ from .transport.endpoints import way_to
 from .transport.recorder import CommandRecorder
 from .transport.scan import scanned
 
-__all__ = ["Session", "Subscriptions"]
+__all__ = ["QUIET", "Session", "Subscriptions"]
 
 _FRESH = 3.0
 """Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
+QUIET = 60.0
+"""Seconds after which the next notices are first ones again: who looks for keys has let go of one that was gone."""
 
 
 _IDLE, _LOOKS = 120.0, 10.0
@@ -77,11 +80,16 @@ class _Numbers:
                 self._looking.release()
         return publisher, number + 1
 
+    def is_quiet(self, channel: str) -> bool:
+        """Return whether nothing was published of a key for long, or ever."""
+        last = self._last.get(channel)
+        return last is None or time.monotonic() - last[2] > QUIET
+
     def take_back(self, channel: str, publisher: str, number: int) -> None:
         """Return a number once more, if it was the last."""
         last = self._last.get(channel)
         if last is not None and last[:2] == (publisher, number):
-            self._last[channel] = publisher, number - 1, last[2]
+            self._last[channel] = publisher, number - 1, -math.inf  # nothing was published: it may be quiet as before
 
     def _forget(self, before: float) -> None:
         # The order of the dict is that of the last use, so the idlest key is the first.
@@ -205,10 +213,11 @@ class Session:
 
     def stamp(self, keys: Keys) -> tuple[str, int]:
         """Return who publishes, and the number of this publisher's next update of a top-level key."""
+        is_quiet = self.transport.sharded and self._numbers.is_quiet(keys.channel)
         publisher, number = self._numbers.next(keys.channel)
         # Of a cluster, notices go to the key's own node. Who looks for keys by pattern does not follow a new one there
-        # yet.
-        if number == 1 and self.transport.sharded:
+        # yet, or no more.
+        if is_quiet or (number == 1 and self.transport.sharded):
             now = time.monotonic()
             if len(self._fresh) >= _KEPT:
                 for channel in [channel for channel, until in self._fresh.copy().items() if until < now]:

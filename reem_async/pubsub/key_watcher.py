@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import re
+import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from ..concurrency.tasks import Tasks
@@ -20,6 +21,7 @@ from ..errors import InterfaceClosed, RedisError
 from ..plan.keys import keys_of
 from ..plan.notices import Notice
 from ..plan.scan import DOCUMENT
+from ..session import QUIET
 from ..transport import Transport
 from ..transport.scan import scanned
 from ..transport.wire import Wire
@@ -34,6 +36,10 @@ _PAUSE = 1.0
 """Seconds between looks for new keys."""
 # Seconds between looks whether something still waits, and how often: a second in all, twice what a buffer waits.
 _MOMENT, _MOMENTS = 0.005, 200
+
+_GONE = QUIET + 30.0
+"""Seconds without a key and without a word of it until it is let go of: nobody who publishes it takes it for known by
+then, however late his last word was."""
 
 _MOST = 10_000
 """Keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes."""
@@ -150,15 +156,26 @@ class KeyWatcher:
                 logger.debug("new keys could not be looked for: %s", error)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:
-        """Follow the keys that are not followed yet."""
+        """Follow the keys that are not followed yet, and let go of those that are gone."""
         async for page in scanned(self._manager.transport, _glob(listener), DOCUMENT):
             await self._found(listener, page, late=late)
+        births, long_ago = self._births.get(listener), time.monotonic() - _GONE
+        branches = self._branches.get(listener, {}) if births is not None else {}
+        for name in [name for name, branch in branches.items() if branch.begun and branch.seen < long_ago]:
+            if births is not None and births.forget(branches[name].topic.name):
+                branch = branches.pop(name)
+                branch.let_go()
+                await self._manager.unfollow_here(branch)
 
     async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
         """Follow those that are not followed yet."""
         branches, births = self._branches.get(listener), self._births.get(listener)
         if branches is None:
             return
+        now = time.monotonic()
+        for name in documents:
+            if name in branches:
+                branches[name].seen = now
         found = {
             name: _KeyListener(listener, name, births)
             for name in documents
@@ -199,7 +216,11 @@ class _Part(ForwardingListener):
 
     def __init__(self, listener: Listener, topic: Topic) -> None:
         super().__init__(topic, listener.patience)
-        self._listener = weakref.ref(listener)
+        self._listener: Callable[[], Listener | None] = weakref.ref(listener)
+
+    def let_go(self) -> None:
+        """Tell nobody any more."""
+        self._listener = _nobody
 
     def lost(self, reason: Exception) -> None:
         """Hand it on, if this had begun."""
@@ -214,11 +235,16 @@ class _Part(ForwardingListener):
             listener.doubt(channel)
 
 
+def _nobody() -> None:
+    return None
+
+
 class _KeyListener(_Part):
     """One key of a pattern: a listener of the subscription manager that hands everything on.
 
     Attributes:
         begun: It is followed.
+        seen: When the key was there last, something was heard of it, or it began to be followed.
     """
 
     def __init__(self, listener: Listener, document: bytes, births: _NewKeysListener | None) -> None:
@@ -226,10 +252,12 @@ class _KeyListener(_Part):
         super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
         self._births = births  # where its first notices came from, or None if only this key is meant
         self.begun = False
+        self.seen = time.monotonic()
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Begin, and let the listener begin."""
         self.begun = True
+        self.seen = time.monotonic()
         if self._births is not None:
             self._births.begin(wire, beginning)
         elif (listener := self._listener()) is not None:
@@ -238,10 +266,16 @@ class _KeyListener(_Part):
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Hand it on, behind what all nodes were told before."""
+        self.seen = time.monotonic()
         if self._births is not None:
             self._births.buffer(channel).told_here(notice)
         elif (listener := self._listener()) is not None:
             listener.on_notice(notice, channel)
+
+    def doubt(self, channel: bytes) -> None:
+        """Hand it on."""
+        self.seen = time.monotonic()
+        super().doubt(channel)
 
 
 class _NewKeysListener(_Part):
@@ -273,6 +307,14 @@ class _NewKeysListener(_Part):
                 del self._buffers[next(iter(self._buffers))]
             found = self._buffers[channel] = ReorderBuffer(self._listener, channel)
         return found
+
+    def forget(self, channel: bytes) -> bool:
+        """Forget what was heard of a key; return False if some of it waits to be handed on."""
+        found = self._buffers.get(channel)
+        if found is not None and found.waits:
+            return False
+        self._buffers.pop(channel, None)
+        return True
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Begin, and let the listener begin."""

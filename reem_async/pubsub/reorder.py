@@ -10,7 +10,7 @@ its way is taken for lost. From then on the key's node is the only one listened 
 from __future__ import annotations
 
 import asyncio
-import weakref
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ..plan.notices import Notice
@@ -76,14 +76,14 @@ class ReorderBuffer:
     """What one listener hears of one key, in order.
 
     Args:
-        listener: Who is told.
+        listener: Returns who is told, None if he is gone.
         channel: The key's channel.
 
     Attributes:
         late: The key was found after the listener had begun, so its first updates may have been missed.
     """
 
-    def __init__(self, listener: weakref.ref[Listener], channel: bytes) -> None:
+    def __init__(self, listener: Callable[[], Listener | None], channel: bytes) -> None:
         self.late = False
         self._listener = listener
         self._channel = channel
