@@ -21,6 +21,7 @@ from reem_async.pubsub.gaps import Numbers
 from reem_async.tools.recording.key_queue import KeyQueue
 from reem_async.tools.recording.order import Item, skipped
 from reem_async.tools.recording.state import applied
+from reem_async.tools.recording.stored import New, Unchanged
 
 PUBLISHERS = "p", "q", "r"
 STORED = "stored"
@@ -323,6 +324,21 @@ def test_a_loss_that_a_note_shows_skips_all_that_it_may_have_changed():
     assert queue.division.divide(b"q 1")
     assert queue.settle(1, 8), "the key has to be read"
     assert [item.role for item in queue.items] == ["skip", "skip"]
+
+
+def test_a_read_that_takes_the_place_of_another_has_the_arrays_that_only_that_one_brought():
+    """The second look was asked for while the first one was on its way, and had to bring no array again."""
+    queue, later, array = KeyQueue(), Unchanged(), b"an array"
+    for number in (1, 2):
+        queue.items.append(Item("stored", ("k",), ANNOUNCED, (2000 * number, 0, 0)))
+    for value in ({"l": [New(array, later)], "n": 1}, {"l": [later], "n": 2, "m": Unchanged()}):
+        queue.asked()
+        assert queue.division.answered(None)
+        assert queue.division.divide(None)
+        assert not queue.settle(value, 8)
+    (item,) = queue.ready()
+    assert (item.role, item.value["l"], item.value["n"]) == ("stored", [New(array, later)], 2)
+    assert type(item.value["m"]) is Unchanged  # of a read whose place was not taken
 
 
 def test_who_never_hears_of_what_is_published_gives_up():

@@ -15,6 +15,7 @@ from ...plan.overtaken import is_own, rest_of
 from ...plan.paths import Path, below, has_index
 from ...plan.trees import MISSING, get
 from .roles import Role
+from .stored import carried
 from .times import AFTER
 
 __all__ = ["Item", "is_replaced", "settled", "skipped"]
@@ -132,7 +133,8 @@ def _with_state(queue: list[Item], head: Item, value: Any, size: int, line: int)
     before = queue[place - 1] if place else head
     if before is not head and before.is_whole and before.value is not ANNOUNCED:  # in whose place it is
         role = Role.STATE if Role.STATE in (before.role, head.role) else Role.STORED
-        queue[place - 1] = dataclasses.replace(before, role=role, value=value, size=before.size + size, order=line)
+        whole = carried(value, before.value)
+        queue[place - 1] = dataclasses.replace(before, role=role, value=whole, size=before.size + size, order=line)
         return queue
     stamp = head.stamp if place == 0 else (queue[place - 1].stamp[0] + AFTER, *head.stamp[1:])
     queue.insert(place, dataclasses.replace(head, value=value, size=size, stamp=stamp, order=line))

@@ -17,8 +17,8 @@ from ...plan.trees import get, replaced
 from .contents import Content
 
 __all__ = [
-    "LONGEST_INLINE", "LOST", "New", "NotWritten", "Store", "Stored", "Unchanged", "extract", "is_inline", "opened",
-    "resolve",
+    "LONGEST_INLINE", "LOST", "New", "NotWritten", "Store", "Stored", "Unchanged", "carried", "extract", "is_inline",
+    "opened", "resolve",
 ]  # fmt: skip
 
 LONGEST_INLINE = 64
@@ -83,6 +83,28 @@ class New(NamedTuple):
 
     value: Any
     later: Unchanged
+
+
+def carried(tree: Any, before: Any) -> Any:
+    """Return what was read, with what an earlier read brought that `before` has and that will not be written itself."""
+    news: dict[int, New] = {}
+    _collect(before, news)
+    return _with(tree, news) if news else tree
+
+
+def _collect(tree: Any, news: dict[int, New]) -> None:
+    if type(tree) is New:
+        news[id(tree.later)] = tree
+    for child in tree.values() if type(tree) is dict else tree if type(tree) is list else ():
+        _collect(child, news)
+
+
+def _with(tree: Any, news: dict[int, New]) -> Any:
+    if type(tree) is dict:
+        return {key: _with(child, news) for key, child in tree.items()}
+    if type(tree) is list:
+        return [_with(child, news) for child in tree]
+    return news.get(id(tree), tree) if type(tree) is Unchanged else tree
 
 
 class NotWritten(Exception):
