@@ -559,6 +559,35 @@ def test_a_copy_has_what_is_only_stored_too_whatever_comes_when(faults, path):
             raise AssertionError(f"seed {seed}") from error
 
 
+def test_an_array_is_not_taken_for_the_old_one_while_the_word_of_its_change_is_still_on_its_way():
+    """What is read over another connection overtakes it; then the copy would have a tree that the server never had."""
+    world = World(0, tracked=True)
+    world.model.tree = {"a": {"b": b"1", "n": {"x": 1}}, "z": b"1"}
+    world.rest()
+    del world.model.trees[:]
+
+    def store(path, value):
+        world.model.change(path, value)
+        world.stream.extend(("changed", name) for name in world.model.changes if name in world.touched)
+        world.touched -= set(world.model.changes)
+        world.model.changes.clear()
+
+    store(("a", "b"), b"2")
+    while not world.aside:  # it is read anew, and the other one, which was not changed, is not
+        assert world.step()
+    assert not world.stream
+    store(("z",), b"2")
+    store(("a", "n", "x"), 2)
+    assert [what for _, what in world.stream] == [KEYS.tag + ".z", KEYS.document]
+    world.execute_aside()
+    world.bring_aside()
+    world.rest()
+    told = [event.data for event in world.events if isinstance(event, Stored)]
+    assert told
+    assert all(any(same(each, tree) for tree in world.model.trees) for each in told)
+    world.check_at_rest()
+
+
 def test_the_replica_does_no_input_or_output():
     """It knows no loop, socket or client, and what it imports of REEM are values."""
     for name in ("replica", "gaps"):
