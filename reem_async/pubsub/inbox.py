@@ -13,7 +13,7 @@ from ..plan.paths import shorten
 from ..plan.patterns import names_key
 from ..ships.registry import Ships
 from ..transport import Transport
-from .listeners import NOBODY, Listener, ListenerGroup, Topic, Watcher, is_invalidation, is_message
+from .listeners import NOBODY, ListenerGroup, Topic, is_invalidation, is_message
 
 __all__ = ["Inbox"]
 
@@ -42,7 +42,7 @@ class Inbox:
         self,
         transport: Transport,
         ships: Ships,
-        topics: Mapping[Topic, ListenerGroup[Listener]],
+        topics: Mapping[Topic, ListenerGroup],
         local: LocalPath,
         moved: Callable[[list[Topic], str], None],
         empty: Callable[[Topic], None],
@@ -55,7 +55,7 @@ class Inbox:
         self._moved = moved
         self._empty = empty
         self._warned: set[bytes] = set()
-        self.watchers: ListenerGroup[Watcher] = ListenerGroup()
+        self.watchers = ListenerGroup()
         database = transport.options.database
         self._tail = b"}:notices" + (f"@{database}".encode() if database else b"")
 
@@ -114,16 +114,16 @@ class Inbox:
     def _changed(self, names: Any) -> None:
         """Tell who follows a document that the server says was changed; names of keys, or None for all."""
         if names is None:
-            everybody = [listener for group in self._topics.values() for listener in group.present()]
-            for watcher in (*everybody, *self.watchers.present()):
-                watcher.changed(None)
+            for group in (*self._topics.values(), self.watchers):
+                for listener in group.present():
+                    listener.changed(None)
             return
         for name in names:
             document = name[1:].partition(b"}")[0] if name[:1] == b"{" else name
             topic: Any = (b"{" + document + self._tail, False)
             text = name.decode(errors="replace")
-            for watcher in (*self._topics.get(topic, NOBODY).present(), *self.watchers.present()):
-                watcher.changed(text)
+            for listener in (*self._topics.get(topic, NOBODY).present(), *self.watchers.present()):
+                listener.changed(text)
 
     def _unreadable(self, channel: bytes, error: Exception) -> None:
         """Count a message, and tell of the first of each channel."""

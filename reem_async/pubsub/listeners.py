@@ -7,7 +7,7 @@ import math
 import weakref
 from collections.abc import Iterable
 from enum import Enum, auto
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 from ..concurrency.queues import BoundedQueue
 from ..plan.notices import Notice
@@ -20,7 +20,6 @@ __all__ = [
     "Listener",
     "ListenerGroup",
     "Topic",
-    "Watcher",
     "is_invalidation",
     "is_message",
 ]
@@ -132,42 +131,32 @@ class ForwardingListener:
         """Nothing to compare."""
 
 
-class Watcher(Protocol):
-    """Who is told which keys were changed."""
-
-    def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed, by its name there; None for every key."""
-
-
-Somebody = TypeVar("Somebody")
-
-
-class ListenerGroup(Generic[Somebody]):
+class ListenerGroup:
     """Who listens to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
 
     __slots__ = ("_references",)
 
     def __init__(self) -> None:
-        self._references: list[weakref.ref[Somebody]] = []
+        self._references: list[weakref.ref[Listener]] = []
 
-    def add(self, listener: Somebody) -> None:
+    def add(self, listener: Listener) -> None:
         """Take somebody in; once is enough."""
         if listener not in self.present():
             self._references.append(weakref.ref(listener, self._references.remove))
 
-    def discard(self, listener: Somebody) -> None:
+    def discard(self, listener: Listener) -> None:
         """Let somebody go who may be there."""
         for reference in tuple(self._references):
             if reference() is listener:
                 self._references.remove(reference)
 
-    def present(self) -> list[Somebody]:
+    def present(self) -> list[Listener]:
         """Return all who are still there, in the order in which they came."""
         # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
         return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
 
 
-NOBODY: ListenerGroup[Listener] = ListenerGroup()
+NOBODY = ListenerGroup()
 
 _LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
 

@@ -27,7 +27,7 @@ from ..transport import Transport
 from ..transport.redirects import is_moved, is_unapplied
 from ..transport.wire import Wire
 from .inbox import Inbox
-from .listeners import NOBODY, Beginning, Listener, ListenerGroup, Topic, Watcher
+from .listeners import NOBODY, Beginning, Listener, ListenerGroup, Topic
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport
@@ -72,7 +72,7 @@ class SubscriptionManager:
         self._local = local
         self._ships = ships
         self._wires: dict[Transport, Wire] = {}
-        self._topics: dict[Topic, ListenerGroup[Listener]] = {}
+        self._topics: dict[Topic, ListenerGroup] = {}
         self._subscribed: dict[Topic, Wire] = {}
         self._invited: set[Topic] = set()  # publishers of this host know that somebody listens
         self._unsure: set[Topic] = set()  # their keys are on their way to another node
@@ -103,8 +103,8 @@ class SubscriptionManager:
         for listener in listeners:
             await self.follow_here(listener)
 
-    async def watch(self, watcher: Watcher) -> None:
-        """Have somebody told by `changed` of every key that was read over a subscription connection and was changed.
+    async def watch(self, watcher: Listener) -> None:
+        """Have a listener told by `changed` of every key that was read over a subscription connection and was changed.
 
         What is read with `touch` is; a warning says so if a server does not tell. It is let go when it is dropped.
         """
@@ -113,8 +113,8 @@ class SubscriptionManager:
             for wire in list(self._wires.values()):
                 await self._track(wire)
 
-    def unwatch(self, watcher: Watcher) -> None:
-        """Tell somebody no more. Idempotent."""
+    def unwatch(self, watcher: Listener) -> None:
+        """Tell a listener no more. Idempotent."""
         self._inbox.watchers.discard(watcher)
 
     @property

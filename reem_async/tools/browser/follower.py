@@ -7,13 +7,12 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ...concurrency.queues import Last
 from ...concurrency.streams import arrived
 from ...connection import RedisInterface
-from ...errors import InterfaceClosed, RedisError, ReemError
+from ...errors import RedisError, ReemError
 from ...plan.notices import note_of
 from ...plan.paths import Path
 from ...plan.trees import MISSING
@@ -79,7 +78,7 @@ class Follower:
         )
         self._monitor = Monitor(interface, policy=Last(_WAITING))
         self._fetcher.failed = self._monitor.doubted = self._stored.doubt
-        self._monitor.broken = self._stored.lost
+        self._monitor.broken, self._monitor.changed = self._stored.lost, self._stored.changed
         self._tasks: list[asyncio.Task[None]] = []
         self._heard: dict[str, Heard] = {}
         self.names: list[str] = []
@@ -91,7 +90,7 @@ class Follower:
             return
         await self._interface.initialize()
         await self._monitor.listen()
-        await manager_of(self._interface.session).watch(self._stored)
+        await self._monitor.watch_changes()
         self.names = sorted([name async for name in names(self._interface)])
         self._stored.begin(self.names)
         for work in (self._follow(), self._fetcher.run(), self._stored.run(), self._go_on_finding()):
@@ -104,8 +103,6 @@ class Follower:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         self._stored.close()
-        with suppress(InterfaceClosed):
-            manager_of(self._interface.session).unwatch(self._stored)
         await self._monitor.close()
 
     @property
