@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 import redis
-from conftest import LOOKING, RawCluster, aeventually, commands_run, same_bits, subscribed, url_of_user
+from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, subscribed, url_of_user
 
 import reem_async
 from reem_async.plan.trees import MISSING
@@ -72,7 +72,8 @@ async def test_at_rest_only_the_names_of_keys_are_asked_for(server_url, key, akv
     await apspace[key("c")].write({"x": 1, "image": np.zeros((300, 300))})
     async with past_of(server_url, key("a"), key("b"), key("c")):
         asked = [await asked_in_three_seconds(raw) for _ in range(2)]  # the first reads may not be over yet
-        assert asked[-1] <= LOOKING
+        # Without the JSON module the list of names looks how each string begins: there are those of others.
+        assert asked[-1] <= LOOKING | ({"getrange"} if PLAIN else set())
 
 
 async def asked_in_three_seconds(raw):
