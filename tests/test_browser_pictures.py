@@ -58,7 +58,7 @@ def test_a_fetcher_ends_though_news_come_as_it_is_cancelled():
     async def work():
         allowance = Allowance(1.0, 1e6)
         assert allowance.take(1_000_000)
-        fetcher = Fetcher(None, History(1.0, 1000), allowance, lambda name: "", None)
+        fetcher = Fetcher(None, History(1.0, 1000), allowance, lambda name: "", None, None)
         fetcher._owed[("camera",)] = 500_000
         task = asyncio.create_task(fetcher.run())
         await asyncio.sleep(0.02)
