@@ -69,29 +69,40 @@ async def test_a_frame_that_a_keyframe_reads_first_is_not_skipped(key, apspace, 
         assert len(found) == 5 - recorder.status.skipped
 
 
+def fetch_behind_each(number, monkeypatch):
+    """Have what was announced be fetched when so many updates were heard of, and a multiple of it."""
+
+    async def wait(self, head):
+        await aeventually(lambda: self._queue.order % number == 0)
+
+    monkeypatch.setattr(key_recorder.KeyRecorder, "_let_pass", wait)
+
+
 async def test_what_was_deleted_before_it_could_be_fetched_is_skipped_and_counted(
     key, apspace, akvs, binterface, file, monkeypatch
 ):
     """It is neither a deletion of its own, nor is its deletion recorded twice."""
-    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
+    fetch_behind_each(2, monkeypatch)
     await apspace[key()].write({})
     async with Recorder(binterface, [key()], file) as recorder:
         for _ in range(5):
             await apspace[key()]["image"].write(LARGE)
             await apspace[key()]["image"].delete()
-            await asyncio.sleep(0.1)
+            await recorder.fence()
+            await recorder._settled(PATIENCE)
     assert recorder.status.skipped == 5
     assert news(file, f"{key()}.image") == [{}, *[True] * 5]
 
 
 async def test_what_was_replaced_with_what_holds_it_is_skipped_and_counted(key, apspace, binterface, file, monkeypatch):
-    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
+    fetch_behind_each(3, monkeypatch)
     async with Recorder(binterface, [key()], file) as recorder:
         for number in range(4):
             await apspace[key()].write({"image": LARGE})
             await apspace[key()]["image"].write(LARGE + 1)
             await apspace[key()].write({"n": number})
-            await asyncio.sleep(0.1)
+            await recorder.fence()
+            await recorder._settled(PATIENCE)
     assert recorder.status.skipped == 8
     assert news(file, key()) == [{"n": number} for number in range(4)]
 
