@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 
 import pytest
-from conftest import aeventually
+from conftest import PATIENCE, aeventually
 from test_recording_stored import is_followed, news, recording
 
 import reem_async
 from reem_async.concurrency.queues import BoundedQueue, Last
 from reem_async.plan.patterns import parse_pattern
+from reem_async.tools.recording import Recorder, open_log
 from reem_async.tools.recording.roles import Kind, Role
 from reem_async.tools.recording.sink import Sink
 from reem_async.tools.recording.writer_thread import Operation, WriterThread
@@ -125,3 +127,28 @@ async def test_after_an_overload_stored_changes_are_told_again(key, akvs, apspac
     told = news(file)
     assert (f"{key()}.n", "stored", 1) in told
     assert not [each for each in told if each[1] == "stored" and "p" in each[0].removeprefix(key())]
+
+
+async def test_what_turns_out_at_the_end_not_to_be_written_is_read_once_more(
+    key, apspace, binterface, file, monkeypatch
+):
+    """The writing thread finds that out when the recorder is about to stop."""
+    async with Recorder(binterface, [key()], file) as recorder:
+        writer, write, released, until = recorder.writer_thread, recorder.writer_thread._write, threading.Event(), []
+
+        def refuse_first(operation):
+            assert released.wait(PATIENCE)
+            if operation.stamp[0] < until[0]:
+                writer._fall_behind(key())
+            else:
+                write(operation)
+
+        def release():
+            until.append(recorder.clock.stamp())
+            released.set()
+
+        monkeypatch.setattr(writer, "_write", refuse_first)
+        await apspace[key()].write({"n": 1})
+        asyncio.get_running_loop().call_later(0.2, release)
+    with open_log(file) as log:
+        assert log[key()].at(log.end) == {"n": 1}

@@ -213,8 +213,8 @@ class Recorder:
                 await self.fence()
             self._pump()
             await self._settled(_PATIENCE)
-            await self._complete(time.monotonic() + _PATIENCE)
             await self._look_once_more()
+            await self._complete(time.monotonic() + _PATIENCE)
             self._keyframe_of_all()
         await self._end()
         self._check()
@@ -332,9 +332,11 @@ class Recorder:
 
     async def _complete(self, deadline: float) -> None:
         """Read anew what was dropped at the last moment: the file is to end with what is there."""
-        while self._connected:
+        writer = self.writer_thread
+        while self._connected and writer.failure is None and time.monotonic() < deadline:
             await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
-            if not self.writer_thread.behind or self.writer_thread.failure is not None or time.monotonic() > deadline:
+            # What could not be written is known when all was taken from the queue, and not earlier.
+            if not writer.waiting and not writer.behind:
                 return
             self._catch_up()
             await asyncio.sleep(_TICK / 10)
