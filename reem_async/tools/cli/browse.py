@@ -52,8 +52,8 @@ def browse(
     The page is updated as things change. The slider goes back through the last seconds, or through a recording.
     Arrays are shown as images, lines, tables and histograms. It can only look, unless --allow-write is given.
 
-    What programs publish is kept for the slider, its arrays at up to 8 MB a second, older ones as small pictures. What
-    they only store is looked at about twice a second, arrays as often as 1 MB a second allows.
+    What programs publish or store is kept for the slider; several stored changes in a moment are one. Arrays are read
+    at up to 8 MB a second; older ones are kept as small pictures.
 
     Examples:
       reem browse
