@@ -9,7 +9,7 @@ import weakref
 from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
 from importlib import import_module
-from threading import get_ident
+from threading import current_thread, get_ident, main_thread
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
@@ -142,6 +142,11 @@ class _Background:
                     # A server that does not answer must not keep a program from ending.
                     portal.call(interface.close(), timeout=1.0)
             portal.stop()
+
+
+def _is_left_over() -> bool:
+    """Return whether this is a daemon thread that still runs while the interpreter ends, which closes interfaces."""
+    return current_thread().daemon and not main_thread().is_alive()
 
 
 class StateIterator:
@@ -280,8 +285,10 @@ class RedisInterface:
         except SELF_EXPLANATORY as error:  # forty lines of ours between the caller's and the message would not help
             self._broken_off()
             raise error.with_traceback(None) from None
-        except BaseException:
+        except BaseException as error:
             self._broken_off()
+            if isinstance(error, InterfaceClosed) and _is_left_over():
+                raise SystemExit from None  # the thread is about to be stopped anyway, without a word
             raise
         # A call of a handler of signals, inside of one of this thread's calls, has ended in an error and could give
         # nothing back.

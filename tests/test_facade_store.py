@@ -377,6 +377,14 @@ LEAVING = {
         "    except reem.ReemError: pass\n"
         "threading.Thread(target=work, daemon=True).start()"
     ),
+    "threads that never end": (
+        "import threading\n"
+        "def work(call):\n"
+        "    while True: call()\n"
+        "space = reem.PublishSpace(interface)\n"
+        "for call in (kvs[key].read, lambda: space[key].write({'n': 1})):\n"
+        "    threading.Thread(target=work, args=[call], daemon=True).start()"
+    ),
 }
 
 
