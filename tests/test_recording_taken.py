@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import aeventually, line_of
+from conftest import PATIENCE, aeventually, line_of
 from test_cli_record import begins, is_recording, started
 
 import reem.recording
@@ -178,7 +178,7 @@ def test_a_hangup_ends_a_recording_as_ctrl_c_does(key, server_url, pspace, file)
         for _ in range(3):  # one is of the kernel, another of the shell
             process.send_signal(signal.SIGHUP)
             time.sleep(0.02)
-        process.wait(timeout=20)
+        process.wait(timeout=2 * PATIENCE)  # a recorder lets all others go first
     with open_log(file) as log:
         assert (log.indexed, log[key("a")].at(log.end)) == (True, 1)
 
