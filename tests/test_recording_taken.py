@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, aeventually, line_of
+from conftest import aeventually, line_of
 from test_cli_record import begins, is_recording, started
 
 import reem.recording
@@ -171,14 +171,15 @@ def test_a_hangup_ends_a_recording_as_ctrl_c_does(key, server_url, pspace, file)
     """The terminal is closed: nobody reads what is said, but the index is written."""
     pspace[key("a")] = 1
     ours, its = os.openpty()
-    with started(server_url, file.parent, "record", key("*"), "-o", file, stdout=its, stderr=its) as process:
+    heed = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)}  # though the tests may run under nohup
+    with started(server_url, file.parent, "record", key("*"), "-o", file, stdout=its, stderr=its, **heed) as process:
         os.close(its)
         assert line_of(ours).startswith("recording into ")
         os.close(ours)
         for _ in range(3):  # one is of the kernel, another of the shell
             process.send_signal(signal.SIGHUP)
             time.sleep(0.02)
-        process.wait(timeout=2 * PATIENCE)  # a recorder lets all others go first
+        process.wait(timeout=20)
     with open_log(file) as log:
         assert (log.indexed, log[key("a")].at(log.end)) == (True, 1)
 
