@@ -68,7 +68,12 @@ def alive(pid: int) -> bool:
     except ProcessLookupError:
         return False
     status = pathlib.Path(f"/proc/{pid}/stat")
-    return not (status.exists() and status.read_text().rpartition(")")[2].split()[0] == "Z")
+    try:
+        return status.read_text().rpartition(")")[2].split()[0] != "Z"
+    except ProcessLookupError:  # it has ended in between
+        return False
+    except FileNotFoundError:  # no /proc: a Mac; or as above
+        return not pathlib.Path("/proc/self").exists()
 
 
 def wait_until(condition, seconds: float = 10) -> bool:
