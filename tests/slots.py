@@ -295,6 +295,11 @@ class Costs:
             reem.SilentSubscriber("cam", interface).listen()
         self._descriptors, self._memory, self.grown = open_files(), 0.0, 0.0
 
+    @property
+    def begun(self) -> bool:
+        """Whether somebody has looked."""
+        return self._memory > 0
+
     def look(self) -> None:
         """Look at the memory; what is needed is there the first time."""
         self._memory = self._memory or resident()
@@ -346,10 +351,12 @@ def mirror_through(end: Any, url: str, place: int, count: Count) -> None:
 def _mirror_through(end: Any, url: str, place: int, count: Count, costs: Costs) -> None:
     logging.getLogger("reem").setLevel(logging.ERROR)  # it says that callbacks are behind
     kept: list[Any] = []
+    last: list[Any] = [None]
 
     def see(data: Any, updated_path: str) -> None:
         if data is None:
             return
+        last[0] = data["id"]
         count.add(place, "seen")
         count.add(place, "shared", in_slot(data["image"]))
         count.add(place, "torn", not is_whole_shot(data))
@@ -365,11 +372,23 @@ def _mirror_through(end: Any, url: str, place: int, count: Count, costs: Costs) 
         mirror.listen()
         calls = reem.CallbackSubscriber("cam", interface, see)
         calls.listen()
+
+        def look() -> None:
+            """Look at the memory when no frame waits for the callback: up to a thousand may, as is due."""
+            deadline = time.monotonic() + PATIENCE
+            while (data := mirror.value()) and data["id"] != last[0] and time.monotonic() < deadline:
+                del data
+                time.sleep(0.01)
+            kept.clear()
+            costs.look()
+
         while end.recv() != "end":
             data = mirror.value()
             end.send((data["id"], is_whole_shot(data)) if data else (None, True))
             del data
-            costs.look()
+            if not costs.begun:
+                look()
+        look()
 
 
 class Result(NamedTuple):

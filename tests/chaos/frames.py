@@ -69,7 +69,7 @@ def killed(run: Run) -> None:
     # Whom a publisher has told early, and then was killed, asks the server when three heartbeats have not confirmed it.
     run.at_most("s where an early publisher was killed", result.slowest_early, 6.0)
     run.none("descriptors left in who was not killed", max(0, result.descriptors))
-    run.at_most("MB more memory of who was not killed", result.grown, 64)
+    run.at_most("MB more memory of who was not killed", result.grown, 30)
     run.none("shared memory left", _holders())
     run.none("files left in /dev/shm", sorted(set(os.listdir("/dev/shm")) - files))
 
