@@ -265,3 +265,23 @@ async def test_what_is_stored_while_the_connection_is_broken_is_seen(server_url,
                 await seen(source, number, name, "n")
                 await seen(source, np.full(5, float(number)), name, "array")
             await told(source, *names)
+
+
+async def test_nothing_is_kept_of_keys_that_are_gone(server_url, key, akvs):
+    async with past_of(server_url) as source:
+        stored = source._follower._stored
+        names = [key(f"gone{number}") for number in range(100)]
+        for name in names:
+            await akvs[name].write({"image": np.zeros(9)})
+        await aeventually(lambda: all(stored.is_told(name) and source.history.knows(name) for name in names))
+        for name in names:
+            await akvs[name].delete()
+        await aeventually(lambda: all(content(source, name) is MISSING for name in names))
+
+        def kept():
+            found = [*stored._looks, *stored._arrays, *stored._told, *stored._changed]
+            return [each for each in found if any(name in each for name in names)]
+
+        await aeventually(lambda: not kept())
+        await akvs[names[0]].write({"n": 1})
+        await seen(source, {"n": 1}, names[0])

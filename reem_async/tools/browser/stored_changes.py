@@ -237,7 +237,15 @@ class StoredChanges:
                 later = divisions[name].take()[1]
                 self._compare(name, it[0], [each.update for each in later if each.update is not None])
             self._unseen.discard(name)
+            if it[0] is None:
+                self._let_go(name)
         return sum([len(it[0] or b"") for it in found.values() if it])
+
+    def _let_go(self, name: str) -> None:
+        """Keep nothing of a key that is gone. If it comes again the server tells once, or it is listed as a new one."""
+        self._told.discard(self._document(name))
+        if name in self._looks and not self._looks[name].due:
+            del self._looks[name]
 
     def _compare(self, name: str, text: bytes | None, later: Sequence[Event]) -> None:
         """Note what was stored.
