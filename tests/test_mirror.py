@@ -15,7 +15,7 @@ from conftest import FRONTS, aeventually, assert_same, eventually, nothing_sent
 import reem
 import reem_async
 from reem_async.errors import BadValue, InterfaceClosed, MissingKey, ReadOnly, Stale
-from reem_async.pubsub import manager as managers
+from reem_async.pubsub import heartbeats
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
@@ -213,7 +213,7 @@ async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_t
     ainterface, akvs, key, raw, monkeypatch
 ):
     """However many keys are followed beside; then the next one that needs them decides."""
-    monkeypatch.setattr(managers, "_HEARTBEAT", 1000.0)
+    monkeypatch.setattr(heartbeats, "_PERIOD", 1000.0)
     manager = manager_of(ainterface.session)
 
     def calls(command):
@@ -221,15 +221,15 @@ async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_t
 
     async with akvs[key("a")].mirror(max_age=0.3):
         async with akvs[key("b")].mirror(max_age=0.005) as mirror:
-            assert manager._period == 0.005 / 3
+            assert manager._heartbeats._period == 0.005 / 3
             await manager.fence()  # the notes that following begins with have been asked for
             gets, pings = calls("get"), calls("ping")
             await aeventually(lambda: calls("ping") >= pings + 20)
             assert calls("get") == gets
             assert mirror.age < 10
-        monkeypatch.setattr(managers, "_HEARTBEAT", 1.0)
-        await aeventually(lambda: manager._period == 0.3 / 3)
-    await aeventually(lambda: manager._period == 1.0)
+        monkeypatch.setattr(heartbeats, "_PERIOD", 1.0)
+        await aeventually(lambda: manager._heartbeats._period == 0.3 / 3)
+    await aeventually(lambda: manager._heartbeats._period == 1.0)
 
 
 async def test_many_wait_and_one_is_cancelled(akvs, key):

@@ -14,20 +14,22 @@ import os
 import random
 import time
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 from ..concurrency.tasks import Tasks
-from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, is_of_command
+from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError
 from ..local.path import LocalPath
-from ..plan import Command, Reply, blamed
+from ..plan import Reply
 from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.redirects import is_moved, is_unapplied
 from ..transport.wire import Wire
+from .heartbeats import Heartbeats
 from .inbox import Inbox
+from .invalidations import Invalidations
 from .listeners import NOBODY, Beginning, Listener, ListenerGroup, Topic
+from .subscribing import Subscribing
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport
@@ -39,13 +41,6 @@ logger = logging.getLogger("reem.subscribe")
 
 _LONGEST_PAUSE = 0.5
 """Seconds between tries to connect: with one that hangs before it, still less than two in all."""
-
-_HEARTBEAT = 1.0
-"""Seconds between looks at a subscribed connection; one that is dead shows a call's time limit later."""
-
-
-_TRACK = ("CLIENT", "TRACKING", "ON")
-"""Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
 
 
 def manager_of(session: Session) -> SubscriptionManager:
@@ -74,17 +69,19 @@ class SubscriptionManager:
         self._wires: dict[Transport, Wire] = {}
         self._topics: dict[Topic, ListenerGroup] = {}
         self._subscribed: dict[Topic, Wire] = {}
-        self._invited: set[Topic] = set()  # publishers of this host know that somebody listens
         self._unsure: set[Topic] = set()  # their keys are on their way to another node
         self._lock = asyncio.Lock()
         self.tasks = Tasks()
         self._reconnecting: asyncio.Task[Any] | None = None
-        self._beating: dict[Wire, asyncio.Task[Any]] = {}
         self._key_watcher: KeyWatcher | None = None
-        self._pace, self._period = 0.0, _HEARTBEAT
+        self._pace = 0.0
         self._closed = False
-        self._warned_of_stored = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
+        self._subscribing = Subscribing(transport, local.host, self._confirmed)
+        self._invalidations = Invalidations()
+        self._heartbeats = Heartbeats(
+            self.tasks, self._listeners_over, self._forget_empty, self._answered, self._on_note
+        )
         self.callers: set[Any] = set()
         self.place = os.getpid(), asyncio.get_running_loop()
 
@@ -111,7 +108,7 @@ class SubscriptionManager:
         async with self._lock:
             self._inbox.watchers.add(watcher)
             for wire in list(self._wires.values()):
-                await self._track(wire)
+                await self._invalidations.turn_on(wire)
 
     def unwatch(self, watcher: Listener) -> None:
         """Tell a listener no more. Idempotent."""
@@ -131,23 +128,7 @@ class SubscriptionManager:
         wire = self._subscribed.get(Topic(channel.encode()))
         if wire is None and not self.transport.sharded:  # all are on one connection
             wire = next(iter(self._wires.values()), None)
-        if wire is None or not wire.alive or not wire.tracked:
-            return False
-        answered = asyncio.get_running_loop().create_future()
-
-        def done(outcome: list[Reply] | Exception) -> None:
-            touched()
-            if not answered.done():  # cancelled
-                answered.set_result(outcome)
-
-        wire.send([("TYPE", name) for name in names], done)
-        outcome = await answered
-        if isinstance(outcome, Exception):
-            raise outcome
-        refused = [reply for reply in outcome if isinstance(reply, Exception)]
-        if any(is_of_command(reply) for reply in refused):
-            self._cannot_track(wire, blamed(refused[0], ("TYPE",)), "+type")
-        return not refused
+        return wire is not None and await self._invalidations.touch(wire, names, touched)
 
     async def subscribe_all(self, listeners: Sequence[Listener]) -> None:
         """Subscribe to many channels ahead of following them, which tries again what cannot be subscribed now."""
@@ -198,7 +179,7 @@ class SubscriptionManager:
                     others = [topic for topic in self._missing() if await self.transport.owner(topic.name) is node]
                     wire = await self._subscribe_at(node, others, [listener])
                 if listener.stored:
-                    await self._track(wire)
+                    await self._invalidations.turn_on(wire)
                 self._invite(wire, listener)
                 listener.start(wire, Beginning.FIRST)
             await ready
@@ -217,7 +198,7 @@ class SubscriptionManager:
         if not self._topics:
             self._pace = listener.patience
         self.hurry(listener.patience)
-        self._beat_every(listener.heartbeat)
+        self._heartbeats.hurry(listener.heartbeat)
         self._topics.setdefault(listener.topic, ListenerGroup()).add(listener)
 
     def hurry(self, patience: float) -> None:
@@ -225,14 +206,6 @@ class SubscriptionManager:
         self._pace = min(self._pace, patience)
         for wire in self._wires.values():
             wire.pace = self._pace
-
-    def _beat_every(self, seconds: float) -> None:
-        """Look at subscribed connections that often while a listener needs it, if that is more often than until now."""
-        if seconds < self._period:
-            self._period = seconds
-            for wire, task in list(self._beating.items()):
-                task.cancel()
-                self._beating[wire] = self.tasks.start(self._beat(wire), "reem heartbeat")
 
     def _watch_keys(self) -> KeyWatcher:
         if self._closed:
@@ -254,71 +227,15 @@ class SubscriptionManager:
                 await wire.close()
                 raise InterfaceClosed("this RedisInterface was closed during the call")
             self._wires[node], wire.pace = wire, self._pace
-            self._beating[wire] = self.tasks.start(self._beat(wire), "reem heartbeat")
+            self._heartbeats.start(wire)
         return wire
 
-    async def _track(self, wire: Wire) -> None:
-        """Have the server tell of changes of what is read over a connection; who may not ask for it is warned once."""
-        if wire.tracked is not None:
-            return
-        (reply,) = await wire.roundtrip([_TRACK])
-        if isinstance(reply, Exception):
-            self._cannot_track(wire, blamed(reply, _TRACK), "+client|tracking")
-        else:
-            wire.tracked = True
-
-    def _cannot_track(self, wire: Wire, reason: Exception, right: str) -> None:
-        wire.tracked = False
-        if not self._warned_of_stored:
-            self._warned_of_stored = True
-            logger.warning(
-                "what is only stored cannot be followed at this server, only what is published is told; a recording "
-                "has the rest at its keyframes, and the page looks for it: %s "
-                "(the user needs the right %s, as in deploy/users.acl)",
-                reason,
-                right,
-            )
-
-    async def _subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
-        """Subscribe and wait until the server has confirmed each topic; raise the first refusal."""
-        answers: list[asyncio.Future[None]] = []
-        for topic in topics:
-            answer = asyncio.get_running_loop().create_future()
-            answers.append(answer)
-            # Noted in order with what is pushed: the word that the slot has moved may come right behind.
-            wire.send([(f"{self._prefix(topic)}SUBSCRIBE", topic.name)], partial(self._confirmed, topic, wire, answer))
-        outcomes = await asyncio.gather(*answers, return_exceptions=True)
-        for outcome in outcomes:
-            if outcome is not None:
-                raise outcome
-
-    def _confirmed(
-        self, topic: Topic, wire: Wire, answer: asyncio.Future[None], replies: list[Reply] | Exception
-    ) -> None:
-        refusal = replies if isinstance(replies, Exception) else replies[0]
-        if not isinstance(refusal, Exception):
-            self._subscribed[topic] = wire
-        if answer.done():  # cancelled
-            return
-        if isinstance(refusal, Exception):
-            command = (f"{self._prefix(topic)}SUBSCRIBE", topic.name)
-            answer.set_exception(refusal if self.transport.sharded else blamed(refusal, command))
-        else:
-            answer.set_result(None)
+    def _confirmed(self, topic: Topic, wire: Wire) -> None:
+        self._subscribed[topic] = wire
 
     def _invite(self, wire: Wire, listener: Listener) -> None:
-        """Have publishers of this host know that somebody looks into their memory; a refusal means that they do not."""
-        if listener.local and self._local.host:
-            near = self._near(listener.topic)
-            self._invited.add(listener.topic)
-            wire.send([(f"{self._prefix(near)}SUBSCRIBE", near.name)], lambda _: None)
-
-    def _near(self, topic: Topic) -> Topic:
-        return Topic(topic.name + f"@{self._local.host}".encode(), topic.pattern)
-
-    def _prefix(self, topic: Topic) -> str:
-        """Return what the server's commands for this kind of topic begin with."""
-        return "P" if topic.pattern else "S" if self.transport.sharded else ""
+        if listener.local:
+            self._subscribing.invite(wire, listener.topic)
 
     def _listeners(self, topics: Iterable[Topic] | None = None) -> list[Listener]:
         wanted = list(self._topics if topics is None else topics)
@@ -348,9 +265,9 @@ class SubscriptionManager:
 
     def _drop(self, listener: Listener) -> None:
         listener.lost(InterfaceClosed("this subscription was closed before it began"))
-        audience = self._topics.get(listener.topic, NOBODY)
-        if listener in audience.present():
-            audience.discard(listener)
+        group = self._topics.get(listener.topic, NOBODY)
+        if listener in group.present():
+            group.discard(listener)
             self._forget_if_empty(listener.topic)
 
     def _forget_if_empty(self, topic: Topic) -> None:
@@ -358,65 +275,22 @@ class SubscriptionManager:
             return
         self._topics.pop(topic, None)
         self._unsure.discard(topic)
-        wire = self._subscribed.pop(topic, None)
-        invited = [self._near(topic)] if topic in self._invited else []
-        self._invited.discard(topic)
-        if wire is None or not wire.alive:
-            return
-        for each in [topic, *invited]:
-            if self._prefix(each) == "S":
-                wire.leave(each.name)
-            else:
-                wire.send([(f"{self._prefix(each)}UNSUBSCRIBE", each.name)], lambda _: None)
+        self._subscribing.leave(self._subscribed.pop(topic, None), topic)
 
-    async def _beat(self, wire: Wire) -> None:
-        """Ask every second for the notes of the last updates: shows a dead connection, and a lost last notice.
-
-        In between ask only for a sign of life, as often as listeners need it.
-        """
-        loop = asyncio.get_running_loop()
-        looked = loop.time()
-        while True:
-            await asyncio.sleep(self._period)
-            if not wire.alive:
-                return
-            notes, answered = [], loop.create_future()
-            if loop.time() - looked > _HEARTBEAT - self._period / 2:
-                looked = loop.time()
-                self._let_go()
-                notes = self._notes(wire)
-            asked: list[Command] = [("GET", note) for note in notes] or [("PING",)]
-            wire.send(asked, partial(self._on_notes, wire, notes, answered))
-            await answered  # a connection breaks only if nothing newer waits on it
-
-    def _let_go(self) -> None:
-        """Forget what nobody listens to any more, and heartbeats that nobody needs."""
+    def _forget_empty(self) -> list[Listener]:
+        """Forget what nobody listens to any more; return who is left."""
         if self._local.host:
             self._local.reader.let_go()
-        for topic in [topic for topic, audience in self._topics.items() if not audience.present()]:
+        for topic in [topic for topic, group in self._topics.items() if not group.present()]:
             self._forget_if_empty(topic)  # all were dropped without closing
-        self._period = min([_HEARTBEAT, *(listener.heartbeat for listener in self._listeners())])
+        return self._listeners()
 
-    def _notes(self, wire: Wire) -> list[str]:
-        """Return the notes to ask for; apart, since a heartbeat that held listeners while it waits would keep them."""
-        listeners = self._listeners([topic for topic, there in self._subscribed.items() if there is wire])
-        return sorted({listener.note for listener in listeners if listener.note is not None})
+    def _listeners_over(self, wire: Wire) -> list[Listener]:
+        return self._listeners([topic for topic, there in self._subscribed.items() if there is wire])
 
-    def _on_notes(
-        self, wire: Wire, names: list[str], answered: asyncio.Future[None], notes: list[Reply] | Exception
-    ) -> None:
-        if not answered.done():  # cancelled
-            answered.set_result(None)
-        if isinstance(notes, Exception):
-            return
+    def _answered(self) -> None:
         if not self.transport.sharded:  # a node says nothing of the others
             self.transport.states.answered()
-        if not names:
-            return
-        found = dict(zip(names, notes, strict=False))
-        for listener in self._listeners([topic for topic, there in self._subscribed.items() if there is wire]):
-            if listener.note in found:
-                self._on_note(listener, found[listener.note])
 
     def _on_note(self, listener: Listener, note: Reply) -> None:
         if is_moved(note):  # this node is only a replica now
@@ -444,7 +318,7 @@ class SubscriptionManager:
             self._repair()
 
     def _on_lost(self, wire: Wire, reason: Exception) -> None:
-        self._beating.pop(wire, None)
+        self._heartbeats.lost(wire)
         topics = [topic for topic, there in self._subscribed.items() if there is wire]
         for topic in topics:
             del self._subscribed[topic]
@@ -472,8 +346,8 @@ class SubscriptionManager:
             return []
         return [
             topic
-            for topic, audience in self._topics.items()
-            if ((wire := self._subscribed.get(topic)) is None or not wire.alive) and audience.present()
+            for topic, group in self._topics.items()
+            if ((wire := self._subscribed.get(topic)) is None or not wire.alive) and group.present()
         ]
 
     async def _reconnect(self) -> None:
@@ -513,9 +387,9 @@ class SubscriptionManager:
         """Subscribe topics at `node` and have who listens begin anew, but for beginners."""
         wire, first = await self._connected(node), {id(each) for each in beginners}
         if self._inbox.watchers.present() or any(listener.stored for listener in self._listeners(topics)):
-            await self._track(wire)
+            await self._invalidations.turn_on(wire)
         try:
-            await self._subscribe(wire, topics)
+            await self._subscribing.subscribe(wire, topics)
         finally:
             for topic in topics:
                 if self._subscribed.get(topic) is wire and wire.alive:
