@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..errors import BadValue, QueueFull
-from .wakeup import Tickets, tickets
+from .wakeup import Wakeups, wakeups
 
 __all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "Places", "Policy", "unheard"]
 
@@ -86,8 +86,8 @@ class BoundedQueue:
         self._items: collections.OrderedDict[int, Any] = collections.OrderedDict()
         self._last = 0
         self._gaps: dict[int, int | None] = {}  # what was lost before which update
-        self._sleepers: collections.deque[None] = collections.deque()  # one for each thread that waits for a ticket
-        self._tickets: dict[int, Tickets] = {}  # by process: a forked child must not take its parent's
+        self._sleepers: collections.deque[None] = collections.deque()  # one for each thread that waits for a wakeup
+        self._wakeups: dict[int, Wakeups] = {}  # by process: a forked child must not take its parent's
         self._end: BaseException | None = None
         self.dropped = 0
         self.wake: Callable[[], None] = unheard
@@ -142,11 +142,11 @@ class BoundedQueue:
         while self._sleepers:
             with contextlib.suppress(IndexError):  # it has found something meanwhile
                 self._sleepers.pop()
-                self._ticket().put(None)
+                self._wakeup().put(None)
         self.wake()
 
-    def _ticket(self) -> Tickets:
-        return self._tickets.get(os.getpid()) or self._tickets.setdefault(os.getpid(), tickets())
+    def _wakeup(self) -> Wakeups:
+        return self._wakeups.get(os.getpid()) or self._wakeups.setdefault(os.getpid(), wakeups())
 
     def take(self) -> Any:
         """Return the oldest update that waits, or EMPTY; raises Ended after the last, or QueueFull."""
@@ -168,11 +168,11 @@ class BoundedQueue:
     def take_waiting(self) -> Any:
         """As `take`, but block this thread until there is something. Any number of threads may."""
         while (item := self.take()) is EMPTY:
-            waiting = self._ticket()
+            waiting = self._wakeup()
             self._sleepers.append(None)
             if not self._items and self._end is None:  # else it was put in before anybody was seen to sleep
                 waiting.get()
-            # Whoever leaves otherwise, also by Ctrl-C, leaves a ticket that wakes somebody in vain.
+            # Whoever leaves otherwise, also by Ctrl-C, leaves a wakeup that wakes somebody in vain.
         return item
 
     def close(self) -> None:

@@ -7,21 +7,21 @@ import queue
 import sys
 from typing import Protocol
 
-__all__ = ["Tickets", "tickets"]
+__all__ = ["Wakeups", "wakeups"]
 
 
-class Tickets(Protocol):
-    """Each ticket that is put wakes one thread that gets one."""
+class Wakeups(Protocol):
+    """Each wakeup that is put wakes one thread that gets one."""
 
-    def put(self, ticket: None) -> None:
-        """Add a ticket."""
+    def put(self, wakeup: None) -> None:
+        """Add a wakeup."""
 
     def get(self) -> None:
-        """Take a ticket; block this thread until there is one."""
+        """Take a wakeup; block this thread until there is one."""
 
 
-def tickets() -> Tickets:
-    """Return the tickets that wake fastest here."""
+def wakeups() -> Wakeups:
+    """Return the wakeups that wake fastest here."""
     try:
         return _Descriptor()
     except (AttributeError, OSError):  # not Linux; or no descriptor is left
@@ -29,7 +29,7 @@ def tickets() -> Tickets:
 
 
 class _Descriptor:
-    """Tickets that the kernel counts, in one file descriptor.
+    """Wakeups that the kernel counts, in one file descriptor.
 
     The thread that is woken may get the processor at once, while the other one is still waking it. That one lets go
     of the interpreter to write to a descriptor; a lock it would release with the interpreter in its hands, for which
@@ -39,7 +39,7 @@ class _Descriptor:
     def __init__(self) -> None:
         self._descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_SEMAPHORE)
 
-    def put(self, ticket: None) -> None:
+    def put(self, wakeup: None) -> None:
         os.write(self._descriptor, (1).to_bytes(8, sys.byteorder))
 
     def get(self) -> None:
