@@ -61,9 +61,9 @@ async def let_go(cluster, interface, key):
 
     def left():
         topics = {*manager._topics, *manager._subscribed}
-        topics |= {branch.topic for branches in watcher._branches.values() for branch in branches.values()}
+        topics |= {listener.topic for there in watcher._followed.values() for listener in there.values()}
         channels = {topic.name for topic in topics if not topic.pattern}
-        channels |= {channel for births in watcher._births.values() for channel in births._buffers}
+        channels |= {channel for new_keys in watcher._new_keys.values() for channel in new_keys._buffers}
         return [channel for channel in channels if key.prefix.encode() in channel]
 
     await aeventually(lambda: not left())
@@ -125,13 +125,13 @@ async def test_a_key_that_is_there_is_not_let_go_of_though_nobody_says_anything_
     await space[key("there")].write(0)
     async with taking(Monitor(two, [key("*")])) as events:
         watcher = manager_of(two.session)._key_watcher
-        (branches,) = watcher._branches.values()
-        followed = dict(branches)
+        (listeners,) = watcher._followed.values()
+        followed = dict(listeners)
         await space[key("gone")].write(0)
         await reem_async.KeyValueStore(one)[key("gone")].delete()
-        await aeventually(lambda: key("gone").encode() in branches)
-        await aeventually(lambda: key("gone").encode() not in branches)
-        assert branches == followed
+        await aeventually(lambda: key("gone").encode() in listeners)
+        await aeventually(lambda: key("gone").encode() not in listeners)
+        assert listeners == followed
         await space[key("there")].write(1)
         await aeventually(lambda: [event.value for event in events if event.name == key("there")] == [1])
         await reem_async.KeyValueStore(one)[key("there")].delete()

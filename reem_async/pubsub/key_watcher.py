@@ -76,22 +76,22 @@ class KeyWatcher:
 
     def __init__(self, manager: Subscriptions) -> None:
         self._manager = manager
-        self._branches: weakref.WeakKeyDictionary[Listener, dict[bytes, _KeyListener]] = weakref.WeakKeyDictionary()
-        self._births: weakref.WeakKeyDictionary[Listener, _NewKeysListener] = weakref.WeakKeyDictionary()
+        self._followed: weakref.WeakKeyDictionary[Listener, dict[bytes, _KeyListener]] = weakref.WeakKeyDictionary()
+        self._new_keys: weakref.WeakKeyDictionary[Listener, _NewKeysListener] = weakref.WeakKeyDictionary()
         self._looking: asyncio.Task[Any] | None = None
 
     async def follow(self, listener: Listener) -> None:
         """Follow all keys that there are now; those that come to be are found within a second."""
-        self._branches[listener] = {}
+        self._followed[listener] = {}
         try:
             name = literal(_glob(listener))
             # A pattern that is a name: nothing has to be looked for.
             if name is not None:  # it need not be there yet
                 await self._found(listener, [name.encode()], late=False)
                 return
-            births = self._births[listener] = _NewKeysListener(self, listener)
+            new_keys = self._new_keys[listener] = _NewKeysListener(self, listener)
             # First the channel to all nodes, then the look: a key that is made in between is heard of.
-            await self._manager.follow_here(births)
+            await self._manager.follow_here(new_keys)
             await self._look(listener, late=False)
         except BaseException:
             await self.unfollow(listener)
@@ -101,42 +101,42 @@ class KeyWatcher:
 
     def listeners(self) -> list[Listener]:
         """Return who listens to patterns: the manager itself only knows of their keys."""
-        return list(self._branches)
+        return list(self._followed)
 
     async def unfollow(self, listener: Listener) -> None:
         """Stop following. Idempotent."""
-        for branch in self._branches.pop(listener, {}).values():
-            await self._manager.unfollow(branch)
-        births = self._births.pop(listener, None)
-        if births is not None:
-            await self._manager.unfollow_here(births)
+        for key_listener in self._followed.pop(listener, {}).values():
+            await self._manager.unfollow(key_listener)
+        new_keys = self._new_keys.pop(listener, None)
+        if new_keys is not None:
+            await self._manager.unfollow_here(new_keys)
 
     def heard(self, listener: Listener, document: bytes) -> None:
         """Follow a key that was just heard of."""
-        births = self._births.get(listener)
-        if births is None or document in self._branches.get(listener, {document: None}):
+        new_keys = self._new_keys.get(listener)
+        if new_keys is None or document in self._followed.get(listener, {document: None}):
             return
         # Collected while others are being followed: many keys are made at once, and each subscription is a round trip.
-        births.fresh[document] = None
-        if not births.following:
-            births.following = True
-            self._manager.tasks.start(self._follow_fresh(listener, births), "reem discovery of new keys")
+        new_keys.fresh[document] = None
+        if not new_keys.following:
+            new_keys.following = True
+            self._manager.tasks.start(self._follow_fresh(listener, new_keys), "reem discovery of new keys")
 
-    async def _follow_fresh(self, listener: Listener, births: _NewKeysListener) -> None:
+    async def _follow_fresh(self, listener: Listener, new_keys: _NewKeysListener) -> None:
         """Follow what was heard of, and all that is heard of meanwhile at once."""
         try:
-            while births.fresh:
-                found, births.fresh = list(births.fresh), {}
+            while new_keys.fresh:
+                found, new_keys.fresh = list(new_keys.fresh), {}
                 await self._found(listener, found, late=True)
         except (RedisError, OSError, InterfaceClosed) as error:
             logger.debug("new keys are not followed yet: %s", error)
         finally:
-            births.following = False
+            new_keys.following = False
 
     async def settled(self) -> None:
         """Return when nothing that has arrived waits for something older, or after a second."""
         for _ in range(_MOMENTS):
-            if not any(births.waits for births in list(self._births.values())):
+            if not any(new_keys.waits for new_keys in list(self._new_keys.values())):
                 return
             await asyncio.sleep(_MOMENT)
 
@@ -145,11 +145,11 @@ class KeyWatcher:
             await asyncio.sleep(_PAUSE)
             await self._look_for_all()
             # Nobody listens to a pattern any more; the next one starts this anew.
-            if not self._branches:
+            if not self._followed:
                 return
 
     async def _look_for_all(self) -> None:
-        for listener in list(self._births):
+        for listener in list(self._new_keys):
             try:
                 await self._look(listener, late=True)
             except (RedisError, OSError) as error:
@@ -159,39 +159,41 @@ class KeyWatcher:
         """Follow the keys that are not followed yet, and let go of those that are gone."""
         async for page in scanned(self._manager.transport, _glob(listener), DOCUMENT):
             await self._found(listener, page, late=late)
-        births, long_ago = self._births.get(listener), time.monotonic() - _GONE
-        branches = self._branches.get(listener, {}) if births is not None else {}
-        for name in [name for name, branch in branches.items() if branch.begun and branch.seen < long_ago]:
-            if births is not None and births.forget(branches[name].topic.name):
-                branch = branches.pop(name)
-                branch.let_go()
-                await self._manager.unfollow_here(branch)
+        new_keys, long_ago = self._new_keys.get(listener), time.monotonic() - _GONE
+        followed = self._followed.get(listener, {}) if new_keys is not None else {}
+        for name in [
+            name for name, key_listener in followed.items() if key_listener.begun and key_listener.seen < long_ago
+        ]:
+            if new_keys is not None and new_keys.forget(followed[name].topic.name):
+                key_listener = followed.pop(name)
+                key_listener.let_go()
+                await self._manager.unfollow_here(key_listener)
 
     async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
         """Follow those that are not followed yet."""
-        branches, births = self._branches.get(listener), self._births.get(listener)
-        if branches is None:
+        followed, new_keys = self._followed.get(listener), self._new_keys.get(listener)
+        if followed is None:
             return
         now = time.monotonic()
         for name in documents:
-            if name in branches:
-                branches[name].seen = now
+            if name in followed:
+                followed[name].seen = now
         found = {
-            name: _KeyListener(listener, name, births)
+            name: _KeyListener(listener, name, new_keys)
             for name in documents
-            if name not in branches and b"{" not in name
+            if name not in followed and b"{" not in name
         }
-        branches.update(found)
-        for branch in found.values():
-            if late and births is not None:
+        followed.update(found)
+        for key_listener in found.values():
+            if late and new_keys is not None:
                 # Its first updates may have been published before it was found.
-                births.buffer(branch.topic.name).late = True
+                new_keys.buffer(key_listener.topic.name).late = True
         try:
             await self._manager.follow_all(list(found.values()))
         except BaseException:
-            for name, branch in found.items():
-                if not branch.begun:
-                    branches.pop(name, None)
+            for name, key_listener in found.items():
+                if not key_listener.begun:
+                    followed.pop(name, None)
             raise
 
 
@@ -247,10 +249,10 @@ class _KeyListener(_Part):
         seen: When the key was there last, something was heard of it, or it began to be followed.
     """
 
-    def __init__(self, listener: Listener, document: bytes, births: _NewKeysListener | None) -> None:
+    def __init__(self, listener: Listener, document: bytes, new_keys: _NewKeysListener | None) -> None:
         channel = keys_of(document.decode(errors="surrogateescape")).channel
         super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
-        self._births = births  # where its first notices came from, or None if only this key is meant
+        self._new_keys = new_keys  # where its first notices came from, or None if only this key is meant
         self.begun = False
         self.seen = time.monotonic()
 
@@ -258,8 +260,8 @@ class _KeyListener(_Part):
         """Begin, and let the listener begin."""
         self.begun = True
         self.seen = time.monotonic()
-        if self._births is not None:
-            self._births.begin(wire, beginning)
+        if self._new_keys is not None:
+            self._new_keys.begin(wire, beginning)
         elif (listener := self._listener()) is not None:
             listener.start(wire, beginning)
         super().start(wire, beginning)
@@ -267,8 +269,8 @@ class _KeyListener(_Part):
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Hand it on, behind what all nodes were told before."""
         self.seen = time.monotonic()
-        if self._births is not None:
-            self._births.buffer(channel).told_here(notice)
+        if self._new_keys is not None:
+            self._new_keys.buffer(channel).told_here(notice)
         elif (listener := self._listener()) is not None:
             listener.on_notice(notice, channel)
 

@@ -120,7 +120,7 @@ class Monitor(Stream[Event]):
         self._namespaces = None if namespaces is None else Pattern(namespaces)
         self.patience = patience
         self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
-        self._ears: list[_PatternListener] = []
+        self._listeners: list[_PatternListener] = []
         self._manager: SubscriptionManager | None = None
         self._numbers = Numbers()
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
@@ -145,35 +145,35 @@ class Monitor(Stream[Event]):
         try:
             for top in dict.fromkeys(pattern.top for pattern in self.patterns):
                 topic = self._topic(Pattern(top))
-                ear = _PatternListener(self, Topic(topic, pattern=True))
-                self._ears.append(ear)
-                await manager.follow(ear)
+                listener = _PatternListener(self, Topic(topic, pattern=True))
+                self._listeners.append(listener)
+                await manager.follow(listener)
         except BaseException:
-            self._manager, self._ears = None, []
+            self._manager, self._listeners = None, []
             raise
 
     async def watch_changes(self) -> None:
         """Be told by `changed` of keys that were read over a connection of notices and then changed."""
         assert self._manager is not None
-        await self._manager.watch(self._ears[0])
+        await self._manager.watch(self._listeners[0])
 
     async def close(self) -> None:
         """Stop following and end the loop. Idempotent."""
         await super().close()
-        for ear in self._ears:
+        for listener in self._listeners:
             if self._manager is not None:
-                self._manager.unwatch(ear)
-                await self._manager.unfollow(ear)
+                self._manager.unwatch(listener)
+                await self._manager.unfollow(listener)
 
     @property
     def connected(self) -> bool:
         """Whether all that it follows is subscribed to, as far as is known."""
-        return all(ear.wire is not None for ear in self._ears)
+        return all(listener.wire is not None for listener in self._listeners)
 
     @property
     def leisurely(self) -> bool:
         """Whether nobody waits for the notices."""
-        return any(ear.wire is not None and ear.wire.leisurely for ear in self._ears)
+        return any(listener.wire is not None and listener.wire.leisurely for listener in self._listeners)
 
     def _topic(self, pattern: Pattern) -> bytes:
         """Return the pattern of the channels of the keys that `pattern` names."""
@@ -294,9 +294,9 @@ class _PatternListener(ForwardingListener):
 
     def _is_others(self, channel: bytes) -> bool:
         """Return whether the pattern of an earlier subscription fits a channel too."""
-        for ear in self._monitor._ears:
-            if ear is self:
+        for listener in self._monitor._listeners:
+            if listener is self:
                 return False
-            if fits(ear.topic.name, channel):
+            if fits(listener.topic.name, channel):
                 return True
         return True

@@ -49,7 +49,7 @@ _PATIENCE = 0.015
 
 
 class Collector(Protocol):
-    """What a feed needs of the recorder."""
+    """What a key recorder needs of the recorder."""
 
     session: Session
     writer_thread: WriterThread
@@ -59,7 +59,7 @@ class Collector(Protocol):
     fetching: asyncio.Semaphore
 
     async def fence(self) -> None:
-        """Wait until everything published before now has been handed to the feeds."""
+        """Wait until everything published before now has been handed to the key recorders."""
 
     def look_for_losses(self) -> None:
         """Note it if updates were dropped that nobody had taken yet."""

@@ -301,7 +301,7 @@ class Recorder:
         self._key_recorder(str(path[0])).sampled(path, value, size)
 
     async def fence(self) -> None:
-        """Wait until everything published before now has been handed to the feeds."""
+        """Wait until everything published before now has been handed to the key recorders."""
         if self._monitor is not None:
             with contextlib.suppress(InterfaceClosed):
                 await manager_of(self.session).fence()

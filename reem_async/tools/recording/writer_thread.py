@@ -152,8 +152,7 @@ class WriterThread:
             if self.failure is not None or self._ending:
                 return False
             # What is small always fits: gaps, deletions and skips must be told most of all when the disk is slow. One
-            # operation
-            # fits into an empty queue whatever its size.
+            # operation fits into an empty queue whatever its size.
             if operation.role in _LARGE and self._size and self._size + size > self._limit:
                 self.counts.drop(operation.path)
                 # The tree lacks this update, so the key has to be read again.
@@ -234,7 +233,7 @@ class WriterThread:
                 self._size -= size
 
     def _write(self, it: Operation) -> None:
-        if it.role == "statistics":
+        if it.role == Role.STATISTICS:
             self._sink.statistics(it.value, it.stamp)
             return
         if it.role == Role.FLUSH:
