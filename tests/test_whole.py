@@ -10,7 +10,7 @@ import pytest
 from clusterkit import Move, owner
 from conftest import aeventually
 from own_servers import liar
-from test_handover import hearing, on_each_node
+from test_reorder import hearing, on_each_node
 
 import reem_async
 from reem_async.errors import ClusterNode, NotConnected

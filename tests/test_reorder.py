@@ -16,7 +16,7 @@ from hypothesis import given, settings
 import reem_async
 from reem_async.errors import InterfaceClosed
 from reem_async.plan.notices import Notice
-from reem_async.pubsub import reorder as handover
+from reem_async.pubsub import reorder
 from reem_async.pubsub.manager import manager_of
 from reem_async.pubsub.monitor import Monitor
 from reem_async.pubsub.reorder import ReorderBuffer
@@ -40,7 +40,7 @@ def notice(sequence, publisher="p"):
     return Notice(publisher, sequence, 0.0, (), False, sequence)
 
 
-class Ear:
+class Heard:
     """A listener that writes down what it is told."""
 
     def __init__(self):
@@ -58,8 +58,8 @@ class Ear:
         return [each[1] for each in self.told if each[0] == publisher]
 
 
-def handed(ear, *, late=True):
-    made = ReorderBuffer(weakref.ref(ear), CHANNEL)
+def handed(listener, *, late=True):
+    made = ReorderBuffer(weakref.ref(listener), CHANNEL)
     made.late = late
     return made
 
@@ -86,17 +86,17 @@ def test_however_the_two_ways_interleave_each_update_is_told_once_and_in_order(d
         first[publisher] = followed
 
     async def play():
-        ear = Ear()
-        made = handed(ear, late=data.draw(st.booleans()) or max(first.values()) > 1)
+        listener = Heard()
+        made = handed(listener, late=data.draw(st.booleans()) or max(first.values()) > 1)
         for which, (publisher, number) in interleaved(data.draw, streams):
             (made.told_here if which % 2 else made.told_to_all)(notice(number, publisher))
         assert not made.waits
-        return ear
+        return listener
 
-    ear = asyncio.run(play())
+    listener = asyncio.run(play())
     for publisher in "pq":
-        assert ear.numbers(publisher) == list(range(1, count + 1))
-    assert "doubt" not in ear.told
+        assert listener.numbers(publisher) == list(range(1, count + 1))
+    assert "doubt" not in listener.told
 
 
 @settings(max_examples=300, deadline=None)
@@ -109,16 +109,16 @@ def test_what_neither_way_brings_is_a_hole_in_the_numbers_and_all_else_is_told_o
     streams = [[("p", number) for number in heard], [("p", number) for number in range(followed, count + 1)]]
 
     async def play():
-        ear = Ear()
-        made = handed(ear)
+        listener = Heard()
+        made = handed(listener)
         for which, (_, number) in interleaved(data.draw, streams):
             (made.told_here if which else made.told_to_all)(notice(number))
         if made.waits:
             await aeventually(lambda: not made.waits)
-        return ear.numbers()
+        return listener.numbers()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(handover, "_PATIENCE", 0.001)
+        patch.setattr(reorder, "_PATIENCE", 0.001)
         numbers = asyncio.run(play())
     assert numbers == sorted({*numbers})
     assert {*numbers} >= {number for number in heard if number < followed}
@@ -128,48 +128,48 @@ def test_what_neither_way_brings_is_a_hole_in_the_numbers_and_all_else_is_told_o
 
 async def test_what_does_not_come_is_not_waited_for_for_ever(monkeypatch):
     """What is missing shows in the numbers; of somebody nothing is known of, it is said that there may be more."""
-    monkeypatch.setattr(handover, "_PATIENCE", 0.01)
-    ear = Ear()
-    made = handed(ear)
+    monkeypatch.setattr(reorder, "_PATIENCE", 0.01)
+    listener = Heard()
+    made = handed(listener)
     made.told_to_all(notice(1))
     made.told_here(notice(4))
     made.told_here(notice(5))
     made.told_here(notice(7, "stranger"))
-    assert ear.told == [("p", 1)]
+    assert listener.told == [("p", 1)]
     assert made.waits
     await aeventually(lambda: not made.waits)
     made.told_here(notice(6))
     made.told_to_all(notice(3))
-    assert ear.told == [("p", 1), ("p", 4), ("p", 5), "doubt", ("stranger", 7), ("p", 6)]
+    assert listener.told == [("p", 1), ("p", 4), ("p", 5), "doubt", ("stranger", 7), ("p", 6)]
 
 
 async def test_who_follows_from_the_beginning_waits_for_nobody():
     """A key that was there already: others may have published to it for long."""
-    ear = Ear()
-    made = handed(ear, late=False)
+    listener = Heard()
+    made = handed(listener, late=False)
     made.told_here(notice(70))
     made.told_to_all(notice(69))
     made.told_here(notice(71))
-    assert ear.numbers() == [70, 71]
+    assert listener.numbers() == [70, 71]
 
 
 async def test_a_crowd_of_publishers_is_forgotten_and_taken_as_it_comes(monkeypatch):
     """Nobody can make it remember without end."""
-    monkeypatch.setattr(handover, "_MOST_PUBLISHERS", 3)
-    ear = Ear()
-    made = handed(ear)
+    monkeypatch.setattr(reorder, "_MOST_PUBLISHERS", 3)
+    listener = Heard()
+    made = handed(listener)
     for number in range(10):
         made.told_here(notice(1, f"p{number}"))
     made.told_here(notice(2, "p0"))
     assert len(made._senders) <= 3
-    assert len(ear.told) == 11
+    assert len(listener.told) == 11
 
 
 async def test_a_listener_that_is_gone_is_told_nothing():
     """It was dropped without closing."""
-    ear = Ear()
-    made = handed(ear)
-    del ear
+    listener = Heard()
+    made = handed(listener)
+    del listener
     made.told_to_all(notice(1))
     made.told_here(notice(2))
     made.told_here(notice(9, "q"))
@@ -231,8 +231,8 @@ async def test_hundreds_of_keys_that_begin_at_once_are_all_followed_and_nothing_
             await asyncio.gather(*[space[name].write(number) for name in names])
         await aeventually(lambda: len(events) >= 3 * len(names))
         key_watcher = manager_of(other.session)._key_watcher
-        branches = [branch for each in key_watcher._branches.values() for branch in each.values()]
-        await aeventually(lambda: len(branches) == len(names) and all(branch.begun for branch in branches))
+        listeners = [one for each in key_watcher._followed.values() for one in each.values()]
+        await aeventually(lambda: len(listeners) == len(names) and all(one.begun for one in listeners))
     assert not [event for event in events if event.gap or event.missed]
     assert sorted((event.name, event.value) for event in events) == sorted(
         (name, number) for name in names for number in range(1, 4)
