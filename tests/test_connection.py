@@ -19,6 +19,8 @@ import reem
 import reem_async
 from reem_async.concurrency.timeouts import moved_last
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.pubsub import heartbeats
+from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
 
@@ -340,6 +342,28 @@ async def test_a_stopped_server_is_noticed_by_who_only_follows(server):
                 assert time.monotonic() - begin < 3.5
             update = await asyncio.wait_for(anext(updates), PATIENCE)
             assert (update.gap, update.data) == (True, 1)
+
+
+@pytest.mark.alone
+async def test_a_connection_that_breaks_gives_no_other_more_time(server, monkeypatch):
+    """The others are asked whether the server is gone, but not one that owes an answer: it would be waited for anew."""
+    monkeypatch.setattr(heartbeats, "_PERIOD", 1000.0)
+    async with reem_async.RedisInterface(server, timeout=1) as interface:
+        store = reem_async.KeyValueStore(interface)
+        await store["foo"].write(1)
+        async with store["foo"].watch():
+            (followed,) = manager_of(interface.session)._wires.values()
+            with stopped(server):
+                begin = time.monotonic()
+                owed = asyncio.ensure_future(followed.roundtrip([("PING",)]))
+                await asyncio.sleep(0.6)
+                for wire in list(interface.session.transport._open):
+                    if wire is not followed:
+                        wire.abort(ConnectionLost("cut"))
+                with pytest.raises(ConnectionLost):
+                    await owed
+                await aeventually(lambda: not followed.alive)
+                assert time.monotonic() - begin < 1.5
 
 
 async def test_a_lost_last_update_is_noticed(server):

@@ -174,7 +174,8 @@ class AsyncTransport:
     def _missed(self, reason: Exception) -> None:
         """Find out whether the server is gone with a connection for calls: nobody may call for a long time."""
         for other in list(self._open):  # one that does not answer in time breaks as well; the last one tells
-            other.send([_PING], lambda _: None)
+            if not other.busy:  # else what it owes already tells, and sooner: whoever asks last would be waited for
+                other.send([_PING], lambda _: None)
         if not self._open and self.states.lost(reason):
             self._tasks.start(self._made_anew(), "reem connect")
 
