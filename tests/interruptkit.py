@@ -59,6 +59,7 @@ def at_step(place, action, call):
         return local
 
     def begin(frame, event, arg):
+        frame.f_trace = local  # Python 3.13 takes no heed of the next line if nothing traces the frame yet
         frame.f_trace_opcodes = True
         return local
 
