@@ -105,11 +105,6 @@ def test_a_handler_that_closes_the_interface_works_at_each_step(server_url, key,
 @pytest.mark.usefixtures("no_callbacks_of_the_collector")
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
-# The interrupt may come into a finalizer of redis-py, where Python tells of it and goes on.
-@pytest.mark.filterwarnings(
-    r"ignore:Exception ignored in. <function (_HiredisParser|AbstractConnection)\.__del__"
-    ":pytest.PytestUnraisableExceptionWarning"
-)
 def test_a_handler_that_raises_keeps_no_other_thread_waiting_at_any_step(server_url, key, name):
     """Ctrl-C comes into every 7th step of Python; then another thread follows, publishes and closes."""
     name_of_key, place, reached = key(), random.randrange(7), True
