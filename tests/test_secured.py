@@ -329,6 +329,7 @@ def test_an_authority_that_is_not_known_is_refused(shielded, other_authority, na
         assert_refused(name, url_of(shielded), "ssl_ca_certs=", **options)
 
 
+@pytest.mark.alone
 @both
 def test_a_sentinel_whose_authority_is_not_known_is_refused_in_the_same_words(shielded, other_authority, name):
     """However many others of the URL are just not there."""
