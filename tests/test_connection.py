@@ -19,6 +19,8 @@ import reem
 import reem_async
 from reem_async.concurrency.timeouts import moved_last
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.plan import Plan
+from reem_async.plan.notices import note_of
 from reem_async.pubsub import heartbeats
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
@@ -376,11 +378,10 @@ async def test_a_lost_last_update_is_noticed(server):
             await space["foo"].write(2)
             update = await asyncio.wait_for(anext(updates), PATIENCE)
             assert (update.data, update.gap, update.missed) == (2, False, 0)
-            # Written, noted as published, and never announced.
+            # Written and noted as published, at one instant, and never announced.
             keys = space["foo"]._reader.keys
-            publisher, number = other.session.stamp(keys)
-            await reem_async.KeyValueStore(other)["foo"].write(3)
-            await other.session.transport.roundtrip([("SET", keys.last, f"{publisher} {number}", "EX", 60)])
+            noted = ("SET", keys.last, note_of(*other.session.stamp(keys)), "EX", "60")
+            await other.session.run(Plan([("JSON.SET", keys.document, "$", "3"), noted], list, atomic=True))
             update = await asyncio.wait_for(anext(updates), PATIENCE)
             assert (update.data, update.gap, update.missed) == (3, True, 1)
             await space["foo"].write(4)
