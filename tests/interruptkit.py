@@ -45,15 +45,17 @@ ARRAY = np.arange(20_000, dtype=float)
 def at_step(place, action, call):
     """Make a call, and take an action before its step of this number, as a handler of signals might.
 
-    A step is one instruction of Python on this thread, wherever it is. Returns whether there are so many.
+    A step is one instruction of Python on this thread, wherever it is. In a finalizer the action waits for the
+    first step behind it: Python keeps from the call what is raised there. Returns whether it was taken.
     """
-    left = place
+    left, taken = place, False
 
     def local(frame, event, arg):
-        nonlocal left
+        nonlocal left, taken
         if event == "opcode":
             left -= 1
-            if left == 0:
+            if left <= 0 and not taken and not in_finalizer(frame):
+                taken = True
                 sys.settrace(None)
                 action()
         return local
@@ -69,7 +71,14 @@ def at_step(place, action, call):
         call()
     finally:
         sys.settrace(before)
-    return left <= 0
+    return taken
+
+
+def in_finalizer(frame):
+    """Tell whether a frame, or one that called it, is an object's `__del__`."""
+    while frame is not None and frame.f_code.co_name != "__del__":
+        frame = frame.f_back
+    return frame is not None
 
 
 class Work:

@@ -18,7 +18,7 @@ from reem_async.errors import BadData, BadKey, BadValue, TooDeep
 from reem_async.plan import placeholders, trees
 from reem_async.plan.documents import encode
 from reem_async.plan.floats import _as_parsed, exact_text, may_lose
-from reem_async.plan.paths import below, may_hold, parse, parse_suffix, show, suffix, to_jsonpath
+from reem_async.plan.paths import below, may_hold, parse, parse_shown, parse_suffix, show, suffix, to_jsonpath
 from reem_async.pubsub.updates import Update
 from reem_async.ships import NumpyShip
 from reem_async.transport.packing import pack
@@ -101,6 +101,12 @@ def test_the_text_of_a_path_leads_back_to_it(path):
     assert parse_suffix(suffix(path) + "~1f") == path
 
 
+@given(TEXT.filter(bool), PATHS)
+def test_the_text_that_a_path_is_shown_by_leads_back_to_it(top, path):
+    """Be it one that the server's paths cannot address."""
+    assert parse_shown(show((top, *path))) == (top, *path)
+
+
 def test_paths_read_as_people_write_them():
     """Plain keys with dots, others in quotes."""
     assert show(("foo", "bar", 0, "a.b", "x")) == 'foo.bar[0]["a.b"].x'
@@ -108,7 +114,8 @@ def test_paths_read_as_people_write_them():
     assert parse(".a.b") == ("a", "b")
     assert parse(".") == () == parse("")
     assert to_jsonpath(("a", 0, 'say "x"')) == '$["a"][0][\'say "x"\']'
-    for text in ("a..b", "a.", "a[b]", 'a["b', "a[1"):
+    assert parse(show(("C:\\a.b", "x"))) == ("C:\\a.b", "x")
+    for text in ("a..b", "a.", "a[b]", 'a["b', "a[1", 'a["\\\\"]', f"a[{'1' * 5000}]"):
         with pytest.raises(BadKey):
             parse(text)
 

@@ -15,6 +15,7 @@ from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import BadKey, ConnectionLost, WriteOnly
 from reem_async.plan import scan
 from reem_async.plan.notices import announce
+from reem_async.plan.paths import show
 from reem_async.pubsub.follower import Follower
 from reem_async.pubsub.manager import manager_of
 from reem_async.pubsub.monitor import Monitor
@@ -131,6 +132,23 @@ def test_what_changes_at_a_key_that_no_path_addresses_is_told_of_the_dict_that_h
     for value in ({"n": 1, " b": 2}, {"n": 1, " b": 2, "q\\": 3}, {"n": 1}):
         kvs[key("a")]["d"] = value
         assert watch.told() == ("stored", f"{key('a')}.d", value)
+
+
+@pytest.mark.parametrize("name", ["C:\\a.b", 'it\'s "x"', " lead.x", '"', "[0]", ".", "~a.", "a\nb.\u202e"])
+def test_any_top_level_key_is_watched_and_disturbs_nobody_beside_it(watching, kvs, pspace, key, name):
+    """Quoted where it is told, also a key that could not be addressed inside a dict."""
+    kvs[key("beside")] = 0
+    watch = watching(key("*"))
+    watch.next()
+    pspace[key(name)] = 1
+    assert watch.told() == ("published", show((key(name),)), 1)
+    kvs[key(name)] = {"x": 2}
+    assert watch.told() == ("stored", show((key(name),)), {"x": 2})
+    kvs[key(name)]["x"] = 3
+    assert watch.told() == ("stored", show((key(name), "x")), 3)
+    pspace[key("beside")] = 4
+    update = watch.next()
+    assert (update.path, update.value, update.gap) == (key("beside"), 4, False)
 
 
 def test_large_arrays_may_stay_at_the_server(watching, kvs, key):

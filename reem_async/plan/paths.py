@@ -17,8 +17,8 @@ from ..errors import BadKey, BadType, BadValue
 
 __all__ = [
     "LONGEST_TOP_KEY", "Path", "below", "check_element", "check_name", "check_namespace", "check_top_key",
-    "counts_from_end", "has_index", "is_namespace", "may_hold", "parse", "parse_suffix", "shorten", "show", "suffix",
-    "to_jsonpath",
+    "counts_from_end", "has_index", "is_namespace", "may_hold", "parse", "parse_shown", "parse_suffix", "shorten", "show",
+    "suffix", "to_jsonpath",
 ]  # fmt: skip
 
 Path = tuple[str | int, ...]
@@ -28,6 +28,8 @@ LONGEST_TOP_KEY = 512
 
 _LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1
 """Beyond, RedisJSON panics, and the server ends."""
+_LONGEST_INDEX = 40
+"""Characters; Python refuses to read numbers of thousands of digits."""
 
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
 # Three kinds of steps: `.key`, `[0]`, and `["any text"]`, quoted as in JSON. The dot before a key may be missing.
@@ -197,6 +199,8 @@ _SHORT = 512
 
 def _element(token: re.Match[str]) -> str | int:
     if token["index"] is not None:
+        if len(token["index"]) > _LONGEST_INDEX:
+            raise BadKey(f"no list has an item {shorten(token['index'])}; indexes have 64 bits")
         return int(token["index"])
     if token["quoted"] is None:
         return token["plain"]
@@ -215,13 +219,21 @@ def parse(text: str) -> Path:
     """
     if not isinstance(text, str):
         raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
+    path = parse_shown(text)
+    # Any text may be a top-level key. A path that begins with a dot may be meant from somewhere else.
+    unchecked = 0 if text.startswith(".") else 1
+    return (*path[:unchecked], *(check_element(key, path[:unchecked]) for key in path[unchecked:]))
+
+
+def parse_shown(text: str) -> Path:
+    """Return the path that `show` turned into `text`; it may have keys that the server's paths cannot address.
+
+    Raises:
+        BadKey: Not a path.
+    """
     if text in ("", "."):
         return ()
-    if text[0] in ".[":
-        return tuple(check_element(key, ()) for key in _split(text, _TYPED))
-    top, *rest = _split("." + text, _TYPED, 1)
-    # Any text may be a top-level key.
-    return (top, *(check_element(key, (top,)) for key in rest))
+    return _split(text, _TYPED) if text[0] in ".[" else _split("." + text, _TYPED, 1)
 
 
 def show(path: Path) -> str:

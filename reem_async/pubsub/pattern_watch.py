@@ -16,7 +16,7 @@ from ..concurrency.queues import BoundedQueue, Last, Policy
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, RedisError, ReemError
 from ..plan.notices import Notice
-from ..plan.paths import Path, parse
+from ..plan.paths import Path, parse_shown
 from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
 from ..session import Session
 from .follower import Follower
@@ -248,7 +248,7 @@ class _Fitting(BoundedQueue):
         watch = self._watch()
         if watch is None:
             return
-        where = parse(update.path)
+        where = parse_shown(update.path)
         if any(pattern.concerns(where) for pattern in watch.patterns):
             watch.queue.put(update)
         if update.deleted and not self._path and update.data is None:

@@ -145,13 +145,15 @@ async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: M
 
 
 async def _hand_on(watch: PatternWatch, monitor: Monitor) -> None:
-    from reem_async.plan.paths import parse
+    from reem_async.plan.paths import parse_shown
     from reem_async.pubsub.monitor import Event
 
     async for update in watch:
         if update.origin == "stored":
             now = time.time()
-            monitor.queue.put(Event(parse(update.path), update.value, update.deleted, 0, now, now, "", 0, stored=True))
+            monitor.queue.put(
+                Event(parse_shown(update.path), update.value, update.deleted, 0, now, now, "", 0, stored=True)
+            )
 
 
 def _enter(event: Event, ending: Ending) -> None:
