@@ -17,8 +17,8 @@ from ..errors import BadKey, BadType, BadValue
 
 __all__ = [
     "LONGEST_TOP_KEY", "Path", "below", "check_element", "check_name", "check_namespace", "check_top_key",
-    "counts_from_end", "has_index", "is_namespace", "may_hold", "parse", "parse_shown", "parse_suffix", "shorten", "show",
-    "suffix", "to_jsonpath",
+    "counts_from_end", "has_index", "is_namespace", "may_hold", "parse", "parse_shown", "parse_suffix", "shorten",
+    "show", "suffix", "to_jsonpath",
 ]  # fmt: skip
 
 Path = tuple[str | int, ...]
