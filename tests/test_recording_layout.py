@@ -310,6 +310,8 @@ def test_only_what_patterns_name_is_kept():
     assert pruned({"left": 1}, ("robot",), patterns) == {}
     assert pruned(1, ("robot",), patterns) is MISSING
     assert pruned(tree, ("arm",), patterns) is MISSING
+    long, image = (Stored(label, ("robot", "left"), 0, 9) for label in ("list", "numpy"))
+    assert pruned({"left": long, "right": image}, ("robot",), patterns) == {"left": long}  # as a short list
 
 
 def test_samples_make_their_parents():

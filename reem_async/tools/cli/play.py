@@ -52,7 +52,8 @@ def play(
     """Publish a recording again, at the pace at which it was recorded.
 
     First all that there was at the start is published, then every update in its turn, bit for bit.
-    If the server is slower than the pace, nothing is left out; how far it lags is said.
+    If the server is slower than the pace, nothing is left out; how far it lags is said. What is damaged or was not
+    recorded is left out, but not what is beside it; it is counted, and the exit code is 1.
 
     Examples:
         reem play run.mcap

@@ -119,7 +119,7 @@ class Log:
 
     @property
     def unreadable(self) -> int:
-        """How many updates were left out until now, since they are damaged, or of a type that was not recorded."""
+        """How many values were left out until now, since they are damaged, or of a type that was not recorded."""
         return max(self._past.unreadable, self._container.left_out)
 
     @property
@@ -157,6 +157,30 @@ class Log:
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
         return resolve(found, self._past.value)
+
+    def readable_at(self, name: str, instant: Instant, patterns: Sequence[str] = ("*",)) -> Any:
+        """Return what patterns name of a top-level key at an instant, without what cannot be read; or MISSING.
+
+        What cannot be read is counted in `unreadable`. An item of a list is None then: the others keep their places.
+        """
+        try:
+            tree = self._at((name,), nanoseconds(instant))
+        except ValueError:  # all of it is damaged
+            self._past.unreadable += 1
+            return MISSING
+        return self._readable(pruned(tree, (name,), [parse_pattern(text) for text in patterns]))
+
+    def _readable(self, tree: Any) -> Any:
+        """Return a past tree without what cannot be read, which is counted; MISSING if that is all of it."""
+        return resolve(tree, self._whole)
+
+    def _whole(self, tree: Any) -> Any:
+        """Return a past tree; MISSING, and it is counted, if something in it cannot be read."""
+        try:
+            return resolve(tree, self._past.value)
+        except ValueError:  # damaged, or never recorded
+            self._past.unreadable += 1
+            return MISSING
 
     def tree_at(self, instant: Instant) -> dict[str, Any]:
         """Return all that there was at an instant: a dict by top-level key; longer arrays as `ArrayHandle`."""
@@ -219,21 +243,32 @@ class Log:
         return [(seconds(ref.time), show(it.path), self._past.stamp(ref)[1]) for ref, it in self._past.skips()]
 
     def updates(
-        self, start: Instant | None = None, end: Instant | None = None, patterns: Sequence[str] = ("*",)
+        self,
+        start: Instant | None = None,
+        end: Instant | None = None,
+        patterns: Sequence[str] = ("*",),
+        *,
+        partial: bool = False,
     ) -> Iterator[LogUpdate]:
         """Yield what was recorded in order, from `start` to `end`, both included.
 
         Of an update of a whole dict, only what the patterns name is in the value.
+
+        Args:
+            start: The first instant; the beginning of the recording if not given.
+            end: The last instant; the end of the recording if not given.
+            patterns: Which paths.
+            partial: An update is left out, and counted in `unreadable`, if anything in its value is damaged or was
+                not recorded. With this, only that is left out of the value; an item of a list is None then.
         """
         after = -1 if start is None else nanoseconds(start) - 1
         until = _END if end is None else nanoseconds(end)
         for ref, stream, value in self._news(after, until, patterns):
-            try:
-                whole = resolve(value, self._past.value)
-            except ValueError:  # damaged, or never recorded
-                self._past.unreadable += 1
-            else:
-                yield self._update(ref, stream, None if whole is MISSING else whole, whole is MISSING)
+            read = self._readable(value) if partial else self._whole(value)
+            if value is MISSING:
+                yield self._update(ref, stream, None, deleted=True)
+            elif read is not MISSING:
+                yield self._update(ref, stream, read, deleted=False)
 
     def outlines_of(self, patterns: Sequence[str] = ("*",)) -> Iterator[tuple[float, Path, Any, str]]:
         """Yield time, path, value and kind of each update; arrays that are not short are `Stored`, and not read.
@@ -251,7 +286,7 @@ class Log:
             if left is not MISSING or value is MISSING:
                 yield ref, stream, left
 
-    def _update(self, ref: Ref, stream: Stream, value: Any, deleted: bool) -> LogUpdate:
+    def _update(self, ref: Ref, stream: Stream, value: Any, *, deleted: bool) -> LogUpdate:
         published, sequence = self._past.stamp(ref)
         return LogUpdate(
             seconds(ref.time), stream.path, value, deleted, seconds(published), sequence, stream.kind.value
@@ -317,7 +352,8 @@ class LogPath:
         Returns:
             The times, in seconds since 1970: float64, (N,). The values: one array, the first axis being
             time, if they are all numbers, all arrays of one shape and dtype, or all lists of as many
-            numbers; else a list. Instants at which nothing was there are left out.
+            numbers; else a list. Instants at which nothing was there are left out, and so are values in
+            which anything is damaged or was not recorded, which `Log.unreadable` counts.
         """
         pairs = list(self.values(start, end))
         times = np.array([time for time, _ in pairs], np.float64)
@@ -334,7 +370,9 @@ class LogPath:
                 last = value
                 continue
             last = value
-            yield seconds(ref.time), resolve(value, self._log._past.value)
+            whole = self._log._whole(value)
+            if whole is not MISSING:
+                yield seconds(ref.time), whole
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"

@@ -57,7 +57,7 @@ class Past:
     Attributes:
         streams: All streams, by no order.
         names: The streams of each top-level key.
-        unreadable: How many updates were skipped since a part of them is damaged.
+        unreadable: How many values were left out, since they are damaged or were not recorded.
 
     Raises:
         DamagedRecording: Not a recording of REEM.
@@ -108,7 +108,7 @@ class Past:
         newest = self._newest(bases, until, -1)
         if newest is not None:
             ref, stream = newest
-            loaded = self._load(ref, stream)
+            loaded = self._load_or_name(ref, stream)
             if loaded is None:
                 return None
             base = ref.time
@@ -116,7 +116,7 @@ class Past:
         # Roles that only repeat are left out here: they say nothing that is not in the updates.
         inner = [it for it in streams if it.role in NEWS and len(it.path) > len(path) and below(it.path, path)]
         for ref, stream in self._later(inner, base, until):
-            loaded = self._load(ref, stream)
+            loaded = self._load_or_name(ref, stream)
             if loaded is None:
                 return None
             tree = self._applied(tree, path, stream, loaded[0])
@@ -177,6 +177,16 @@ class Past:
         if channel.message_encoding == "json":
             return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
         return [self._stored(channel, ref.time, stream.path, message.data)]
+
+    def _load_or_name(self, ref: Ref, stream: Stream) -> list[Any] | None:
+        """Do as `_load`, but have a value that cannot be read stand for itself: what is beside it can be read."""
+        try:
+            return self._load(ref, stream)
+        except BadData:
+            label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
+            if label in ("", "list"):  # it has places of its own, and nobody could tell whether something was there
+                raise
+            return [Stored(label, stream.path, ref.time, 0, label)]
 
     def _readable(self, ref: Ref, stream: Stream) -> list[Any] | None:
         """Return a list of the value of a message; None, and it is counted, if it is damaged."""

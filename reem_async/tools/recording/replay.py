@@ -17,7 +17,6 @@ from ...plan.writes import make_parents
 from ...store.publish import PublishSpace
 from .log import Log, LogUpdate
 from .roles import Kind
-from .state import pruned
 from .times import Instant, nanoseconds, seconds
 
 __all__ = ["ReplayStatus", "Replayer"]
@@ -34,7 +33,7 @@ class ReplayStatus:
         lag: Seconds it is behind the pace asked for.
         most_lag: The most it was.
         rounds: How often it has come to the end.
-        unreadable: How many updates were left out, since they are damaged or of a type that was not recorded.
+        unreadable: How many values were left out, since they are damaged or of a type that was not recorded.
     """
 
     position: float
@@ -51,7 +50,8 @@ class Replayer:
 
     What is read from the server afterwards equals what was recorded, bit for bit. The pace is kept from
     one beginning, so it does not drift; a server that is slower than the pace makes the replay lag, and
-    `status.lag` says by how much. Nothing is left out.
+    `status.lag` says by how much. Nothing is left out but what is damaged or was not recorded: that value
+    alone, an item of a list being None then, and it is counted.
 
     Args:
         interface: The server.
@@ -195,15 +195,12 @@ class Replayer:
         # A microsecond later: what happened at the start is in the trees already, and times of floats are exact to
         # that.
         after = seconds(nanoseconds(self.start) + 1000)
-        self._updates = iter(self._log.updates(after, self.end, self._texts))
+        self._updates = iter(self._log.updates(after, self.end, self._texts, partial=True))
 
     def _whole(self, name: str) -> Any:
         if not self._is_chosen(name):
             return MISSING
-        try:
-            return pruned(self._log.value_at((name,), self.start), (name,), self._patterns)
-        except (MissingKey, ValueError):  # not there, or damaged
-            return MISSING
+        return self._log.readable_at(name, self.start, self._texts)
 
     async def _publish(self, update: LogUpdate) -> None:
         path = self._renamed(update.path)

@@ -10,6 +10,7 @@ from ...plan.paths import Path
 from ...plan.patterns import Pattern
 from ...plan.trees import MISSING, CannotApply, get, removed, replaced
 from .roles import Kind, Role
+from .stored import Stored
 
 __all__ = ["applied", "differing", "planted", "pruned", "without"]
 
@@ -87,7 +88,8 @@ def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
     wanted = [pattern for pattern in patterns if pattern.concerns(path)]
     if any(len(pattern.rest) < len(path) for pattern in wanted):
         return tree
-    if type(tree) is list and wanted:  # the items keep their places
+    # The items keep their places, also those of a long list that has a message of its own.
+    if wanted and (type(tree) is list or (type(tree) is Stored and tree.label == "list")):
         return tree
     if type(tree) is not dict or not wanted:
         return MISSING

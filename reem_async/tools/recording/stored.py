@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...plan.paths import Path, show
-from ...plan.trees import get, replaced
+from ...plan.trees import MISSING, get, replaced
 from .contents import Content
 
 __all__ = [
@@ -165,12 +165,17 @@ def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
 
 
 def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
-    """Return a copy of `tree` with every `Stored` replaced by what `load` makes of it."""
+    """Return a copy of `tree` with every `Stored` replaced by what `load` makes of it.
+
+    What it makes MISSING of is left out; an item of a list is None then, and the others keep their places.
+    """
     kind = type(tree)
     if kind is dict:
-        return {key: resolve(item, load) for key, item in tree.items()}
+        items = {key: resolve(item, load) for key, item in tree.items()}
+        return {key: item for key, item in items.items() if item is not MISSING}
     if kind is list:
-        return [resolve(item, load) for item in tree]
+        found = [resolve(item, load) for item in tree]
+        return [None if item is MISSING else item for item in found]
     return load(tree) if kind is Stored else tree
 
 
