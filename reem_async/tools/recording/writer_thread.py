@@ -256,17 +256,23 @@ class WriterThread:
     def _write_update(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
         tree = self._extracted(it)
-        if type(tree) is not Stored or type(it.value) in (Stored, Unchanged):  # else its message is the update
-            self._count(self._sink.json(it.path, Role.UPDATE, it.kind, to_json(tree), it.stamp))
         # A long list is a message of its own: to change one of its items, it becomes a list again.
         before = opened(self._trees.get(name, MISSING), rest, _as_list)
         if it.kind == Kind.READ:
             self._trees[name] = planted(before, rest, tree)
-            return
-        try:
-            self._trees[name] = replaced(before, rest, tree)
-        except CannotApply:  # the server has refused it too, or an update is missing here
-            self._fall_behind(name)
+        else:
+            try:
+                self._trees[name] = replaced(before, rest, tree)
+            except CannotApply:  # the server has refused it too, or an update is missing here
+                self._fall_behind(name)
+        lost = type(tree) is Stored and tree.label == LOST
+        # Else its message is the update.
+        if type(tree) is not Stored or lost or type(it.value) in (Stored, Unchanged):
+            try:
+                self._count(self._sink.json(it.path, Role.UPDATE, it.kind, to_json(tree), it.stamp))
+            except FullError:
+                if not lost:  # else it is counted already
+                    raise
 
     def _write_delete(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
@@ -274,8 +280,8 @@ class WriterThread:
         # A read that finds nothing where nothing was known is no news.
         if it.kind == Kind.READ and get(before, rest) is MISSING:
             return
-        self._event(it, {"op": "delete", "path": show(it.path)})
         self._trees[name] = without(before, rest, it.kind)
+        self._event(it, {"op": "delete", "path": show(it.path)})
 
     def _write_skip(self, it: Operation) -> None:
         self._event(it, {"op": "skip", "path": show(it.path)})
