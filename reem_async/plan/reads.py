@@ -122,6 +122,8 @@ def read(
     # Else `_Fetch` asks for document and arrays in one transaction, until the placeholders are those that were asked
     # for.
     known = cache.layout(keys.document, path)
+    # What a ship wrote that is lacking here is an error if it is there still; that a reply says, not a guess.
+    known = tuple([each for each in known if ships.has(each.label) or each.size > largest])
     if known:
         return _Fetch(keys, path, ships, cache, known, also, held, largest).plan()
 

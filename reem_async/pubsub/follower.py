@@ -15,8 +15,8 @@ from functools import partial
 from typing import Any
 
 from ..concurrency.queues import BoundedQueue, unheard
-from ..concurrency.tasks import Tasks
-from ..errors import ClusterNode
+from ..concurrency.tasks import Tasks, is_being_cancelled
+from ..errors import BadData, ClusterNode
 from ..plan import Reply, wire_commands
 from ..plan.keys import Keys
 from ..plan.notices import Notice
@@ -225,8 +225,9 @@ class Follower:
         if self._wire is not None:
             self._wire.send([("TYPE", key) for key in command.keys], partial(self._armed, command.number))
 
-    def _armed(self, number: int, _: list[Reply] | Exception) -> None:
-        self._replica.armed(number)  # a refusal meets the read too
+    def _armed(self, number: int, outcome: list[Reply] | Exception) -> None:
+        refusals = [outcome] if isinstance(outcome, Exception) else [it for it in outcome if isinstance(it, Exception)]
+        self._replica.armed(number, refusals[0] if refusals else None)
         self._perform()
 
     def _read(self, command: Read) -> None:
@@ -284,6 +285,12 @@ class Follower:
         try:
             for container, key, value in waiting:
                 container[key] = await value
+        except asyncio.CancelledError as error:
+            if is_being_cancelled():
+                raise
+            # Of something that was cancelled, and whose result a ship has asked for.
+            failure = BadData(f"{self.keys.name}: a ship could not make a value of what is there: {error!r}")
+            self._replica.failed(command.number, failure)
         except Exception as error:
             self._replica.failed(command.number, error)
         else:

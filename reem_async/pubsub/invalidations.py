@@ -6,7 +6,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterable
 
-from ..errors import is_of_command
+from ..errors import ServerNotReady, is_of_command
 from ..plan import Reply, blamed
 from ..transport.wire import Wire
 
@@ -16,6 +16,8 @@ logger = logging.getLogger("reem.subscribe")
 
 _TRACK = ("CLIENT", "TRACKING", "ON")
 """Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
+_TOUCH = ("TYPE", "")
+"""Tells whether the user may use what keys are touched with; no document has that name."""
 
 
 class Invalidations:
@@ -25,12 +27,20 @@ class Invalidations:
         self._warned = False
 
     async def turn_on(self, wire: Wire) -> None:
-        """Have the server tell of changes of what is read over a connection; at most one round trip."""
+        """Have the server tell of changes of what is read over a connection; at most one round trip.
+
+        Raises:
+            ServerNotReady: It answers nobody now; to be tried again.
+        """
         if wire.tracked is not None:
             return
-        (reply,) = await wire.roundtrip([_TRACK])
-        if isinstance(reply, Exception):
-            self._refused(wire, blamed(reply, _TRACK), "+client|tracking")
+        tracking, touching = await wire.roundtrip([_TRACK, _TOUCH])
+        if isinstance(tracking, ServerNotReady):
+            raise blamed(tracking, _TRACK)
+        if isinstance(tracking, Exception):
+            self._refused(wire, blamed(tracking, _TRACK), "+client|tracking")
+        elif isinstance(touching, Exception) and is_of_command(touching):
+            self._refused(wire, blamed(touching, _TOUCH), "+type")
         else:
             wire.tracked = True
 

@@ -16,8 +16,9 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
+from ..concurrency.queues import unheard
 from ..concurrency.tasks import Tasks
-from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError
+from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
 from ..local.path import LocalPath
 from ..plan import Reply
 from ..session import Session
@@ -70,6 +71,7 @@ class SubscriptionManager:
         self._topics: dict[Topic, ListenerGroup] = {}
         self._subscribed: dict[Topic, Wire] = {}
         self._unsure: set[Topic] = set()  # their keys are on their way to another node
+        self._beginners: Sequence[Listener] = ()  # they begin by themselves once their topics are subscribed
         self._lock = asyncio.Lock()
         self.tasks = Tasks()
         self._reconnecting: asyncio.Task[Any] | None = None
@@ -176,8 +178,7 @@ class SubscriptionManager:
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
                     node = await self.transport.owner(listener.topic.name, anew=anew)
-                    others = [topic for topic in self._missing() if await self.transport.owner(topic.name) is node]
-                    wire = await self._subscribe_at(node, others, [listener])
+                    wire = await self._subscribe_at(node, [listener.topic], [listener])
                 if listener.stored:
                     await self._invalidations.turn_on(wire)
                 self._invite(wire, listener)
@@ -231,7 +232,15 @@ class SubscriptionManager:
         return wire
 
     def _confirmed(self, topic: Topic, wire: Wire) -> None:
+        """Note a subscription, and have who listens begin anew, but for beginners; whoever asked for it may be gone."""
+        if self._subscribed.get(topic) is wire:
+            return
         self._subscribed[topic] = wire
+        self._forget_if_empty(topic)  # who asked for it was cancelled
+        for listener in self._listeners([topic]):
+            if listener not in self._beginners:
+                self._invite(wire, listener)
+                listener.start(wire, Beginning.AFTER_LOSS)
 
     def _invite(self, wire: Wire, listener: Listener) -> None:
         if listener.local:
@@ -362,10 +371,10 @@ class SubscriptionManager:
                 try:
                     async with self._lock:
                         await self._resubscribe()
-                except (RedisError, OSError) as error:
-                    logger.debug("not connected yet: %s", error)
                 except InterfaceClosed:
                     return
+                except (ReemError, RedisError, OSError) as error:  # a file of certificates that is being replaced, too
+                    logger.debug("not connected yet: %s", error)
         finally:
             self._reconnecting = None
 
@@ -378,33 +387,53 @@ class SubscriptionManager:
         for node, topics in missing.items():
             try:
                 await self._subscribe_at(node, topics)
-            except (RedisError, OSError) as error:
+            except (ReemError, RedisError, OSError) as error:
                 failure = error
         if failure is not None:
             raise failure
 
     async def _subscribe_at(self, node: Transport, topics: list[Topic], beginners: Sequence[Listener] = ()) -> Wire:
         """Subscribe topics at `node` and have who listens begin anew, but for beginners."""
-        wire, first = await self._connected(node), {id(each) for each in beginners}
+        wire = await self._connected(node)
         if self._inbox.watchers.present() or any(listener.stored for listener in self._listeners(topics)):
             await self._invalidations.turn_on(wire)
+        self._beginners = beginners
         try:
             await self._subscribing.subscribe(wire, topics)
         finally:
-            for topic in topics:
-                if self._subscribed.get(topic) is wire and wire.alive:
-                    for listener in self._listeners([topic]):
-                        if id(listener) not in first:
-                            self._invite(wire, listener)
-                            listener.start(wire, Beginning.AFTER_LOSS)
+            self._beginners = ()
         return wire
 
     async def close(self) -> None:
         """End all listeners and the connections. Idempotent."""
         self._closed = True
+        if self.place != (os.getpid(), asyncio.get_running_loop()):
+            return  # its connections are the parent's, or went with their event loop
+        # First, since a task may be slow to end: loops over what is followed do not wait for it.
+        await self._unfollow_all()
         await self.tasks.end()
-        beyond = self._key_watcher.listeners() if self._key_watcher is not None else []
-        for listener in [*beyond, *self._listeners()]:
-            await self.unfollow(listener)
         for wire in list(self._wires.values()):
             await wire.close()
+        await self._unfollow_all()  # who came meanwhile
+
+    async def _unfollow_all(self) -> None:
+        for listener in self._everybody():
+            await self.unfollow(listener)
+
+    def end_loops(self) -> None:
+        """End the loops of threads over what is followed, though the event loop may be busy. Any thread may."""
+        for listener in self._everybody():
+            for queue in listener.queues:
+                if queue.wake is unheard:  # else it wakes something in the event loop, which no other thread may
+                    queue.close()
+
+    def _everybody(self) -> list[Listener]:
+        """Return all who listen, also to patterns in a cluster. Any thread may ask."""
+        beyond = self._key_watcher.listeners() if self._key_watcher is not None else []
+        return [*beyond, *self._listeners()]
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it goes on: not in a forked child, nor when its event loop was closed. Any thread may ask."""
+        pid, loop = self.place
+        return pid == os.getpid() and not loop.is_closed()

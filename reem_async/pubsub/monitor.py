@@ -23,7 +23,7 @@ from .manager import SubscriptionManager, Topic, manager_of
 __all__ = ["ANNOUNCED", "Event", "Monitor"]
 
 # Keys. Beyond that every key is taken to have a gap, once.
-_MOST_DOUBTS = 10_000
+_MOST_OWED = 10_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ class Monitor(Stream[Event]):
         self._manager: SubscriptionManager | None = None
         self._numbers = Numbers()
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
-        self._doubts: set[str] = set()  # keys of which a message could not be read: the next one has a gap
+        self._owed: dict[str, int] = {}  # keys with a gap to be told, and how many updates are known to be lost there
         self.doubted: Callable[[str], None] = lambda name: None
         self.broken: Callable[[], None] = unheard
         self.begun_anew: Callable[[], None] = unheard
@@ -215,11 +215,15 @@ class Monitor(Stream[Event]):
         place = self._split(channel)
         if place is None:
             return
-        if len(self._doubts) >= _MOST_DOUBTS:
-            self._doubts.clear()
-            self._lost()
-        self._doubts.add("".join(place))
+        self._owe("".join(place), 0)
         self.doubted(place[1])
+
+    def _owe(self, whole: str, missed: int) -> None:
+        """Have the next event of a key say that updates were lost."""
+        if len(self._owed) >= _MOST_OWED:
+            self._owed.clear()
+            self._lost()
+        self._owed[whole] = self._owed.get(whole, 0) + missed
 
     def _heard(self, notice: Notice, channel: bytes) -> None:
         place = self._split(channel)
@@ -229,11 +233,13 @@ class Monitor(Stream[Event]):
         whole = namespace + name
         # By publisher and key, since a publisher numbers each key's updates by themselves.
         missed, path = self._numbers.take((notice.publisher, whole), notice.sequence), (name, *notice.path)
-        gap = missed != 0 or whole in self._doubts or (self._gaps is not None and whole not in self._gaps)
-        self._doubts.discard(whole)
+        gap = missed != 0 or whole in self._owed or (self._gaps is not None and whole not in self._gaps)
+        lost = max(missed, 0) + self._owed.pop(whole, 0)
         if self._gaps is not None:
             self._gaps.add(whole)
         if not any(pattern.concerns(path) for pattern in self.patterns):
+            if gap:  # what was lost may have been at a place that one does
+                self._owe(whole, lost)
             return
         self.queue.put(
             Event(
@@ -245,7 +251,7 @@ class Monitor(Stream[Event]):
                 time.time(),
                 notice.publisher,
                 notice.sequence,
-                max(missed, 0),
+                lost,
                 gap,
                 namespace,
                 local=notice.slot is not None,

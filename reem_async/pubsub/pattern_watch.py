@@ -11,10 +11,11 @@ import logging
 import math
 import weakref
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from ..concurrency.queues import BoundedQueue, Last, Policy
 from ..concurrency.streams import Stream
-from ..errors import InterfaceClosed, RedisError, ReemError
+from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan.notices import Notice
 from ..plan.paths import Path, parse_shown
 from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
@@ -69,6 +70,7 @@ class PatternWatch(Stream[Update]):
         self._followed: dict[str, list[Follower]] = {}
         self._born: dict[str, list[Notice]] = {}  # about to be followed
         self._failed: set[str] = set()  # could not be followed: what is there later was not made just then
+        self._unreadable: set[str] = set()  # of these that was because of what is there, or of rights
 
     @property
     def _following(self) -> bool:
@@ -106,6 +108,7 @@ class PatternWatch(Stream[Update]):
         self._listeners, self._followed = [], {}
         self._born.clear()
         self._failed.clear()
+        self._unreadable.clear()
         for listener in leaving:
             if self._manager is not None:
                 await self._manager.unfollow(listener)
@@ -127,9 +130,10 @@ class PatternWatch(Stream[Update]):
         return [path for path in paths if not any(path[: len(other)] == other for other in paths - {path})]
 
     async def _follow(self, names: Iterable[str], *, late: bool) -> None:
-        """Follow some keys; what cannot be read is told in a warning, and followed nevertheless."""
+        """Follow some keys; what cannot be read is told in a warning, and tried again at each look."""
         manager, session = self._manager, self._session
-        assert manager is not None
+        if manager is None or self._closed:  # meanwhile
+            return
         followers: dict[str, list[Follower]] = {}
         for name in names:
             if name in self._followed:  # meanwhile
@@ -156,23 +160,32 @@ class PatternWatch(Stream[Update]):
         try:
             await manager.subscribe_all([each for there in followers.values() for each in there])
             for name, there in followers.items():
-                await self._begin(there, manager)
-                self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
-                begun.add(name)
+                if await self._begin(name, there, manager):
+                    self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
+                    begun.add(name)
         finally:
             for name in followers.keys() - begun:  # they are found again; the others have told what is there
                 self._born.pop(name, None)
                 self._failed.add(name)
                 self._drop(name)
+            if self._closed:  # meanwhile
+                for name in begun:
+                    self._drop(name)
 
-    async def _begin(self, followers: Iterable[Follower], manager: SubscriptionManager) -> None:
-        for follower in followers:
-            try:
+    async def _begin(self, name: str, followers: Iterable[Follower], manager: SubscriptionManager) -> bool:
+        """Begin to follow one key; return False if that fails because of what is there, or of rights to it."""
+        try:
+            for follower in followers:
                 await manager.follow_here(follower)
-            except RedisError:
+        except ReemError as error:
+            if isinstance(error, RedisError | InterfaceClosed) and not isinstance(error, NotAllowed | WrongKind):
                 raise
-            except ReemError as error:
-                logger.warning("%s cannot be watched: %s", follower.keys.name, error)
+            if name not in self._unreadable:
+                self._unreadable.add(name)
+                logger.warning("%s cannot be watched until that is mended: %s", name, error)
+            return False
+        self._unreadable.discard(name)
+        return True
 
     def heard(self, notice: Notice, channel: bytes) -> None:
         """Follow the key of which somebody has published something, unless it is followed."""
@@ -183,9 +196,13 @@ class PatternWatch(Stream[Update]):
                 born.append(notice)
         elif notice.deleted and not notice.path:  # who followed the key has told that it is gone
             return
-        elif name and name not in self._followed and self._manager is not None and self._paths(name):
+        elif name and self._is_new(name) and self._manager is not None and self._paths(name):
             self._born[name] = [notice]
             self._manager.tasks.start(self._follow_late([name]), "reem discovery of new keys")
+
+    def _is_new(self, name: str) -> bool:
+        """Return whether a key that is heard of is to be followed at once; one that was unreadable waits for a look."""
+        return name not in self._followed and name not in self._unreadable
 
     async def _follow_late(self, names: Iterable[str]) -> None:
         try:
@@ -216,6 +233,8 @@ class PatternWatch(Stream[Update]):
         followed = list(self._followed)
         try:
             found = await self._there()
+            self._failed &= found
+            self._unreadable &= found
             for name in followed:  # of a place in a key, no update says that all of the key is gone
                 if name not in found:
                     self._drop_if_gone(name)
@@ -242,15 +261,23 @@ class _Fitting(BoundedQueue):
         self._watch = weakref.ref(watch)
         self._name = name
         self._path = path
+        self._owes = False  # the next update that fits says that some were lost, and
+        self._missed: int | None = 0  # how many; None if that is not known
 
     def put(self, update: Update) -> None:
         """Hand an update on."""
         watch = self._watch()
         if watch is None:
             return
+        if self._owes:
+            missed = None if self._missed is None or update.missed is None else self._missed + update.missed
+            update = replace(update, gap=True, missed=missed)
         where = parse_shown(update.path)
-        if any(pattern.concerns(where) for pattern in watch.patterns):
+        fits = any(pattern.concerns(where) for pattern in watch.patterns)
+        if fits:
             watch.queue.put(update)
+        # What was lost before one that no pattern names may have been at a place that one does.
+        self._owes, self._missed = update.gap and not fits, 0 if fits else update.missed
         if update.deleted and not self._path and update.data is None:
             watch.gone(self._name)
 

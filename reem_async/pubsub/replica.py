@@ -51,7 +51,7 @@ import math
 from enum import Enum, auto
 from typing import Any
 
-from ..errors import RedisError
+from ..errors import RedisError, ReemError
 from ..plan import Plan, Reply
 from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
@@ -258,13 +258,17 @@ class Replica:
         if self._dirty and self.state in _AT_REST:
             self._read()
 
-    def armed(self, number: int) -> None:
-        """The keys were touched: what is changed from now on is told of."""
-        if number == self._number and self.state is State.ARMING:
-            assert self._plan is not None
-            self._division.asked(in_order=False)
-            self.state = State.READING
-            self.outputs.append(Read(number, self._plan))
+    def armed(self, number: int, error: Exception | None = None) -> None:
+        """The keys were touched, unless there was an `error`: what is changed from now on is told of."""
+        if number != self._number or self.state is not State.ARMING:
+            return
+        if error is not None:
+            self._fail(error)
+            return
+        assert self._plan is not None
+        self._division.asked(in_order=False)
+        self.state = State.READING
+        self.outputs.append(Read(number, self._plan))
 
     def _take(self, heard: Heard[Notice]) -> None:
         """Apply an update that follows on a copy that is current; keep any other with the snapshot that tells."""
@@ -310,8 +314,12 @@ class Replica:
         self._number += 1
         self._early.read()
         noted = (("GET", self._keys.last),)
-        plan = read(self._keys, self.path, self._ships, self._cache, noted, self._attachments.values, self._largest)
-        self._send(look_first(plan, self._keys, self._cache))
+        try:
+            plan = read(self._keys, self.path, self._ships, self._cache, noted, self._attachments.values, self._largest)
+        except ReemError as error:
+            self._fail(error)
+        else:
+            self._send(look_first(plan, self._keys, self._cache))
 
     def _send(self, plan: Plan) -> None:
         arms = plan.bulk and self._tracked

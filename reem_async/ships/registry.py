@@ -148,6 +148,10 @@ class Ships:
                 return each
         return None
 
+    def has(self, label: str) -> bool:
+        """Return whether there is a ship with this label."""
+        return label in self._by_label
+
     def labelled(self, label: str, where: str) -> Registered:
         """Return the ship with this label.
 
