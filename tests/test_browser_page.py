@@ -12,6 +12,7 @@ from browserkit import live, served
 from conftest import eventually
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
 
+import reem
 from reem.server import EmbeddedServer
 
 expect = playwright.expect
@@ -96,6 +97,69 @@ def test_what_a_search_finds_has_its_whole_path_though_the_tree_comes_late(visit
     expect(row(page, f"{name}.needle").locator(".key")).to_have_text(f"{name}.needle")
     page.locator("#search").press("Escape")
     expect(row(page, f"{name}.needle").locator(".key")).to_have_text("needle")
+
+
+BROKEN = """([what, times]) => {
+  const real = window.fetch;
+  window.fetch = async (...all) => {
+    const answer = await real(...all);
+    if (!String(all[0]).includes(what) || times-- <= 0) return answer;
+    const body = new ReadableStream({ start: (to) => to.error(new TypeError("network error")) });
+    return new Response(body, { status: 200, headers: answer.headers });
+  };
+}"""
+
+
+@pytest.mark.parametrize("what", ["/api/tree", "/api/node", "/api/image"])
+def test_after_an_answer_that_breaks_off_the_page_goes_on(visit, pspace, key, what):
+    """It took itself for busy from then on, and showed nothing new for ever."""
+    name = key("arm")
+    pspace[name] = {"x": 1, "image": np.zeros((20, 30), np.uint8)}
+    page = visit.open(f"/view/{name}.{'image' if what == '/api/image' else 'x'}")
+    expect(row(page, f"{name}.x")).to_contain_text("1")
+    page.evaluate(BROKEN, [what, 1])
+    pspace[name]["image"] = np.ones((20, 30), np.uint8)
+    pspace[name]["x"] = 2
+    expect(row(page, f"{name}.x")).to_contain_text("2")
+    pspace[name]["x"] = 3
+    expect(row(page, f"{name}.x")).to_contain_text("3")
+    expect(page.locator("#banner")).to_be_hidden()
+
+
+@pytest.mark.parametrize("label", ["constructor", "toString", "__proto__"])
+def test_a_ship_may_be_called_as_what_every_object_has(visit, server_url, key, label):
+    """The page looked its name up in a plain object, found a function, and showed nothing new for ever."""
+
+    class Odd(reem.BytesShip):
+        def check_fit(self, value):
+            return isinstance(value, bytes)
+
+        def get_label(self):
+            return label
+
+    name = key("odd")
+    with reem.RedisInterface(server_url, ships=[Odd()]) as interface:
+        reem.KeyValueStore(interface)[name] = {"blob": b"12345", "n": 1}
+        page = visit.open(f"/view/{name}.blob")
+        expect(page.locator("#view .head .what")).to_contain_text(label)
+        expect(page.locator("#view .big")).to_have_text("bytes")
+        expect(row(page, f"{name}.blob").locator(".value")).to_have_attribute("title", re.compile(f"^{label}  "))
+        reem.PublishSpace(interface)[name]["n"] = 2
+        expect(row(page, f"{name}.n")).to_contain_text("2")
+
+
+def test_a_key_may_be_called_as_what_turns_the_pages_of_another(visit, kvs, key):
+    """Both were kept under `more:` and the key: the tree was not drawn any more."""
+    name = key("long")
+    kvs[name] = dict.fromkeys([f"n{number:03}" for number in range(120)], 1)
+    kvs[f"more:{name}"] = 7
+    try:
+        page = visit.open()
+        row(page, name).locator(".twist").click()
+        expect(page.locator("#tree .pager.more")).to_contain_text("of 120")
+        expect(row(page, f"more:{name}")).to_contain_text("7")
+    finally:
+        del kvs[f"more:{name}"]
 
 
 def test_a_picture_that_is_on_its_way_is_not_drawn_as_a_broken_one(visit, kvs, key):

@@ -68,17 +68,20 @@ const app = {
     this.valueToo ||= valueToo;
     if (this.busy) { this.again = true; return; }
     this.busy = true;
-    do {
-      this.again = false;
-      const began = performance.now(), value = this.valueToo;
-      this.valueToo = false;
-      const results = await Promise.allSettled([finder.shown ? finder.refresh() : tree.refresh(), value ? view.refresh() : null]);
-      for (const result of results) if (result.status === "rejected") this.failed(result.reason);
-      this.done = performance.now();
-      this.took = this.done - began;
-      if (value) [this.valueDone, this.valueTook] = [this.done, this.took];
-    } while (this.again);
-    this.busy = false;
+    try {
+      do {
+        this.again = false;
+        const began = performance.now(), value = this.valueToo;
+        this.valueToo = false;
+        const results = await Promise.allSettled([finder.shown ? finder.refresh() : tree.refresh(), value ? view.refresh() : null]);
+        this.done = performance.now();
+        this.took = this.done - began;
+        if (value) [this.valueDone, this.valueTook] = [this.done, this.took];
+        for (const result of results) if (result.status === "rejected") this.failed(result.reason);
+      } while (this.again);
+    } finally {
+      this.busy = false; // whatever went wrong: a page that is busy for ever shows nothing new
+    }
   },
 
   // Something changed, or may have: a page that takes long to make is made less often.

@@ -1,6 +1,6 @@
 // The tree of keys: rows made once and changed in place, branches loaded when they are opened, long ones in pages.
 import { Spark } from "./spark.js";
-import { addressUrl, ageText, bytesText, el, getJson, icon, NAMES, setNumbers, setText, steps, store, stored, toast } from "./util.js";
+import { addressUrl, ageText, bytesText, el, getJson, icon, nameOf, setNumbers, setText, steps, store, stored, toast } from "./util.js";
 
 const PAGE = 100;
 const BRANCHES = 90; // the program answers for 100 at a time
@@ -16,6 +16,7 @@ export class Tree {
     this.remember = remember;
     this.open = new Map([[root, 0], ...(remember ? stored(remember, []) : [])]);
     this.rows = new Map();
+    this.pagers = new Map();
     this.levels = new Map();
     this.regular = new Set(); // what was published often: worth a warning when it falls silent
     this.loaded = false;
@@ -47,7 +48,7 @@ export class Tree {
       if (it === position) position = position.nextSibling;
       else this.element.insertBefore(it, position);
     }
-    for (const [address, row] of this.rows) if (!kept.has(row)) this.rows.delete(address);
+    for (const known of [this.rows, this.pagers]) for (const [address, it] of known) if (!kept.has(it)) known.delete(address);
     this.focusable(wanted);
     if (this.wanted) this.bringIntoView();
   }
@@ -97,7 +98,7 @@ export class Tree {
     else row.removeAttribute("aria-expanded");
     setNumbers(parts.value, container ? node.text || `${node.count} ${node.kind === "dict" ? (node.count === 1 ? "key" : "keys") : node.count === 1 ? "item" : "items"}` : node.text);
     parts.value.className = `value is-${node.text.startsWith("[") && container ? "float" : node.kind.replace(/\W/g, "")}`;
-    parts.value.title = `${NAMES[node.kind] ?? node.kind}  ${node.text}`;
+    parts.value.title = `${nameOf(node.kind)}  ${node.text}`;
     setText(parts.size, container || PLAIN.includes(node.kind) ? "" : bytesText(node.size));
     parts.spark.show(node, this.app.now());
     this.age(parts.age, node);
@@ -135,14 +136,13 @@ export class Tree {
 
   pager(branch, level) {
     const end = branch.start + branch.nodes.length;
-    const id = `more:${branch.address}`;
-    let it = this.rows.get(id);
+    let it = this.pagers.get(branch.address);
     if (!it) {
       const turn = (step) => () => { this.open.set(branch.address, Math.max(0, (this.open.get(branch.address) ?? 0) + step)); this.save(); this.app.refresh(); };
       const back = el("button", { type: "button", onclick: turn(-PAGE) }, `‹ ${PAGE}`), forth = el("button", { type: "button", onclick: turn(PAGE) }, `${PAGE} ›`);
       it = el("div", { class: "pager more" }, back, el("span"), forth);
       it.parts = { back, text: it.children[1], forth };
-      this.rows.set(id, it);
+      this.pagers.set(branch.address, it);
     }
     it.style.paddingLeft = `${Math.min(level - 1, 12) * 15 + 30}px`;
     setText(it.parts.text, `${(branch.start + 1).toLocaleString()}–${end.toLocaleString()} of ${branch.total.toLocaleString()}`);

@@ -13,8 +13,10 @@ export function el(tag, props = {}, ...children) {
   return it;
 }
 
-// What kinds are called here.
-export const NAMES = { NoneType: "null", str: "text", int: "whole number", float: "number", bool: "true or false", numpy: "array" };
+const NAMES = new Map([["NoneType", "null"], ["str", "text"], ["int", "whole number"], ["float", "number"], ["bool", "true or false"], ["numpy", "array"]]);
+
+// What a kind is called here. What a name from the data is looked up in is a Map: a plain object has a "constructor", too.
+export function nameOf(kind) { return NAMES.get(kind) ?? kind; }
 
 const SVG = "http://www.w3.org/2000/svg";
 
@@ -66,8 +68,18 @@ export async function fetched(url, options) {
   }
 }
 
+// What an answer holds, as "json", "blob" or "text".
+export async function bodyOf(response, form) {
+  try {
+    return await response[form]();
+  } catch (error) {
+    if (error.name === "AbortError") throw error;
+    throw new ApiError("An answer of the program behind this page broke off.", 0);
+  }
+}
+
 export async function getJson(what, values, signal) {
-  const said = await (await ask(what, values, signal)).json();
+  const said = await bodyOf(await ask(what, values, signal), "json");
   if (said.missing !== undefined) throw new ApiError(said.missing, 404);
   return said;
 }
@@ -75,7 +87,7 @@ export async function getJson(what, values, signal) {
 export async function getPicture(what, values, signal) {
   const response = await ask(what, values, signal);
   const said = response.headers.get("x-picture");
-  return { blob: await response.blob(), said: said ? JSON.parse(said) : null };
+  return { blob: await bodyOf(response, "blob"), said: said ? JSON.parse(said) : null };
 }
 
 export async function postWrite(path, valueText, key) {

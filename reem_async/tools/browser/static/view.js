@@ -3,13 +3,14 @@ import { ArrayView } from "./arrays.js";
 import { Course } from "./course.js";
 import { isNumber, MOST, Panes } from "./panes.js";
 import { Tree } from "./tree.js";
-import { addressUrl, ageText, bytesText, copy, el, fetched, getJson, getPicture, NAMES, postWrite, query, setNumbers, setText, steps, swap, toast, visible } from "./util.js";
+import { addressUrl, ageText, bodyOf, bytesText, copy, el, fetched, getJson, getPicture, nameOf, postWrite, query, setNumbers, setText, steps, swap, toast, visible } from "./util.js";
 
 const LONGEST = 16; // items of a list that are drawn over time
 const BUSY = 6, OF_EACH = 3, BUSY_PAUSE = 5000, FRESH = 10;
 // The keys on the first page, the panes of each, ms until others may take their place, s in which a number must have come.
 const SCALARS = ["str", "int", "float", "bool", "NoneType"];
 const NUMBERS = ["int", "float", "bool"];
+const FORMATS = new Map([["numpy", ["npy", "csv", "png", "json"]], ["list", ["json", "csv", "npy"]], ["bytes", ["bin", "json"]]]);
 
 export class View {
   constructor(element, app) {
@@ -50,7 +51,7 @@ export class View {
       this.facts(node);
       this.main.classList.remove("gone");
       this.note.hidden = !kept;
-      if (kept) setText(this.note, `It is ${NAMES[node.kind] ?? node.kind} now: ${node.text}. It is shown again once Edit is closed.`);
+      if (kept) setText(this.note, `It is ${nameOf(node.kind)} now: ${node.text}. It is shown again once Edit is closed.`);
       else await this.body.update(node, signal);
       this.offer();
     } catch (error) {
@@ -102,14 +103,14 @@ export class View {
   build(node, shape) {
     this.shape = shape;
     this.frame(node);
-    const make = { dict: DictBody, list: ListBody, str: TextBody, bytes: BytesBody, numpy: ArrayView, int: NumberBody, float: NumberBody, bool: NumberBody }[node.kind] ?? PlainBody;
+    const make = BODIES.get(node.kind) ?? PlainBody;
     this.body = new make(this.main, this.app, this.address);
   }
 
   facts(node) {
     const size = node.kind === "dict" || node.kind === "list" ? `${node.count} ${node.count === 1 ? "item" : "items"}` : bytesText(node.size);
     const age = node.time === null ? "" : ageText(Math.max(this.app.now() - node.time, 0));
-    const words = [NAMES[node.kind] ?? node.kind, node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
+    const words = [nameOf(node.kind), node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
     if (node.rate >= 2) words.push(`${Math.round(node.rate)} Hz`);
     if (node.shared) words.push("shared memory");
     if (age) words.push(age === "now" ? "changed now" : `changed ${age} ago`);
@@ -138,7 +139,7 @@ export class View {
     try {
       const response = await fetched(link.href);
       const name = /filename\*=UTF-8''([^;]*)/.exec(response.headers.get("content-disposition") ?? "")?.[1];
-      const url = URL.createObjectURL(await response.blob());
+      const url = URL.createObjectURL(await bodyOf(response, "blob"));
       const file = el("a", { href: url, download: name ? decodeURIComponent(name) : "" });
       file.click();
       setTimeout(() => URL.revokeObjectURL(url), 60000);
@@ -151,7 +152,7 @@ export class View {
     const extras = [];
     this.editor = this.snippet = null;
     if (this.app.config.write && [...SCALARS, "dict", "list"].includes(node.kind) && node.editable !== false) extras.push((this.editor = this.editCard()));
-    const formats = { numpy: ["npy", "csv", "png", "json"], list: ["json", "csv", "npy"], bytes: ["bin", "json"] }[node.kind] ?? ["json"];
+    const formats = FORMATS.get(node.kind) ?? ["json"];
     this.downloads = formats.map((format) => el("a", { "data-format": format, href: this.linkFirst(format), onclick: (event) => this.save(event) }, format));
     const snippet = Object.keys(node.snippets ?? {}).length ? this.snippetCard(node.snippets) : null;
     const files = el("div", { class: "card row2" }, el("span", { class: "what" }, "Download"), ...this.downloads);
@@ -180,7 +181,7 @@ export class View {
 
   async jsonText() {
     if (SCALARS.includes(this.node.kind) && this.node.kind !== "str") return this.node.text;
-    return (await fetched(this.linkFirst("json"))).text();
+    return bodyOf(await fetched(this.linkFirst("json")), "text");
   }
 
   // What is wrong with what is in the field is said beside it, until it is changed.
@@ -372,3 +373,5 @@ class BytesBody {
     await swap(this.image, blob);
   }
 }
+
+const BODIES = new Map([["dict", DictBody], ["list", ListBody], ["str", TextBody], ["bytes", BytesBody], ["numpy", ArrayView], ["int", NumberBody], ["float", NumberBody], ["bool", NumberBody]]);
