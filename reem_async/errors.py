@@ -16,7 +16,7 @@
     +-- MissingKey               also KeyError, redis ResponseError: nothing is stored there
     +-- PathRefused              also KeyError, redis ResponseError: the parent is missing or cannot hold the element
     +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
-    +-- Conflict                 somebody else changed what was being edited; nothing written
+    +-- Conflict                 somebody else changed what was edited, or kept writing to the key; nothing written
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     +-- QueueFull                a subscriber with the policy Every fell too far behind
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
@@ -183,7 +183,14 @@ class Overflow(ReemError, OverflowError, redis.exceptions.ResponseError):
 
 
 class Conflict(ReemError):
-    """Somebody else changed the value between reading and writing back; nothing was written."""
+    """Somebody else changed the value between reading and writing back; nothing was written.
+
+    Or others kept writing to the same top-level key until the call's time limit was over; nothing was applied.
+    """
+
+
+class Contended(Conflict):
+    """Others kept writing to the same top-level key: who tries again by himself on a Conflict had better not now."""
 
 
 class QueueFull(ReemError):

@@ -517,7 +517,10 @@ def test_what_others_have_changed_meanwhile_is_tried_again():
 
 def test_a_large_array_gets_through_beside_a_busy_writer(server, raw):
     """It is sent ahead, or the other one would be first each time."""
-    with contextlib.closing(reem.RedisInterface(server)) as one, contextlib.closing(reem.RedisInterface(server)) as two:
+    with (
+        contextlib.closing(reem.RedisInterface(server, timeout=30)) as one,
+        contextlib.closing(reem.RedisInterface(server)) as two,
+    ):
         mine, theirs = reem.KeyValueStore(one)["busy"], reem.KeyValueStore(two)["busy"]
         reem.KeyValueStore(one)["busy"] = {"n": 0}
         over, count = threading.Event(), 0

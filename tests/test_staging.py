@@ -111,7 +111,7 @@ WRITES = {
 
 @pytest.mark.parametrize("write", WRITES)
 def test_beside_a_program_that_never_rests_it_is_sent_twice_at_most(place, write):
-    with reem.RedisInterface(place.url) as interface:
+    with reem.RedisInterface(place.url, timeout=30) as interface:
         kvs = reem.KeyValueStore(interface)
         kvs[place.name] = {"n": 0, "image": np.zeros(3), "list": [np.zeros(3), 1]}
         with place.restless():
@@ -138,7 +138,7 @@ def test_what_was_lost_before_it_was_put_in_its_place_is_sent_again(place, write
         while len(lost) < 3 and not over.is_set():
             lost.extend(name for name in place.waiting() if place.raw.unlink(name))
 
-    with reem.RedisInterface(place.url) as interface, contextlib.ExitStack() as stack:
+    with reem.RedisInterface(place.url, timeout=30) as interface, contextlib.ExitStack() as stack:
         kvs = reem.KeyValueStore(interface)
         kvs[place.name] = {"n": 0, "image": np.zeros(3), "list": [np.zeros(3), 1]}
         stack.enter_context(place.restless())

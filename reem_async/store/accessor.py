@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from ..concurrency.aside import ensure_imported
-from ..errors import BadType, Conflict, MissingDocument, MissingKey
+from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey
 from ..plan.documents import number_text
 from ..plan.handles import Handle
 from ..plan.paths import Path, check_element, check_name, show
@@ -159,6 +159,8 @@ class Accessor(Handle):
             BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
             PathRefused: The parent is missing or cannot hold this element; nothing was stored. (One array, or other
                 value that goes by ship, just below a top-level key that is not there makes a dict for it.)
+            Conflict: Others kept writing to the same top-level key for as long as the time limit; nothing was stored.
+                Only where it has to be looked first what is there: guarantee 6 in docs/guarantees.md says where.
         """
         await self._writer.set(self._path, value)
 
@@ -167,6 +169,7 @@ class Accessor(Handle):
 
         Raises:
             MissingKey: Nothing was here.
+            Conflict: As `write`.
         """
         await self._writer.delete(self._path)
 
@@ -219,7 +222,7 @@ class Accessor(Handle):
 
         Raises:
             MissingKey: Nothing is there and no default was given.
-            Conflict: Others changed it each of many times.
+            Conflict: Others changed it each of many times, or kept writing to the same top-level key.
         """
         return await self[key]._take(*default)
 
@@ -232,8 +235,8 @@ class Accessor(Handle):
                 before = await self._reader.raw_read(self._path)
                 value = await opened(before)
                 await self._writer.take(self._path, before)
-            except Conflict:
-                if last:
+            except Conflict as error:
+                if last or isinstance(error, Contended):
                     raise
             except MissingKey:
                 if not default:
@@ -253,6 +256,7 @@ class Accessor(Handle):
         Raises:
             BadValue, BadType, BadKey, TooDeep: A value cannot be stored; nothing was sent.
             PathRefused: No dict is here; nothing was stored.
+            Conflict: As `write`.
         """
         await self._writer.update(self._path, dict(values, **more))
 
@@ -264,7 +268,7 @@ class Accessor(Handle):
 
         Raises:
             PathRefused: No dict is here.
-            Conflict: Others changed it each of many times.
+            Conflict: Others changed it each of many times, or kept writing to the same top-level key.
         """
         return await self[check_name(key, self.full_path)]._read_or_put(default)
 
@@ -277,8 +281,8 @@ class Accessor(Handle):
                 why = error
             try:
                 await self._writer.put_absent(self._path, default, why)
-            except Conflict:
-                if last:
+            except Conflict as error:
+                if last or isinstance(error, Contended):
                     raise
             else:
                 return default
@@ -303,6 +307,7 @@ class Accessor(Handle):
             MissingKey: Nothing is here.
             WrongType: It is not a number.
             Overflow: The result is out of range; the old value is kept.
+            Conflict: As `write`.
         """
         return await self._writer.calculate(self._path, "JSON.NUMINCRBY", operator.add, number)
 
@@ -348,6 +353,7 @@ class Accessor(Handle):
             MissingKey: Nothing is here.
             WrongType: It is not a list.
             BadType: `value` cannot be stored.
+            Conflict: As `write`.
         """
         await self._writer.extend(self._path, [value])
 
@@ -363,7 +369,8 @@ class Accessor(Handle):
         Raises:
             MissingKey: Nothing is here (on entering).
             WrongType: It is a number, text or None, which cannot be changed in place.
-            Conflict: Somebody else changed it meanwhile (on leaving); nothing was written.
+            Conflict: Somebody else changed it meanwhile, or others kept writing to the same top-level key (on leaving);
+                nothing was written.
         """
         return Edit(self._reader, self._writer, self._path)
 

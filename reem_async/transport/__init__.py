@@ -10,10 +10,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from ..errors import SELF_EXPLANATORY, BadData, NotConnected, ReemError, Refused, WrongKind
+from ..errors import SELF_EXPLANATORY, BadData, Contended, NotConnected, ReemError, Refused, WrongKind
 from ..plain.documents import is_document
 from ..plan import Command, Plan, Reply, wire_commands
 from ..plan.replies import decoded
+from .contention import Contention
 from .state import States
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["Held", "Transport", "drive"]
 
 _UNWATCH: Command = ("UNWATCH",)
-_UNAPPLIED = (NotConnected, Refused)
+_UNAPPLIED = (Contended, NotConnected, Refused)
 """Errors of a plan that the server did nothing for."""
 
 
@@ -113,14 +114,19 @@ async def drive(transport: Transport, plan: Plan) -> Any:
     """Run `plan` and what follows from it; return the result.
 
     Suspends only where `transport` does: over a blocking transport it runs through at the first step.
+
+    Raises:
+        Contended: Others kept writing to the same top-level key; nothing was applied.
     """
+    contention: Contention | None = None
     while True:
         try:
             # Everything up to the last held plan goes over one connection: WATCH lives on it. The lock on the
             # connection is given back before an error is raised, since it is no fault of the connection.
             if plan.held:
+                contention = contention or Contention(transport.timeout)
                 async with transport.hold() as held:
-                    outcome = await _drive_held(held, plan)
+                    outcome = await _drive_held(held, plan, contention)
                 if isinstance(outcome, _Raised):
                     raise outcome.error
             else:
@@ -161,20 +167,26 @@ class _Raised(NamedTuple):
     error: Exception
 
 
-async def _drive_held(held: Held, plan: Plan) -> Any:
+async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
     outcome: Any = plan
     while type(outcome) is Plan and outcome.held:
         try:
             replies = await held.roundtrip(wire_commands(outcome))
         except NotConnected as error:
             raise _told(outcome, error) from error
+        sent = outcome
         try:
-            outcome = decoded(outcome, replies)
+            outcome = decoded(sent, replies)
+            if sent.atomic and replies[-1] is not None:
+                contention.over()
+            # Given up, and to be tried again: in which way, the plan knows.
+            elif sent.atomic and type(outcome) is Plan:
+                contention.given_up(sent.commands)
         # The replies are not the protocol's: the connection is not to be used again, so it leaves with the error.
         except BadData:
             raise
         except ReemError as error:
             # The next borrower must not have his transaction fail over keys that he does not know of.
             await held.roundtrip([_UNWATCH])
-            return _Raised(_told(outcome, error) if isinstance(error, _UNAPPLIED) else error)
+            return _Raised(_told(sent, error) if isinstance(error, _UNAPPLIED) else error)
     return outcome

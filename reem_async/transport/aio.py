@@ -16,6 +16,7 @@ from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Held
+from .contention import document_of
 from .identity import WHO, who
 from .options import Options, ShorterWay
 from .state import States
@@ -59,7 +60,7 @@ class AsyncTransport:
         # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
         self._leaving: set[Wire] = set()
         self._orders = Locks(asyncio.Lock)
-        self._text = Text()
+        self._text = Text(options.timeout)
         # By document: what cancelled callers have left on its way. A later write to the same document waits for it.
         self._left: dict[str, set[asyncio.Future[Any]]] = {}
         # Not cancelled by `close`: callers share an attempt to connect, which ends by itself, within its time limit.
@@ -110,7 +111,7 @@ class AsyncTransport:
             outcome = await asyncio.shield(arrived)
         except asyncio.CancelledError:
             if not arrived.done():
-                document = _document(commands)
+                document = document_of(commands)
                 self._left.setdefault(document, set()).add(arrived)
                 arrived.add_done_callback(lambda done: self._has_arrived(document, done))
             raise
@@ -386,10 +387,3 @@ class _Lent:
         replies = await self._transport.upload(self._wire, commands)
         self.is_uploading = False
         return replies
-
-
-def _document(commands: Sequence[Command]) -> str:
-    """Return the name on the server of the document that commands are about: all their keys carry it."""
-    key = next(command for command in commands if len(command) > 1)[1]
-    name: str = key.decode() if isinstance(key, bytes) else str(key)
-    return name[1 : name.index("}")] if name.startswith("{") else name

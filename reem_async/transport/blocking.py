@@ -226,7 +226,7 @@ class BlockingTransport:
         self._pid = os.getpid()
         self._closed = False
         self._orders = Locks(ThreadLock)
-        self._text = Text()
+        self._text = Text(options.timeout)
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
 

@@ -24,6 +24,7 @@ from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotC
 from ..plan import Command, Reply
 from . import Held, Transport
 from .addresses import NewTransport, address_of, listed
+from .contention import Contention
 from .options import Address, NodeOptions, Options
 from .publication import Publication
 from .redirects import Moved, key_slot, publishes, refusal, slot_of, slots_of
@@ -359,7 +360,7 @@ class ClusterTransport(Rooted):
         """Send a transaction that publishes, over a connection that watches its keys; what is large goes before it."""
         slot = slot_of(commands)
         assert slot is not None  # there is a notice, so there is a key
-        route, publication = Route(self, slot), Publication(commands)
+        route, publication, contention = Route(self, slot), Publication(commands), Contention(self.timeout)
         # Each has a connection of its own, for WATCH; one key's notices keep their order, since it has one slot.
         async with self._root.ordered(f"publishing {slot % _PUBLISHING}"):
             while True:
@@ -373,7 +374,10 @@ class ClusterTransport(Rooted):
                         return replies
                 except NotConnected as error:
                     problem = error
-                await (route.contended() if problem is None else route.refused(problem))
+                if problem is None:
+                    contention.given_up(commands)
+                else:
+                    await route.refused(problem)
 
     def lost(self, address: Address, reason: Exception) -> bool:
         """Note that the connections to a node broke; return whether it is missed."""

@@ -97,10 +97,6 @@ class Route:
                 self._node = random.choice(await self._cluster.nodes())  # noqa: S311
         return self._node
 
-    async def contended(self) -> None:
-        """Try once more at once: somebody else wrote to the same key; raise NotConnected if time is over."""
-        self._check_time("other programs kept writing to the same key", NotConnected)
-
     async def refused(self, problem: Exception) -> None:
         """Note why nothing was applied, and wait if need be; raise NotConnected if time is over."""
         # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.

@@ -13,6 +13,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 from zlib import crc32
 
+from ..concurrency.timeouts import patience
 from ..errors import NoJsonSupport
 from ..plain.batches import Known, Steps, Watched, concerns, has_json
 from ..plain.changes import after_look
@@ -20,6 +21,7 @@ from ..plain.translation import directly, finished, looked_at, shortcut, transla
 from ..plan import Command, Reply
 from ..plan.staging import KEPT, as_given, is_large, stage
 from . import Held
+from .contention import Contention
 from .parsing import error_of
 
 __all__ = ["PROBE", "HeldText", "Text", "is_plain", "lists_json", "over_wire"]
@@ -68,9 +70,14 @@ class Lending(Protocol):
 
 
 class Text:
-    """The documents of one server without JSON, as one transport meets them."""
+    """The documents of one server without JSON, as one transport meets them.
 
-    def __init__(self) -> None:
+    Args:
+        timeout: The interface's time limit, in seconds.
+    """
+
+    def __init__(self, timeout: float) -> None:
+        self.timeout = timeout
         self.known = Known()
 
     def shortcut(self, commands: Sequence[Command]) -> list[Command] | None:
@@ -100,28 +107,34 @@ class Text:
         Callers of one transport go one after the other for each key, since they would only be in each other's way, and
         no more than a few at a time, since each has a connection. Cancelled, or broken off, it was applied once or not
         at all; the connection is closed.
+
+        Raises:
+            Contended: Others were first each time; nothing was applied.
         """
         # Locks by a few numbers rather than by key, which bounds the connections as well. Sorted, so that two callers
         # who need the same two locks never wait for each other.
-        turns = {f"documents {crc32(key) % _AT_A_TIME}" for key in keys}
-        return await self._in_turn(sorted(turns), lending, keys, commands, bulk)
+        turns = sorted({f"documents {crc32(key) % _AT_A_TIME}" for key in keys})
+        contention, attempt = Contention(patience(self.timeout)), _Attempt(keys, commands)
+        while True:
+            # Each attempt waits for its turn: who is never first must not keep those who write to other keys.
+            replies = await self._in_turn(turns, lending, attempt, bulk)
+            if replies is not None:
+                return replies
+            contention.given_up(commands)
+            # Somebody was first, and will be again while the array is on its way: from now on it is sent ahead.
+            if type(attempt) is _Attempt and commands[-1][0] == "EXEC" and any(map(is_large, commands)):
+                attempt = _Ahead(keys, commands)
 
     async def _in_turn(
-        self, turns: Sequence[str], lending: Lending, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
-    ) -> list[Reply]:
+        self, turns: Sequence[str], lending: Lending, attempt: _Attempt, bulk: bool
+    ) -> list[Reply] | None:
         if turns:
             async with lending.ordered(turns[0]):
-                return await self._in_turn(turns[1:], lending, keys, commands, bulk)
+                return await self._in_turn(turns[1:], lending, attempt, bulk)
         async with lending.hold() as held:
             if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
-                return await held.roundtrip(commands, bulk=bulk)
-            replies = await held.attempt(keys, commands, bulk)
-            # Somebody was first, and will be again while the array is on its way: from now on it is sent ahead.
-            if replies is None and commands[-1][0] == "EXEC" and any(map(is_large, commands)):
-                return await _Ahead(held, keys, commands).carried_out(bulk)
-            while replies is None:
-                replies = await held.attempt(keys, commands, bulk)
-            return replies
+                return await held.roundtrip(attempt.given, bulk=bulk)
+            return await attempt.made(held, bulk)
 
 
 class HeldText:
@@ -135,52 +148,77 @@ class HeldText:
     def __init__(self, held: Held, text: Text) -> None:
         self._held = held
         self._known = text.known
+        self._timeout = text.timeout
         self._watched = Watched()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` and return their replies; a change of what was not read before takes two round trips."""
+        """Send `commands` and return their replies; a change of what was not read before takes two round trips.
+
+        Raises:
+            Contended: Others were first each time; nothing was applied.
+        """
+        contention: Contention | None = None
         while True:
             steps = translated(commands, self._known, error_of, self._watched)
             replies = await _carried_out(self._held.roundtrip, steps, bulk)
             if replies is not None:
                 return replies
+            contention = contention or Contention(patience(self._timeout))
+            contention.given_up(commands)
 
     async def attempt(self, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool) -> list[Reply] | None:
         """Look at `keys` and change them where nothing is watched before; return None if somebody else was first."""
         return await _carried_out(self._held.roundtrip, after_look(commands, keys, self._known, error_of, None), bulk)
 
 
-class _Ahead:
+class _Attempt:
+    """A batch that is tried until nobody else is first.
+
+    Args:
+        keys: Of the documents.
+        commands: The batch.
+
+    Attributes:
+        given: The batch.
+    """
+
+    def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
+        self._keys = keys
+        self.given = commands
+
+    async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
+        """Try once; return None if somebody else was first."""
+        return await held.attempt(self._keys, self.given, bulk)
+
+
+class _Ahead(_Attempt):
     """A transaction whose large values are sent before it: others would always be first while they are on their way.
 
     Args:
-        held: The connection.
         keys: Of the documents; all are in one slot.
         commands: MULTI, what it does, EXEC.
     """
 
-    def __init__(self, held: HeldText, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
+    def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
+        super().__init__(keys, commands)
         tag = f"{{{keys[0].decode(errors='surrogateescape')}}}"
-        self._held, self._keys = held, keys
         self._commands, self._coming = stage(commands, tag, secrets.token_hex(5))
+        self._sent = -float(KEPT)
 
-    async def carried_out(self, bulk: bool) -> list[Reply]:
-        """Send it until nobody else is first."""
-        sent = -float(KEPT)
-        while True:
-            # Sent again well before the server forgets it.
-            if time.monotonic() - sent > KEPT / 2:
-                sent = time.monotonic()
-                refused = await self._sent()
-                if refused is not None:
-                    return refused
-            replies = await self._held.attempt(self._keys, self._commands, bulk)
-            if replies is not None:
-                return as_given(self._commands, self._coming, replies)
+    async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
+        """Try once; return None if somebody else was first."""
+        # Sent again well before the server forgets it.
+        if time.monotonic() - self._sent > KEPT / 2:
+            self._sent = time.monotonic()
+            refused = await self._upload(held)
+            if refused is not None:
+                return refused
+        replies = await held.attempt(self._keys, self._commands, bulk)
+        return None if replies is None else as_given(self._commands, self._coming, replies)
 
-    async def _sent(self) -> list[Reply] | None:
+    async def _upload(self, held: HeldText) -> list[Reply] | None:
         """Send what is large; return the replies if the server refuses that."""
-        replies = await self._held.roundtrip([each.upload for each in self._coming])
+        replies = await held.roundtrip([each.upload for each in self._coming])
         reason = next((reply for reply in replies if isinstance(reply, Exception)), None)
         return None if reason is None else [reason] * (len(self._commands) - len(self._coming))
 

@@ -1,0 +1,178 @@
+"""Changes that look first end beside programs that never rest: applied, or with a Conflict that says what to do."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import time
+from zlib import crc32
+
+import numpy as np
+import pytest
+import redis
+from conftest import FRONTS, RawCluster
+
+import reem
+import reem_async
+from reem.server import EmbeddedServer
+from reem_async.transport.blocking import _Line
+from reem_async.transport.contention import Contention
+from reem_async.transport.wire import Wire
+
+LIMIT = 0.2
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["json", "plain"])
+def server(request):
+    with EmbeddedServer(json=request.param) as running:
+        yield running
+
+
+@pytest.fixture(scope="module")
+def raw(server):
+    with redis.Redis(unix_socket_path=server.socket_path) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def overtaken(monkeypatch, write, times=None):
+    """Somebody else writes just before each transaction is sent, or before the first `times`; yields how often."""
+    writes, send, exchange = [], Wire.send, _Line.exchange
+
+    def first(commands):
+        if commands[0][0] == "MULTI" and (times is None or len(writes) < times):
+            writes.append(write())
+
+    def on_a_loop(self, commands, done):
+        first(commands)
+        send(self, commands, done)
+
+    def blocking(self, commands, bulk=False):
+        first(commands)
+        return exchange(self, commands, bulk)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Wire, "send", on_a_loop)
+        patch.setattr(_Line, "exchange", blocking)
+        yield writes
+
+
+def touching(raw, server, key):
+    """What writes to a document and changes nothing that a test looks at."""
+    if server.json:
+        return lambda: raw.execute_command("JSON.SET", key, "$.busy", "1")
+    return lambda: raw.append(key, " ")
+
+
+CALLS = {
+    "write": lambda place: place["l"][-1].write(7),
+    "write an array": lambda place: place["l"][-1].write(np.arange(20_000.0)),
+    "delete": lambda place: place["l"][-1].delete(),
+    "divide": lambda place: place["n"].divide(2),
+    "pop": lambda place: place["l"].pop(),
+    "setdefault": lambda place: place.setdefault("new", 1),
+}
+VALUE = {"busy": 0, "n": 8, "l": [1, 2]}
+
+
+def run(front, call, path):
+    """Make a call of either front."""
+    result = CALLS[call](front.at(path))
+    return front.run(result) if isinstance(front, FRONTS["asyncio"]) else result
+
+
+@pytest.mark.parametrize("name", FRONTS)
+@pytest.mark.parametrize("call", CALLS)
+def test_what_others_are_always_faster_than_ends_with_a_conflict(server, raw, monkeypatch, name, call):
+    with contextlib.closing(FRONTS[name](server.url, timeout=LIMIT)) as front:
+        front.write(["robot"], VALUE)
+        with overtaken(monkeypatch, touching(raw, server, "robot")) as writes:
+            began = time.monotonic()
+            with pytest.raises(reem.Conflict, match=r"^robot: others kept writing .* nothing was applied: .*timeout="):
+                run(front, call, ["robot"])
+            assert LIMIT < time.monotonic() - began < LIMIT + 2
+        assert len(writes) > 1
+        found = front.read(["robot"])
+        assert {**found, "busy": 0} == VALUE
+        run(front, call, ["robot"])
+
+
+@pytest.mark.parametrize("name", FRONTS)
+@pytest.mark.parametrize("call", CALLS)
+def test_what_others_were_faster_than_some_times_is_applied(server, raw, monkeypatch, name, call):
+    with contextlib.closing(FRONTS[name](server.url, timeout=30)) as front:
+        front.write(["robot"], VALUE)
+        with overtaken(monkeypatch, touching(raw, server, "robot"), 5) as writes:
+            run(front, call, ["robot"])
+        assert len(writes) == 5
+
+
+def test_there_are_two_attempts_however_long_they_take():
+    commands = [("UNLINK", "{robot}.image"), ("JSON.SET", "robot", "$", b"1")]
+    contention = Contention(1e-6)
+    for _ in range(2):
+        contention.given_up(commands)
+        time.sleep(1e-3)
+        with pytest.raises(reem.Conflict, match=r"^robot: "):
+            contention.given_up(commands)
+        contention.over()  # what follows has a time of its own
+
+
+def test_the_limit_of_one_call_is_its_own(server, raw, monkeypatch):
+    with contextlib.closing(reem.RedisInterface(server, timeout=30)) as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs["robot"] = VALUE
+        with overtaken(monkeypatch, touching(raw, server, "robot")), reem.timeout(LIMIT), pytest.raises(reem.Conflict):
+            kvs["robot"]["l"][-1] = 7
+
+
+@pytest.mark.parametrize("outage", ["raise", "newest"])
+async def test_an_update_that_others_are_always_faster_than_is_no_outage(server, raw, monkeypatch, outage):
+    async with reem_async.RedisInterface(server, timeout=LIMIT) as interface:
+        space = reem_async.PublishSpace(interface, outage=outage)
+        await space["robot"].write(VALUE)
+        with overtaken(monkeypatch, touching(raw, server, "robot")), pytest.raises(reem.Conflict):
+            await space["robot"]["l"][-1].write(7)
+        assert (space.dropped, space.waiting) == (0, 0)
+        await space["robot"]["l"][-1].write(7)
+        assert (await reem_async.KeyValueStore(interface)["robot"].read())["l"] == [1, 7]
+
+
+async def test_a_cluster_says_so_too(cluster, monkeypatch):
+    """There all that is published is watched."""
+    key = "contended"
+    first = cluster.url.replace("redis+cluster://", "redis://").split(",")[0]
+    with contextlib.closing(RawCluster.from_url(first, decode_responses=True)) as raw:
+        async with reem_async.RedisInterface(cluster.url, timeout=LIMIT) as interface:
+            space, number = reem_async.PublishSpace(interface, outage="newest"), itertools.count()
+            await space[key].write(VALUE)
+            with (
+                overtaken(monkeypatch, lambda: raw.execute_command("JSON.SET", key, "$.busy", str(next(number)))),
+                pytest.raises(reem.Conflict, match="others kept writing"),
+            ):
+                await space[key]["n"].write(1)
+            assert (space.dropped, space.waiting) == (0, 0)
+            assert (await reem_async.KeyValueStore(interface)[key]["n"].read()) == 8
+            await reem_async.KeyValueStore(interface)[key].delete()
+
+
+async def test_who_is_never_first_keeps_nobody_who_writes_to_another_key(raw, server, monkeypatch):
+    """A plain server's documents share a few locks."""
+    if server.json:
+        pytest.skip("with the module no lock is taken")
+    beside = next(f"k{n}" for n in range(99) if crc32(f"k{n}".encode()) % 8 == crc32(b"robot") % 8)
+    async with reem_async.RedisInterface(server, timeout=30) as interface:
+        kvs = reem_async.KeyValueStore(interface)
+        await kvs["robot"].write(VALUE)
+        await kvs[beside].write({})
+        over, touch = asyncio.Event(), touching(raw, server, "robot")
+        with overtaken(monkeypatch, lambda: over.is_set() or touch()) as writes:
+            starving = asyncio.create_task(kvs["robot"]["n"].write(9))
+            while len(writes) < 3:
+                await asyncio.sleep(0)
+            await asyncio.wait_for(kvs[beside]["n"].write(1), 5)
+            assert not starving.done()
+            over.set()
+            await starving
+        assert await kvs["robot"]["n"].read() == 9
