@@ -23,6 +23,11 @@ __all__ = ["Portal", "finish"]
 
 Result = TypeVar("Result")
 
+_LONGEST_LAST = 2.0
+"""Seconds for what a loop runs before its end: more than the core waits for tasks that are slow to end."""
+_LONGEST_STOP = 3.0
+"""Seconds to wait for the loop's thread, in which a ship of a user's own may be at work."""
+
 
 def finish(coroutine: Coroutine[Any, Any, Result]) -> Result:
     """Run a coroutine that never suspends, and return its result.
@@ -127,6 +132,7 @@ class Portal:
         self._loop = _new_loop()
         self._calls: set[_Call[Any]] = set()
         self._ident: int | None = None
+        self._last: Callable[[], Coroutine[Any, Any, None]] | None = None
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         self._thread.start()
 
@@ -136,11 +142,21 @@ class Portal:
         try:
             self._loop.run_forever()
             # Calls that are under way are cancelled, and their callers told, before the loop is closed.
-            self._loop.run_until_complete(self._end_tasks())
+            self._loop.run_until_complete(self._end())
         finally:
             self._loop.close()
             for call in list(self._calls):  # a call that is not noted by now finds the loop closed
                 call.end(_closed_meanwhile())
+
+    async def _end(self) -> None:
+        try:
+            if self._last is not None:
+                # A server that does not answer must not keep a program from ending.
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(_LONGEST_LAST):
+                        await self._last()
+        finally:
+            await self._end_tasks()
 
     async def _end_tasks(self) -> None:
         """Cancel what still runs, including calls that were handed over just before the end."""
@@ -190,10 +206,19 @@ class Portal:
                 raise
             raise InterfaceClosed("this RedisInterface is closed; make a new one") from None
 
-    def stop(self) -> None:
-        """End the loop and wait for the thread, unless this is it. Idempotent."""
+    def stop(self, last: Callable[[], Coroutine[Any, Any, None]] | None = None) -> None:
+        """End the loop and wait for the thread, unless this is it, or it is busy for long.
+
+        Args:
+            last: What the loop runs before its end, however late it comes to that.
+        """
+
+        def end() -> None:
+            self._last = last
+            self._loop.stop()
+
         with contextlib.suppress(InterfaceClosed):
-            self._hand_over(self._loop.stop)
-        # A finalizer may run on the loop's own thread, which cannot wait for itself.
+            self._hand_over(end)
+        # A finalizer, or a callback, may run on the loop's own thread, which cannot wait for itself.
         if not self.inside:
-            self._thread.join(2.0)
+            self._thread.join(_LONGEST_STOP)

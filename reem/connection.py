@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import weakref
@@ -86,7 +85,7 @@ class _States(States):
 class _Background:
     """The event loop of an interface and the core's interface on it, made when first needed.
 
-    Threads do not survive a fork, so each process has its own. There is no lock: who comes second finds what the
+    Threads do not survive a fork, so each process has its own loop. There is no lock: who comes second finds what the
     first has made, and what is made while the interface is being closed is stopped by whoever sees it last.
     """
 
@@ -107,10 +106,9 @@ class _Background:
         return self._made.get(os.getpid()) or aside(self._begun)
 
     def _begun(self) -> tuple[Portal, reem_async.RedisInterface]:
-        host, ships, settings = self._direct._given
-        interface = reem_async.RedisInterface(host, ships, **settings)
-        # Both have one state: a user knows of one interface.
-        interface.session.transport.states = self._direct.session.transport.states
+        # After a fork it is the parent's: what was made from it goes on here, and ends with the rest.
+        before = [*self._made.values()]
+        interface = before[0][1] if before else self._interface()
         portal = Portal("reem-loop")
         # One step of C, so of two threads that come here at once the second finds what the first has made.
         made = self._made.setdefault(os.getpid(), (portal, interface))
@@ -123,6 +121,13 @@ class _Background:
             self._stop()
             raise
         return made
+
+    def _interface(self) -> reem_async.RedisInterface:
+        host, ships, settings = self._direct._given
+        interface = reem_async.RedisInterface(host, ships, **settings)
+        # Both have one state: a user knows of one interface.
+        interface.session.transport.states = self._direct.session.transport.states
+        return interface
 
     def close(self) -> None:
         """Close all connections and end the loop. Idempotent; goes on to its end if the caller is interrupted."""
@@ -137,11 +142,10 @@ class _Background:
         made = self._made.pop(os.getpid(), None)
         if made is not None:
             portal, interface = made
-            if not portal.inside:
-                with contextlib.suppress(TimeoutError, InterfaceClosed):
-                    # A server that does not answer must not keep a program from ending.
-                    portal.call(interface.close(), timeout=1.0)
-            portal.stop()
+            # Loops in other threads end at once: the event loop may be busy, and this may be a callback on its thread.
+            if interface.session.subscriptions is not None:
+                interface.session.subscriptions.end_loops()
+            portal.stop(interface.close)
 
 
 def _is_left_over() -> bool:

@@ -111,6 +111,9 @@ class Subscriptions(Protocol):
     async def close(self) -> None:
         """End all of them."""
 
+    def end_loops(self) -> None:
+        """End the loops of threads over what is followed. Any thread may."""
+
 
 class Background(Protocol):
     """Runs coroutines beside the calls of an interface."""
@@ -152,6 +155,7 @@ class Session:
         subscriptions: The subscription manager, made when something is first followed; see `pubsub.manager.manager_of`.
         tasks: What runs in the background for publishers; ended by `close`.
         closing: Who is told when this is closed.
+        closed: It is, or is about to be.
     """
 
     def __init__(
@@ -179,6 +183,7 @@ class Session:
         self.subscriptions: Subscriptions | None = None
         self.tasks: Background = Tasks()
         self.closing: weakref.WeakSet[Closing] = weakref.WeakSet()
+        self.closed = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         return attrgetter("session"), (self.interface,)
@@ -264,6 +269,7 @@ class Session:
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""
+        self.closed = True
         if self.subscriptions is not None:
             await self.subscriptions.close()
         # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has kept.

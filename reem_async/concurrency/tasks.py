@@ -9,7 +9,7 @@ from typing import Any
 
 from .timeouts import forget
 
-__all__ = ["Tasks", "started"]
+__all__ = ["Tasks", "is_being_cancelled", "started"]
 
 _LONGEST_END = 1.0
 """Seconds to wait for cancelled tasks: a ship of a user's own may be at work in one, and not end at once."""
@@ -20,6 +20,12 @@ def started(coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]
     context = copy_context()
     context.run(forget)  # a time limit given for one call is not meant for what goes on after it
     return asyncio.get_running_loop().create_task(coroutine, name=name, context=context)
+
+
+def is_being_cancelled() -> bool:
+    """Return whether this task is, and not only what it awaits."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 class Tasks:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..concurrency.queues import EMPTY, Ended
 from ..concurrency.streams import Stream
-from ..concurrency.tasks import started
+from ..concurrency.tasks import is_being_cancelled, started
 from ..concurrency.timeouts import forget
 from ..errors import BadType, QueueFull
 
@@ -184,7 +184,7 @@ class Calls:
         try:
             await result
         except (Exception, asyncio.CancelledError):
-            if _is_being_cancelled():
+            if is_being_cancelled():
                 self._end()
                 raise
             self._caller.failed(update)
@@ -199,12 +199,9 @@ class Calls:
             self._over.set_result(None)
 
     async def done(self) -> None:
-        """Wait until the queue, which is closed, is empty and all calls were made, unless one of them asks for it."""
-        if self._awaited is not asyncio.current_task():
+        """Wait until the queue, which is closed, is empty and all calls were made, unless one of them asks for it.
+
+        None is made in another event loop than theirs, nor in a forked child.
+        """
+        if self.loop is asyncio.get_running_loop() and self._awaited is not asyncio.current_task():
             await asyncio.wait([self._over])
-
-
-def _is_being_cancelled() -> bool:
-    """Return whether this task is, and not only what it awaits."""
-    task = asyncio.current_task()
-    return task is not None and task.cancelling() > 0

@@ -100,8 +100,8 @@ class KeyWatcher:
             self._looking = self._manager.tasks.start(self._go_on_looking(), "reem discovery")
 
     def listeners(self) -> list[Listener]:
-        """Return who listens to patterns: the manager itself only knows of their keys."""
-        return list(self._followed)
+        """Return who listens to patterns: the manager itself only knows of their keys. Any thread may ask."""
+        return [listener for each in self._followed.keyrefs() if (listener := each()) is not None]
 
     async def unfollow(self, listener: Listener) -> None:
         """Stop following. Idempotent."""
