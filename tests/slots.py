@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import gc
 import json
 import logging
@@ -302,6 +303,8 @@ class Costs:
 
     def look(self) -> None:
         """Look at the memory; what is needed is there the first time."""
+        # What had waited for a slow callback was let go, and glibc keeps its heaps for what may come.
+        ctypes.CDLL(None).malloc_trim(0)
         self._memory = self._memory or resident()
         self.grown = resident() - self._memory
 
