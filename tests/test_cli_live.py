@@ -137,6 +137,48 @@ def test_echo_fetches_if_asked(space, listening):
     assert said.rstrip().endswith("foo  int64[5000] [7 7 7 ... 7 7 7]")
 
 
+class Scan:
+    """What only its own ship can read."""
+
+
+class ScanShip(blocking.BlobShip):
+    def check_fit(self, value):
+        return isinstance(value, Scan)
+
+    def pack(self, value):
+        return (b"1" * 50_000,)
+
+    def unpack(self, blob):
+        return Scan()
+
+    def get_label(self):
+        return "scan"
+
+
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_echo_goes_on_beside_what_it_cannot_fetch(cli, raw, listening, options):
+    """It ended at the first value of a custom type."""
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace, ships=[ScanShip()]) as interface:
+        space = blocking.PublishSpace(interface)
+        space["a"] = 0
+        with listening("echo", "a", "--fetch", "--timeout", "60", *options) as process:
+            space["a"] = Scan()
+            first = process.stdout.readline()
+            space["a"] = 2
+            second = process.stdout.readline()
+            code, _, errors = ended(process)
+    assert code == 0, errors
+    why = "a was written by the ship 'scan', which this interface lacks"
+    if options:
+        first, second = json.loads(first), json.loads(second)
+        assert first["error"].startswith(why)
+        assert ("value" in first, second["value"], "error" in second) == (False, 2, False)
+    else:
+        assert f"a  <{why}" in first
+        assert "read it in a program that has this ship" in first  # in the words of the command line
+        assert second.rstrip().endswith("a  2")
+
+
 def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
     with listening("echo", "foo") as process:
         space["foo"] = 1
@@ -361,6 +403,17 @@ def test_updates_that_came_at_once_have_no_rate():
     window.add(event(5.0))
     assert (window.rate(), window.bandwidth()) == (None, None)
     assert RATE.cells(window)[0] == "-"
+
+
+def test_the_last_line_counts_so_many_paths_and_no_more(capsys, monkeypatch):
+    """Under ever new names, what was kept of them grew for as long as it went on."""
+    monkeypatch.setattr(following, "_MOST_PATHS", 3)
+    ending = Ending(stored=True)
+    for number in range(9):
+        following._enter(Event((f"k{number}",), 1, False, 0, 0.0, 0.0, "a", number), ending)
+    ending.tell()
+    assert (ending.taken, len(ending.paths)) == (9, 3)
+    assert capsys.readouterr().err == "9 updates of 3 or more paths in 0.0 s, 0 lost\n"
 
 
 def test_the_last_line(capsys):

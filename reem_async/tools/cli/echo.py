@@ -24,6 +24,7 @@ from reem_async.tools.cli.output import (
     width,
 )
 from reem_async.tools.cli.running import run
+from reem_async.tools.cli.wording import for_users
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -52,7 +53,8 @@ def echo(
     so and printed as what it led to, with the time at which it was found ("stored" in JSON): several changes in a
     moment may be one line. Of a path that is asked for, only what is there is printed. Values over 16 KB do not
     travel with the notice: their size is printed; of stored arrays, type and shape. Updates that were lost or
-    skipped are told in a line that begins with #; in JSON they are "missed", "gap" and "skipped".
+    skipped are told in a line that begins with #; in JSON they are "missed", "gap" and "skipped". With --fetch, what
+    cannot be read has the reason in its place, in JSON as "error".
 
     Examples:
         reem echo
@@ -62,7 +64,7 @@ def echo(
     """
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.errors import MissingKey
+        from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, WrongKind
         from reem_async.plan.patterns import parse_pattern
         from reem_async.pubsub.monitor import ANNOUNCED
         from reem_async.store.reader import DocumentReader
@@ -74,19 +76,21 @@ def echo(
         async def take(event: Event, ending: Ending) -> None:
             nonlocal skipped
             event = _narrowed(event, asked)
-            value, known = event.value, event.value is not ANNOUNCED
+            value, known, problem = event.value, event.value is not ANNOUNCED, ""
             # Large values are announced without their bytes: what is read here may be newer than the update.
             if fetch and not known:
                 try:
                     value, known = await DocumentReader(interface.session, event.name).read(event.path[1:]), True
                 except MissingKey:
                     value, known = "gone already", True
+                except (BadData, NotAllowed, PathRefused, WrongKind) as error:  # this one's: others can be read
+                    problem = for_users(error)
             # How many were skipped since the last line, of a counter that only grows.
             new, skipped = ending.skipped - skipped, ending.skipped
             if as_json:
-                emit_json(_for_programs(event, value if known else None, known, new))
+                emit_json(_for_programs(event, value if known else None, known, problem, new))
                 return
-            for line in _for_people(event, value, known, new, cut_lines=is_terminal() and not full):
+            for line in _for_people(event, value, known, problem, new, cut_lines=is_terminal() and not full):
                 emit(line)
             sys.stdout.flush()
 
@@ -114,7 +118,7 @@ def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
     return dataclasses.replace(event, path=place, value=None if gone else value, deleted=gone)
 
 
-def _for_programs(event: Event, value: Any, known: bool, skipped: int) -> dict[str, Any]:
+def _for_programs(event: Event, value: Any, known: bool, problem: str, skipped: int) -> dict[str, Any]:
     entry = {
         "path": typed(event.path),
         "time": event.time,
@@ -127,12 +131,14 @@ def _for_programs(event: Event, value: Any, known: bool, skipped: int) -> dict[s
         entry["deleted"] = True
     elif known:
         entry["value"] = _each_leaf(value, _unfetched_as_text) if event.stored else value
+    elif problem:
+        entry["error"] = problem
     if event.stored:
         entry["stored"] = True
     return entry | {"missed": event.missed, "gap": event.gap, "skipped": skipped}
 
 
-def _for_people(event: Event, value: Any, known: bool, skipped: int, *, cut_lines: bool) -> list[str]:
+def _for_people(event: Event, value: Any, known: bool, problem: str, skipped: int, *, cut_lines: bool) -> list[str]:
     lines = []
     if event.missed:
         # In the place where they were lost, so that the order of what is printed is the order of what happened.
@@ -146,6 +152,8 @@ def _for_people(event: Event, value: Any, known: bool, skipped: int, *, cut_line
         what = "deleted"
     elif known:
         what = _one_line(value)
+    elif problem:
+        what = f"<{clean(problem)}>"
     else:
         what = f"<{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
     # The path has at most half of the line, the value the rest.

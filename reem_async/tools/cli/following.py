@@ -23,6 +23,9 @@ __all__ = ["Ending", "follow"]
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
 
+_MOST_PATHS = 10_000
+"""Paths that are told apart for the last line: a program may publish under ever new names."""
+
 _NEVER = float("inf")
 
 
@@ -36,7 +39,7 @@ class Ending:
         skipped: How many came faster than they were taken, and were dropped here.
         gaps: How often the connection broke or a message was unreadable.
         seconds: How long it went on.
-        paths: Where the updates were.
+        paths: Where the updates were, the first 10,000.
         timed_out: The time was over before there was enough.
         stored: What is only stored is heard, too.
     """
@@ -52,7 +55,8 @@ class Ending:
 
     def tell(self) -> int:
         """Say in one line how it went; return the exit code."""
-        where = f"{len(self.paths)} path{'' if len(self.paths) == 1 else 's'}"
+        more = " or more" * (len(self.paths) >= _MOST_PATHS)
+        where = f"{len(self.paths)}{more} path{'' if len(self.paths) == 1 else 's'}"
         words = [f"{self.taken} updates of {where} in {self.seconds:.1f} s", f"{self.lost} lost"]
         if self.gaps:
             words.append(f"{self.gaps} gaps of unknown length")
@@ -161,7 +165,8 @@ def _enter(event: Event, ending: Ending) -> None:
     ending.lost += event.missed
     # A loss whose number is known is counted as lost, not as a gap as well.
     ending.gaps += event.gap and not event.missed
-    ending.paths.add(event.shown)
+    if len(ending.paths) < _MOST_PATHS:
+        ending.paths.add(event.shown)
 
 
 async def _next(monitor: Monitor, when: float) -> Event | None:
