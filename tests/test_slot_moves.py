@@ -11,14 +11,15 @@ import contextlib
 import itertools
 import os
 
+import numpy as np
 import pytest
 from callkit import CALLS
-from clusterkit import Move, assert_tidy, clients_of, slot_of
+from clusterkit import Move, assert_tidy, clients_of, raw_of, slot_of
 from conftest import assert_same
 from slotload import load
 
 import reem_async
-from reem_async.errors import MissingKey, NotConnected, PathRefused
+from reem_async.errors import MissingKey, NotConnected, PartialWrite, PathRefused
 from reem_async.server.cluster import EmbeddedCluster
 
 MOVES = int(os.environ.get("REEM_SLOT_MOVES", "5"))
@@ -122,3 +123,22 @@ async def test_a_call_to_a_slot_on_its_way_is_whole_or_refused(cluster, key, pha
         told = collections.Counter((case.space, case.told) for case in cases)
         assert not (phase in WAIT and told["PublishSpace", "done"]), told
         assert told["PublishSpace", "done"] or phase not in GO, told
+
+
+@pytest.mark.parametrize("json", [True, False], ids=["json", "plain"])
+async def test_a_registry_that_has_not_gone_yet_is_not_taken_for_missing(json):
+    """The document has gone ahead of its array, which the interface that replaces it does not know of."""
+    with EmbeddedCluster(primaries=3, replicas=0, json=json) as own:
+        async with reem_async.RedisInterface(own) as one, reem_async.RedisInterface(own, timeout=0.3) as two:
+            await reem_async.KeyValueStore(one)["cam"].write({"n": 1, "image": np.arange(5)})
+            cam = reem_async.KeyValueStore(two)["cam"]
+            await reem_async.KeyValueStore(two)["warm"].write(1)
+            move = Move(own, "cam").begin()
+            move.take("cam")
+            with pytest.raises(PartialWrite, match="arrays that nothing refers to could not be removed"):
+                await cam.write({"n": 2})
+            move.finish()
+            assert await cam.read() == {"n": 2}
+            await cam.write({"n": 3})
+            with raw_of(move.target) as client:
+                assert not client.exists("{cam}.image")

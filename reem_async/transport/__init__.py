@@ -179,8 +179,9 @@ async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
             outcome = decoded(sent, replies)
             if sent.atomic and replies[-1] is not None:
                 contention.over()
-            # Given up, and to be tried again: in which way, the plan knows.
-            elif sent.atomic and type(outcome) is Plan:
+            # Given up, and to be tried again: in which way, the plan knows. (Where the reason is that a slot moves, the
+            # connection across the cluster has a limit of its own.)
+            elif sent.atomic and type(outcome) is Plan and not isinstance(replies[0], Exception):
                 contention.given_up(sent.commands)
         # The replies are not the protocol's: the connection is not to be used again, so it leaves with the error.
         except BadData:

@@ -29,7 +29,7 @@ from .options import Address, NodeOptions, Options
 from .publication import Publication
 from .redirects import Moved, key_slot, publishes, refusal, slot_of, slots_of
 from .rooted import Rooted
-from .route import HeldAcross, Route, asked_of, looked_early, places_refused
+from .route import HeldAcross, Route, asked_of, looked_early, places_refused, without_looks
 from .state import States
 
 __all__ = ["ClusterOptions", "ClusterTransport"]
@@ -310,14 +310,16 @@ class ClusterTransport(Rooted):
             while True:
                 try:
                     node = await route.node()
-                    got = await asked_of(node, [commands[place] for place in left], route.asking, bulk)
+                    sent = without_looks(commands, left) if route.asking and not whole else left
+                    got = await asked_of(node, [commands[place] for place in sent], route.asking, bulk)
                 except NotConnected as error:
                     await route.refused(error)
                     continue
                 problem = refusal(got)
-                for place, reply in zip(left, got, strict=True):
+                for place, reply in zip(sent, got, strict=True):
                     answers[place] = reply
                 if problem is None:
+                    early.update(place for place in left if place not in sent)
                     break
                 # A transaction is applied or not. Of other commands some may be: only those that were not are sent
                 # again.

@@ -38,7 +38,7 @@ from ..plan import Command, Reply, blamed
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, publishes, refusal, slot_of
 
-__all__ = ["HeldAcross", "Layout", "Route", "asked_of", "looked_early", "places_refused", "watched"]
+__all__ = ["HeldAcross", "Layout", "Route", "asked_of", "looked_early", "places_refused", "watched", "without_looks"]
 
 _ASKING: Command = ("ASKING",)
 _UNWATCH: Command = ("UNWATCH",)
@@ -189,7 +189,10 @@ class HeldAcross:
             await route.refused(problem)
 
     async def _end(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        """Send a transaction. If its keys are moving it is given up, as after a change of what is watched."""
+        """Send a transaction. If its keys are moving it is given up, as after a change of what is watched.
+
+        Then the replies to all but EXEC say why.
+        """
         assert self._held is not None
         problem = (await watched(self._held, keys_in(commands), self._route))[0] if publishes(commands) else None
         if problem is None:
@@ -200,7 +203,7 @@ class HeldAcross:
         if self._giving_up is None:
             self._giving_up = Route(self._cluster, slot_of(commands))
         await self._giving_up.refused(problem)
-        return [None] * len(commands)
+        return [problem] * (len(commands) - 1) + [None]
 
     async def _on(self, node: Transport) -> Held:
         if self._node is not node or self._held is None:
@@ -287,3 +290,11 @@ def looked_early(commands: Sequence[Command], left: Sequence[int]) -> set[int]:
     """
     first = min(left, default=len(commands))
     return {place for place in range(first, len(commands)) if place not in left and commands[place][0] == "SMEMBERS"}
+
+
+def without_looks(commands: Sequence[Command], left: Sequence[int]) -> Sequence[int]:
+    """Return the places of what is sent, of what is left, to a node that a slot is moving to: no looks at a registry.
+
+    That may not have moved yet, and the node would say that there is none. A look by itself goes its own way.
+    """
+    return [place for place in left if commands[place][0] != "SMEMBERS"] or left
