@@ -93,8 +93,8 @@ def test_only_snapshots_of_the_same_server_and_namespace_are_deleted(tmp_path):
     names = [tmp_path / f"reem-auto-20260801T1200{second:02}Z.zip" for second in range(6)]
     for place, name in enumerate(names):
         made(name, namespace="one" if place % 2 else "two", match="*" if place else "arm*")
-    assert prune([names[5]], 1) == [names[1], names[3]]
-    assert prune([names[4]], 1) == [names[2]]
+    assert prune([names[5]], 1).deleted == [names[1], names[3]]
+    assert prune([names[4]], 1).deleted == [names[2]]
     assert sorted(tmp_path.iterdir()) == [names[0], names[4], names[5]]
 
 

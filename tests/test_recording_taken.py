@@ -65,7 +65,7 @@ def test_a_part_file_leaves_a_link_a_link(tmp_path):
     (tmp_path / "there").mkdir()
     link.symlink_to(tmp_path / "there" / "file")
     for content in (b"first", b"second"):
-        part = PartFile(link)
+        part = PartFile(link, replace=True)
         assert part.path.parent == tmp_path / "there"
         part.path.write_bytes(content)
         part.finish()

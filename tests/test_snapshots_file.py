@@ -18,7 +18,7 @@ from snapshotkit import everything, left_in
 import reem_async
 import reem_async.snapshots
 from reem_async.errors import BadData
-from reem_async.tools.snapshots import describe, restore, save
+from reem_async.tools.snapshots import describe, rdb, restore, save, save_rdb
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import new_name, prune
 from reem_async.tools.snapshots.values import Entry, Value, joined, split
@@ -155,6 +155,31 @@ async def test_a_file_that_is_there_is_not_overwritten_unasked(here, raws, tmp_p
     assert (await describe(tmp_path / "a.zip")).count == 0
 
 
+async def test_a_file_that_somebody_makes_meanwhile_is_not_overwritten_unasked(here, raws, tmp_path, monkeypatch):
+    """The look at the beginning did not see it, and both were told that they had saved."""
+    await reem_async.KeyValueStore(here)["foo"].write(1)
+
+    def meanwhile(_):
+        (tmp_path / "a.zip").write_text("precious")
+
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        await save(here, tmp_path / "a.zip", progress=meanwhile)
+    asked = rdb._asked
+
+    async def while_asked(*words):
+        (tmp_path / "a.rdb").write_text("precious")
+        return await asked(*words)
+
+    monkeypatch.setattr(rdb, "_asked", while_asked)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        await save_rdb(here, tmp_path / "a.rdb")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.zip": "precious", "a.rdb": "precious"}
+    await save_rdb(here, tmp_path / "a.rdb", overwrite=True)
+    await save(here, tmp_path / "a.zip", overwrite=True, progress=meanwhile)
+    assert (await describe(tmp_path / "a.zip")).count == 1
+    assert (await describe(tmp_path / "a.rdb")).kind == "rdb"
+
+
 async def test_cancelled_or_failed_it_leaves_no_file(here, raws, tmp_path):
     kvs = reem_async.KeyValueStore(here)
     for number in range(30):
@@ -243,4 +268,4 @@ def test_names_say_when_and_pruning_deletes_only_its_own(tmp_path):
     assert [path.name for path in made] == [f"reem-auto-19700101T000000Z-{number}.zip" for number in (2, 3, 4)]
     assert left_in(tmp_path) == sorted(path.name for path in made + others)
     assert not any(path.exists() for path in earlier)
-    assert prune(made[-1:], 1) == made[:2]
+    assert prune(made[-1:], 1) == (made[:2], [])

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import enum
+import errno
 import os
 import re
 import secrets
+import stat
 import time
 from pathlib import Path
 
@@ -14,38 +17,65 @@ try:
 except ModuleNotFoundError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["PartFile", "is_locked", "lock"]
+__all__ = ["Lock", "PartFile", "is_locked", "lock", "there_already"]
 
-_NAME = re.compile(r"\..+\.[0-9a-f]{8}\.reem\.part")
+_NAME = re.compile(r"\..*\.[0-9a-f]{8}\.reem\.part", re.DOTALL)
+_LONGEST = 200
+"""Bytes of a target's name in that of the hidden file: file systems take 255 in all."""
 _ABANDONED_SECONDS = 3600.0
 """Where there are no locks: a file that was not written to for so long is nobody's."""
+_AT_WORK_SECONDS = 10.0
+"""Where there are no locks: a file that was written to since then has a writer. A recording has a keyframe each 5 s."""
+_FLAGS = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+# Anybody may put a FIFO or a link into a shared directory: neither waits here, nor leads elsewhere.
+_OTHERS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _FLAGS
 
 
-def lock(descriptor: int) -> bool:
-    """Lock an open file until it is closed, also by the end of the program; return False if another has locked it.
+class Lock(enum.Enum):
+    """What became of asking for the lock of a file."""
+
+    HELD = enum.auto()
+    TAKEN = enum.auto()
+    """By another program, or elsewhere in this one."""
+    NONE = enum.auto()
+    """There are no locks: Windows, and some file systems."""
+
+
+def lock(descriptor: int, *, shared: bool = False) -> Lock:
+    """Lock an open file until it is closed, also by the end of the program.
 
     Other programs may read and write it nevertheless: only those that ask are told.
+
+    Args:
+        descriptor: It, open for writing; for reading if `shared`: NFS refuses other locks of what is open for reading.
+        shared: Together with others that ask so. Whoever only looks whether a writer has it asks so.
     """
-    if fcntl is not None:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        except OSError:  # a file system without locks
-            return True
-    return True
+    if fcntl is None:
+        return Lock.NONE
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except OSError as error:  # CIFS says EACCES of what is locked
+        return Lock.TAKEN if error.errno in (errno.EAGAIN, errno.EACCES) else Lock.NONE
+    return Lock.HELD
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether some program, this one included, has locked a file."""
+    """Return whether some program, this one included, has locked a file; without locks, whether it is written to."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_CLOEXEC", 0))
+        descriptor = os.open(path, _OTHERS)
     except OSError:
         return False
     try:
-        return not lock(descriptor)
+        found = lock(descriptor, shared=True)
+        # Windows has no locks either, but refuses itself to replace a file that is open.
+        return found is Lock.TAKEN or (found is Lock.NONE and fcntl is not None and _age(descriptor) < _AT_WORK_SECONDS)
     finally:
         os.close(descriptor)
+
+
+def there_already(path: Path) -> FileExistsError:
+    """Return the error that says so, and what to do."""
+    return FileExistsError(f"{path} is there already; choose another name, or replace it with overwrite=True")
 
 
 class PartFile:
@@ -55,6 +85,11 @@ class PartFile:
 
     Making one removes those in the same directory whose program was killed.
 
+    Args:
+        target: The name.
+        replace: Whether it may take the place of a file that has that name by then. It is readable by nobody who
+            could not read that one.
+
     Attributes:
         path: The hidden file.
         descriptor: It, open for reading and writing, and locked; -1 once it is closed.
@@ -63,28 +98,44 @@ class PartFile:
         OSError: It cannot be made.
     """
 
-    def __init__(self, target: Path) -> None:
+    def __init__(self, target: Path, *, replace: bool = False) -> None:
         self.descriptor = -1
         target = Path(os.path.realpath(target))  # unlike `resolve`, it takes a circle of links
         _remove_abandoned(target.parent)
         self._target = self.path = target
-        flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
+        self._replace = replace
+        old = _to_replace(target) if replace else None
+        # A part of a character at the end is left out: not every file system takes it.
+        name = os.fsencode(target.name)[:_LONGEST].decode(errors="ignore")
         while self.descriptor < 0:
-            self.path = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.reem.part")
-            descriptor = os.open(self.path, flags, 0o666)
+            self.path = target.with_name(f".{name}.{secrets.token_hex(4)}.reem.part")
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _FLAGS, 0o600 if old else 0o666)
             # Before it was locked, another program may have taken it for abandoned.
-            if lock(descriptor) and os.fstat(descriptor).st_nlink:
+            if lock(descriptor) is not Lock.TAKEN and os.fstat(descriptor).st_nlink:
                 self.descriptor = descriptor
             else:
                 os.close(descriptor)
+        if old is not None:
+            _make_as_private(self.descriptor, old)
 
     def appear(self) -> None:
-        """Give the file its name; it stays open and locked."""
-        self.path.replace(self._target)
+        """Give the file its name; it stays open and locked.
+
+        Raises:
+            FileExistsError: There is a file of that name by now, and it may not be replaced.
+            OSError: The directory cannot be written.
+        """
+        if self._replace:
+            self.path.replace(self._target)
+        else:
+            try:
+                _rename(self.path, self._target)
+            except FileExistsError:
+                raise there_already(self._target) from None
         self.path = self._target
 
     def finish(self) -> None:
-        """Give the file its name, and close it."""
+        """Give the file its name, and close it; raises as `appear` does."""
         if fcntl is None:  # Windows renames no open file
             os.close(self.descriptor)
             self.descriptor = -1
@@ -105,11 +156,68 @@ class PartFile:
             self.close()
 
 
+def _to_replace(target: Path) -> os.stat_result | None:
+    """Return what a file is like that is to be replaced, None if there is none; OSError if it is no file."""
+    try:
+        old = target.lstat()
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISREG(old.st_mode):
+        raise OSError(errno.EINVAL, "not a file, and not replaced", str(target))
+    return old
+
+
+def _make_as_private(descriptor: int, old: os.stat_result) -> None:
+    """Let those read and write a new file, which only its owner may, who may do so with the old one."""
+    if fcntl is None:  # Windows
+        return
+    mode = stat.S_IMODE(old.st_mode) & 0o777 | 0o600  # its owner is about to write it
+    with contextlib.suppress(OSError):
+        os.fchown(descriptor, -1, old.st_gid)
+    if os.fstat(descriptor).st_gid != old.st_gid:
+        mode &= ~0o070  # this program may not give it to that group, and its own one is another
+    with contextlib.suppress(OSError):  # what has no rights, such as FAT
+        os.fchmod(descriptor, mode)
+
+
+def _rename(part: Path, target: Path) -> None:
+    """Give a file another name; FileExistsError if there is a file of that name."""
+    if fcntl is None:  # Windows refuses by itself
+        part.rename(target)
+        return
+    try:
+        target.hardlink_to(part)  # a rename would replace what came to be meanwhile
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links; of all else, the rename tells
+        if os.path.lexists(target):
+            raise FileExistsError from None
+        part.rename(target)
+    else:
+        # If this fails, or the program is killed before it, the hidden name is removed later: the file keeps its other.
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def _age(descriptor: int) -> float:
+    """Return the seconds since a file was written to."""
+    return time.time() - os.fstat(descriptor).st_mtime
+
+
 def _remove_abandoned(directory: Path) -> None:
     """Remove what programs have left that were killed."""
     for part in directory.glob(".*.reem.part"):
         if _NAME.fullmatch(part.name):
-            with contextlib.suppress(OSError), part.open("rb") as file:
-                age = time.time() - os.fstat(file.fileno()).st_mtime
-                if lock(file.fileno()) and (fcntl is not None or age > _ABANDONED_SECONDS):
-                    part.unlink()
+            with contextlib.suppress(OSError):
+                _remove_if_abandoned(part)
+
+
+def _remove_if_abandoned(part: Path) -> None:
+    descriptor = os.open(part, _OTHERS | getattr(os, "O_NOFOLLOW", 0))
+    try:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            found = lock(descriptor, shared=True)
+            if found is Lock.HELD or (found is Lock.NONE and _age(descriptor) > _ABANDONED_SECONDS):
+                part.unlink()
+    finally:
+        os.close(descriptor)

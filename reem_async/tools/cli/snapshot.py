@@ -6,10 +6,10 @@ import asyncio
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
@@ -17,13 +17,14 @@ from reem_async.tools.cli.bar import progress_bar
 from reem_async.tools.cli.lazy import help_text
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, styled
-from reem_async.tools.cli.running import prepared, run
+from reem_async.tools.cli.running import FAILED, prepared, run
 from reem_async.tools.cli.snapshot_listing import check_there, content, facts, listed, number
 from reem_async.tools.cli.wording import for_users
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.tools.snapshots import Progress, Snapshot
+    from reem_async.tools.snapshots.files import Pruned
 
 __all__ = ["app"]
 
@@ -100,11 +101,8 @@ def save(
     _check_options(file, directory, match, rdb=rdb, periodic=every is not None or keep is not None)
     saver = _Saver(file, directory or Path(), match, rdb=rdb, keep=keep, overwrite=force, as_json=as_json)
 
-    async def work(interface: RedisInterface) -> None:
-        if every is None:
-            await saver.once(interface)
-        else:
-            await saver.by_period(interface, every)
+    async def work(interface: RedisInterface) -> int:
+        return await (saver.once(interface) if every is None else saver.by_period(interface, every))
 
     run("snapshot save", work, url, namespace, live=every is not None)
 
@@ -142,25 +140,30 @@ class _Saver:
         self._made: list[Path] = []
         self._noted: set[str] = set()
 
-    async def once(self, interface: RedisInterface, *, bar: bool = True) -> None:
-        """Take one, delete what is too old, print a line."""
+    async def once(self, interface: RedisInterface, *, bar: bool = True) -> int:
+        """Take one, delete what is too old, print a line; return the exit code."""
         started = time.monotonic()
         it = await self._saved(interface, bar)
         # Only when the new one is complete and on the disk are old ones deleted.
-        gone = await asyncio.to_thread(self._pruned, it.path)
+        gone, failed = await asyncio.to_thread(self._pruned, it.path)
+        self._tell(it, gone, time.monotonic() - started)
+        for error in failed:
+            note(f"reem snapshot save: saved, but an older one could not be deleted: {for_users(error)}")
+        return FAILED if failed else 0
+
+    def _tell(self, it: Snapshot, gone: Sequence[Path], seconds: float) -> None:
         if self._as_json:
-            done = {"seconds": time.monotonic() - started, "deleted": [str(path) for path in gone]}
+            done = {"seconds": seconds, "deleted": [str(path) for path in gone]}
             emit_json({**facts(it), "doubt": it.doubt, **done})
             return
         deleted = f", deleted {', '.join(path.name for path in gone)}" if gone else ""
-        taken = f"{time.monotonic() - started:.2f} s"
-        emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {taken}{clean(deleted)}")
+        emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {seconds:.2f} s{clean(deleted)}")
         sys.stdout.flush()
         self._note_foreign(it)
         if it.doubt:
             self._note_once(f"Keys may be missing: {it.doubt}.")
 
-    async def by_period(self, interface: RedisInterface, every: float) -> None:
+    async def by_period(self, interface: RedisInterface, every: float) -> NoReturn:
         """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""
         from reem_async.errors import RedisError, ReemError
 
@@ -186,6 +189,15 @@ class _Saver:
             raise
 
     async def _saved(self, interface: RedisInterface, bar: bool) -> Snapshot:
+        while True:
+            try:
+                return await self._saved_as(interface, bar)
+            except FileExistsError:
+                # Of one named by time: another program has begun one in the same second, and this gets the next number.
+                if self._file is not None:
+                    raise
+
+    async def _saved_as(self, interface: RedisInterface, bar: bool) -> Snapshot:
         from reem_async.tools.snapshots import RdbUnavailable, save, save_rdb
 
         if self._rdb:
@@ -206,17 +218,17 @@ class _Saver:
 
         return self._file or new_name(self._directory, kind, time.time(), auto=self._keep is not None)
 
-    def _pruned(self, newest: Path) -> list[Path]:
-        from reem_async.tools.snapshots.files import prune
+    def _pruned(self, newest: Path) -> Pruned:
+        from reem_async.tools.snapshots.files import Pruned, prune
 
         self._made.append(newest)
         # Without --keep nothing is ever deleted, so there is nothing to remember.
         if self._keep is None:
             del self._made[:-1]
-            return []
-        gone = prune(self._made, self._keep)
+            return Pruned([], [])
+        done = prune(self._made, self._keep)
         del self._made[: -self._keep]
-        return gone
+        return done
 
     def _note_foreign(self, it: Snapshot) -> None:
         if it.foreign:

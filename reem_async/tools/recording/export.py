@@ -16,7 +16,7 @@ import numpy as np
 from ...errors import BadData, BadValue
 from ...plan.paths import Path, suffix
 from ...plan.trees import MISSING
-from ..partfile import PartFile
+from ..partfile import PartFile, there_already
 from .history import EXACT, numbers
 from .log import Log
 from .roles import Kind
@@ -102,14 +102,13 @@ def export(
         BadValue: Another kind, the file exists, or there is nothing to write.
         OSError: It cannot be written.
     """
-    if kind not in FORMATS:
-        raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
+    check_format(kind)
     target = FilePath(target)
     if target.exists() and not overwrite:
-        raise BadValue(f"{target} is there already; choose another name, or replace it with overwrite=True")
+        raise BadValue(str(there_already(target)))
     result = Export()
     try:
-        part = PartFile(target)
+        part = PartFile(target, replace=overwrite)
         try:
             # Under a hidden name: a program that waits for the file never sees a half one.
             FORMATS[kind](log, part.path, patterns, result)

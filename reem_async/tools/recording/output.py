@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from ...errors import BadValue
-from ..partfile import PartFile, is_locked, lock
+from ..partfile import Lock, PartFile, is_locked, lock
 from .yielding import slices
 
 __all__ = ["FileGone", "Output"]
@@ -44,14 +44,15 @@ class Output:
             if overwrite and path.is_file():
                 self._refuse_recorded()
                 # Beside the old file, which is complete and stays until the new one has something in it.
-                self._part = PartFile(path)
+                self._part = PartFile(path, replace=True)
                 self._file = self._part.descriptor
             else:
                 # O_EXCL makes two recorders that begin at once agree on who has the name; the lock is for those that
                 # come later.
                 flags = os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL)
                 self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
-                if stat.S_ISREG(os.fstat(self._file).st_mode) and not lock(self._file):  # both have just begun
+                regular = stat.S_ISREG(os.fstat(self._file).st_mode)
+                if regular and lock(self._file) is Lock.TAKEN:  # both have just begun
                     os.close(self._file)
                     raise self._taken()
         except FileExistsError:

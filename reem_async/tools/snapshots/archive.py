@@ -77,10 +77,11 @@ class ArchiveWriter:
     Args:
         path: The file.
         header: What `header` returned.
+        overwrite: Whether a file that has its name by then may be replaced.
     """
 
-    def __init__(self, path: Path, header: dict[str, Any]) -> None:
-        self._new = NewFile(path)
+    def __init__(self, path: Path, header: dict[str, Any], *, overwrite: bool = False) -> None:
+        self._new = NewFile(path, overwrite=overwrite)
         # A file that cannot seek makes zipfile write sizes behind each member rather than going back to its head, which
         # would change bytes that are in the digest already.
         self._hashed = _Hashed(self._new.file)

@@ -17,9 +17,20 @@ from typing import BinaryIO, NamedTuple
 import orjson
 
 from ...errors import BadData
-from ..partfile import PartFile
+from ..partfile import PartFile, there_already
 
-__all__ = ["SUFFIXES", "NewFile", "SavedKey", "Snapshot", "check_target", "dated", "new_name", "prune", "sniff"]
+__all__ = [
+    "SUFFIXES",
+    "NewFile",
+    "Pruned",
+    "SavedKey",
+    "Snapshot",
+    "check_target",
+    "dated",
+    "new_name",
+    "prune",
+    "sniff",
+]
 
 SUFFIXES = {"portable": ".zip", "rdb": ".rdb"}
 """How the names of both kinds of files end. What a file is, its content says."""
@@ -106,7 +117,7 @@ def new_name(directory: Path, kind: str, moment: float, *, auto: bool) -> Path:
     """Return a name that says when, in UTC, and that no file of the directory has."""
     stem = f"reem-{'auto-' if auto else ''}{time.strftime(_TIME, time.gmtime(moment))}"
     path, number = directory / f"{stem}{SUFFIXES[kind]}", 1
-    while path.exists():
+    while os.path.lexists(path):
         number += 1
         path = directory / f"{stem}-{number}{SUFFIXES[kind]}"
     return path
@@ -122,8 +133,20 @@ def dated(path: Path) -> float | None:
     return None
 
 
-def prune(made: Sequence[Path], keep: int) -> list[Path]:
-    """Delete the oldest snapshots that were saved by period until `keep` are left; return what was deleted.
+class Pruned(NamedTuple):
+    """What became of snapshots that are too old.
+
+    Attributes:
+        deleted: Those that are gone.
+        failed: Why others are not.
+    """
+
+    deleted: list[Path]
+    failed: list[OSError]
+
+
+def prune(made: Sequence[Path], keep: int) -> Pruned:
+    """Delete the oldest snapshots that were saved by period until `keep` are left.
 
     Only files beside the last one made that have such a name and such content, and are of its kind, server,
     namespace and pattern, are deleted, and never that one itself. Those of earlier runs go first, whatever the
@@ -133,6 +156,22 @@ def prune(made: Sequence[Path], keep: int) -> list[Path]:
         made: What this run has saved, in this order.
         keep: How many to leave, at least 1.
     """
+    done = Pruned([], [])
+    try:
+        old = _too_old(made, keep)
+    except OSError as error:  # of the directory
+        return Pruned([], [error])
+    for path in old:
+        try:
+            path.unlink(missing_ok=True)
+            done.deleted.append(path)
+        except OSError as error:
+            done.failed.append(error)
+    return done
+
+
+def _too_old(made: Sequence[Path], keep: int) -> list[Path]:
+    """Return the snapshots that `prune` deletes, the oldest first."""
     # A clock may have been set back since: files of this run are in the order in which they were made, not of their
     # times.
     newest, order = made[-1], {path: number for number, path in enumerate(made)}
@@ -145,10 +184,7 @@ def prune(made: Sequence[Path], keep: int) -> list[Path]:
     # -1 for files of earlier runs: they are older than all of this run.
     own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
     # `own` is without the newest one, which counts among those that are kept.
-    gone = own[: max(0, len(own) + 1 - keep)]
-    for path in gone:
-        path.unlink(missing_ok=True)
-    return gone
+    return own[: max(0, len(own) + 1 - keep)]
 
 
 def _is_automatic(path: Path) -> bool:
@@ -183,22 +219,26 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     if not path.parent.is_dir():
         raise NotADirectoryError(f"{path}: there is no directory {path.parent}; make it first")
     if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} is there already; choose another name, or replace it with overwrite=True")
+        raise there_already(path)
 
 
 class NewFile:
     """A file that gets the name `path` when all of it is on the disk, or never; until then it is hidden beside it.
 
+    Args:
+        path: The name.
+        overwrite: Whether a file that has it by then may be replaced.
+
     Attributes:
         file: What to write to.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._part = PartFile(path)
+    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+        self._part = PartFile(path, replace=overwrite)
         self.file: BinaryIO = self._part.path.open("r+b")
 
     def commit(self) -> None:
-        """Give the file its name."""
+        """Give the file its name; FileExistsError if another one has it by now, which may not be replaced."""
         self.file.flush()
         # First the content, then the name: after a power failure there is never a name with half a file.
         os.fsync(self.file.fileno())

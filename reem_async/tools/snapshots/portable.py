@@ -97,14 +97,15 @@ async def save(
         BadData: A ship keeps its value in a Redis type that cannot be saved.
         ClusterNode: The server is one node of several. No file was made.
         NotConnected: A node does not answer, or slots of the cluster have none. No file was made.
-        FileExistsError, OSError: The file cannot be written.
+        FileExistsError: The file is there, or was made by somebody else meanwhile.
+        OSError: The file cannot be written.
     """
     session, target = interface.session, Path(path)
     await anyio.to_thread.run_sync(lambda: check_target(target, overwrite=overwrite))
     found = await survey(session, match)
     # The time in the header is that of the beginning: no key was read before it.
     facts = header(interface.hostname, session.namespace, match, __version__)
-    writer = ArchiveWriter(target, facts)
+    writer = ArchiveWriter(target, facts, overwrite=overwrite)
     try:
         count = await _fill(session, writer, found, progress)
         if not count and match != "*":

@@ -51,6 +51,7 @@ async def save_rdb(interface: RedisInterface, path: str | os.PathLike[str], *, o
     Raises:
         RdbUnavailable: The server does not allow it, or its file cannot be read here, or this is a cluster,
             whose nodes have a file each.
+        FileExistsError: The file is there, or was made by somebody else meanwhile.
         OSError: The file cannot be written.
     """
     target = Path(path)
@@ -69,7 +70,7 @@ async def save_rdb(interface: RedisInterface, path: str | os.PathLike[str], *, o
     # SCHEDULE: if the server is rewriting its append-only file it saves after that, and does not refuse.
     await _asked(interface, "BGSAVE", "SCHEDULE")
     await _finished(interface, source, before, saves)
-    await _copy(source, before, target)
+    await _copy(source, before, target, overwrite=overwrite)
     return await anyio.to_thread.run_sync(describe_rdb, target)
 
 
@@ -140,12 +141,12 @@ async def _finished(
     raise RdbUnavailable(f"the server has accepted BGSAVE but not begun within {_START_SECONDS:.0f} s")
 
 
-async def _copy(source: Path, before: tuple[int, int, int] | None, target: Path) -> None:
+async def _copy(source: Path, before: tuple[int, int, int] | None, target: Path, *, overwrite: bool) -> None:
     if _identity(source) in (None, before):
         raise RdbUnavailable(
             f"the server has saved, but the file {source} of this machine has not changed: it is another server's"
         )
-    new = NewFile(target)
+    new = NewFile(target, overwrite=overwrite)
     try:
         with source.open("rb") as origin:
             while await anyio.to_thread.run_sync(lambda: new.file.write(origin.read(_BLOCK))):
