@@ -20,7 +20,11 @@ import reem_async
 from reem_async.concurrency.queues import Every
 from reem_async.errors import BadInput, BadValue
 from reem_async.tools.recording import Recorder, Replayer, open_log
-from reem_async.tools.recording.export import export
+from reem_async.tools.recording.export import FORMATS, export
+from reem_async.tools.recording.layout import to_json
+from reem_async.tools.recording.messages import encode
+from reem_async.tools.recording.roles import Kind, Role
+from reem_async.tools.recording.sink import Sink
 
 
 @pytest.fixture
@@ -339,6 +343,37 @@ def test_an_export_that_is_broken_off_leaves_nothing(log, tmp_path, kind, monkey
     with pytest.raises(KeyboardInterrupt):
         export(log, kind, target)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_somebody_makes_while_it_is_exported_stays(log, tmp_path, monkeypatch):
+    target, write = tmp_path / "run.csv", FORMATS["csv"]
+
+    def meanwhile(*arguments):
+        target.write_text("precious")
+        write(*arguments)
+
+    monkeypatch.setitem(FORMATS, "csv", meanwhile)
+    with pytest.raises(BadValue, match=r"there already.*overwrite=True"):
+        export(log, "csv", target)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
+    export(log, "csv", target, overwrite=True)
+    assert target.read_text().startswith("time,")
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_what_cannot_be_read_is_counted_once_though_it_is_read_several_times(kind, tmp_path):
+    file = tmp_path / "run.mcap"
+    sink = Sink(file, "none", {}, overwrite=False)
+    for number in range(1, 4):
+        sink.json(("a", "n"), Role.UPDATE, Kind.PUBLISHED, to_json(number), (number, number, number))
+        blob = encode("no ship of this name", b"x", "", 0)
+        sink.part(("a",), Role.UPDATE, Kind.PUBLISHED, "no ship of this name", blob, (10 + number,) * 3)
+    sink.finish({})
+    with open_log(file) as log:
+        assert (len(list(log.updates())), log.unreadable) == (3, 3)
+    with open_log(file) as log:
+        result = export(log, kind, tmp_path / "out")
+    assert (result.rows, result.unreadable) == (3, 3)
 
 
 async def test_steps_of_a_recording_without_updates_end(key, akvs, other, server_url, tmp_path):

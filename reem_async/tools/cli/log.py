@@ -162,10 +162,13 @@ def export(
     """
 
     def work() -> int:
-        target = output or file.with_suffix(f".{to}")
-        with tools("open_log")(file) as log:
-            from reem_async.tools.recording.export import export as write
+        open_log = tools("open_log")
+        from reem_async.tools.recording.export import check_format
+        from reem_async.tools.recording.export import export as write
 
+        check_format(to)  # before it becomes a part of a name
+        with open_log(file) as log:
+            target = output or file.with_suffix(f".{to}")
             result = write(log, to, target, patterns or ["*"], overwrite=force)
         for path, why in result.left_out.items():
             note(f"left out: {path}: {why}")

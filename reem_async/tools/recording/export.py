@@ -22,7 +22,7 @@ from .log import Log
 from .roles import Kind
 from .stored import Stored, is_inline
 
-__all__ = ["FORMATS", "Export", "export"]
+__all__ = ["FORMATS", "Export", "check_format", "export"]
 
 # Rows of a group in a Parquet file, and those that are in memory at once.
 _ROWS = 10_000
@@ -115,11 +115,18 @@ def export(
             part.finish()
         finally:
             part.close()
+    except FileExistsError as error:  # somebody has made it meanwhile
+        raise BadValue(str(error)) from None
     except OSError as error:
         file = str(log.path if error.filename == str(log.path) else target)
         raise OSError(error.errno, error.strerror or str(error), file) from error
-    result.unreadable = log.unreadable
     return result
+
+
+def check_format(kind: str) -> None:
+    """Raise BadValue if there is no such format."""
+    if kind not in FORMATS:
+        raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
 
 
 def _rows(log: Log, patterns: Sequence[str], result: Export) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -157,6 +164,7 @@ def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
     columns: dict[str, None] = {}
     for _, cells in _rows(log, patterns, result):
         columns.update(dict.fromkeys(cells))
+    result.unreadable = log.unreadable  # the second time it is counted again
     result.begin(columns)
     with target.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -178,6 +186,7 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
     for _, cells in _rows(log, patterns, result):
         for name, value in cells.items():
             kinds.setdefault(name, set()).add(_kind(value))
+    result.unreadable = log.unreadable  # the second time it is counted again
     result.begin(kinds)
     kinds |= {result.deleted: {str}, result.stored: {str}}
     # None stands for an empty cell in every type.
@@ -230,13 +239,18 @@ def _cell(value: Any, form: type) -> Any:
 
 def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
     """Write each path as it is read, array by array: a recording may be larger than memory."""
+    paths, lost = _array_paths(log, patterns, result), 0
+    result.unreadable = log.unreadable
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-        for path in _array_paths(log, patterns, result):
+        for path in paths:
+            before = log.unreadable
             try:
                 times, form, count = _shape(log, path)
             except BadData as error:
                 result.left_out[_name(path)] = str(error)
                 continue
+            finally:
+                lost += log.unreadable - before
             if form is None:
                 result.left_out[_name(path)] = "its type or shape changes, or no dtype holds it exactly"
                 continue
@@ -254,6 +268,8 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
                 np.lib.format.write_array_header_2_0(file, header)
                 for _, value in itertools.islice(log[path].values(), count):
                     file.write(np.ascontiguousarray(np.asarray(value, dtype)).tobytes())
+    # What each path lacks is in the updates, which were counted, but for arrays, which were not read then.
+    result.unreadable = result.unreadable or lost
     result.begin(result.columns)
 
 
