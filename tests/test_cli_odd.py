@@ -19,16 +19,18 @@ from conftest import assert_same
 from rich.console import Console
 from snapshotkit import servers  # noqa: F401 - a fixture
 from test_cli import REEM, CommandLine
+from typer.testing import CliRunner
 
 import reem as blocking
 import reem.snapshots
 from reem_async.errors import BadData, ReemError
 from reem_async.plan.paths import parse
+from reem_async.tools.cli import build
 from reem_async.tools.cli.echo import _moment
 from reem_async.tools.cli.output import json_text, typed
 from reem_async.tools.cli.running import Refused
 from reem_async.tools.cli.up import fail, print_rows
-from reem_async.tools.cli.values import parse_value, save
+from reem_async.tools.cli.values import FILES, parse_value, save
 from reem_async.tools.snapshots import described
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import NewFile, prune
@@ -75,6 +77,38 @@ def test_no_name_of_an_array_is_special_to_a_file(tmp_path):
     assert save(value, tmp_path / "a.npz", "a").endswith("4 arrays")
     with np.load(tmp_path / "a.npz") as found:
         assert_same({name: found[name] for name in found.files}, value)
+
+
+@pytest.mark.parametrize("kind", ["a/b", "", "xml"])
+def test_a_format_of_an_export_that_there_is_not(tmp_path, kind):
+    """It became a part of the file's name first, and some cannot."""
+    run = CliRunner().invoke(build(), ["log", "export", str(tmp_path / "run.mcap"), "--to", kind], prog_name="reem")
+    assert (run.exit_code, run.stderr) == (2, f"reem log export: {kind!r} is none of csv, npz, parquet\n")
+    assert isinstance(run.exception, SystemExit)
+
+
+def test_a_link_to_a_file_stays_a_link(tmp_path):
+    """As for recordings and snapshots; the name may be as long as the file system takes."""
+    file, link = tmp_path / ("ä" * 120 + ".npy"), tmp_path / "newest.npy"
+    file.write_bytes(b"old")
+    link.symlink_to(file)
+    save(np.arange(3), link, "a", replace=True)
+    assert link.is_symlink()
+    assert_same(np.load(file), np.arange(3))
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(reem, kvs, tmp_path, monkeypatch):
+    kvs["a"] = np.arange(3)
+    file, write = tmp_path / "a.npy", FILES[".npy"]
+
+    def meanwhile(*arguments):
+        file.write_bytes(b"precious")
+        return write(*arguments)
+
+    monkeypatch.setitem(FILES, ".npy", meanwhile)
+    assert "there already; choose another name, or replace it with --force" in reem.error(2, "get", "a", "-o", file)
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"]
 
 
 def made(path, entries=(), index=None, **head):

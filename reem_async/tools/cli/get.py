@@ -10,8 +10,9 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Url
 from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width
-from reem_async.tools.cli.running import USAGE, Refused, run
+from reem_async.tools.cli.running import Refused, run
 from reem_async.tools.cli.values import FILES
+from reem_async.tools.partfile import there_already
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -70,10 +71,10 @@ def get(
         from reem_async.tools.cli.values import save
 
         if output is not None and output.exists() and not force:
-            raise Refused(f"{output} is there already; choose another name, or replace it with --force", USAGE)
+            raise there_already(output)
         store = KeyValueStore(interface)
         if output is not None:
-            note(save(await store.get(path), output, path))
+            note(save(await store.get(path), output, path, replace=force))
             return
         # First what it is, without arrays: then what is too large to be shown is not fetched.
         node = await outline(interface, store.at(path).full_path)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
-import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +11,7 @@ from typing import IO, Any, NoReturn
 
 from reem_async.tools.cli.output import clean, json_text, size_text, typed
 from reem_async.tools.cli.running import USAGE, Refused
+from reem_async.tools.partfile import PartFile
 
 __all__ = ["FILES", "parse_value", "preview", "save"]
 
@@ -103,28 +102,24 @@ def _range(array: Any) -> str:
     return f", min {numbers.min()}, max {numbers.max()}, mean {numbers.mean(dtype=np.float64):.6g}" + text
 
 
-def save(value: Any, path: Path, where: str) -> str:
+def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
     """Write what was read at `where` to a file, whole or not at all; return what to say of it.
 
     Raises:
-        Refused: A file of this kind cannot hold it.
+        Refused: A file of this kind cannot hold it, or it cannot be written.
+        FileExistsError: There is a file of that name, and `replace` is False.
     """
     write = FILES[path.suffix]
     try:
-        # Beside its target, since a rename within one directory replaces a file in one step.
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        part = PartFile(path, replace=replace)
         try:
-            with os.fdopen(handle, "wb") as file:
+            with part.path.open("wb") as file:
                 said = write(value, file, where)
-            # The umask can be read only by setting it.
-            umask = os.umask(0)
-            os.umask(umask)
-            # mkstemp makes files that only their owner can read.
-            Path(name).chmod(0o666 & ~umask)  # as if it had been opened plainly
-            Path(name).replace(path)
-        except BaseException:
-            Path(name).unlink()
-            raise
+            part.finish()
+        finally:
+            part.close()
+    except FileExistsError:
+        raise
     except OSError as error:
         raise Refused(f"{path} cannot be written: {error.strerror or error}") from None
     return f"{path}: {said}"
