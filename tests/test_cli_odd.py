@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import time
+import zipfile
 
 import numpy as np
 import orjson
@@ -191,6 +192,33 @@ def test_an_index_that_unpacks_to_gigabytes_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr("reem_async.tools.snapshots.archive._LARGEST_INDEX", 1 << 20)
     with pytest.raises(BadData, match="larger than any index"):
         described(made(tmp_path / "a.zip", index=b" " * (1 << 21) + b'{"keys":[],"foreign":0,"foreign_names":[]}'))
+
+
+@pytest.mark.parametrize(
+    ("member", "kind"),
+    [
+        ("document.json", "string"),
+        ("values/1.bin", "string"),
+        ("values/1.hash", "hash"),
+        ("values/1.json", "ReJSON-RL"),
+    ],
+)
+def test_a_member_that_unpacks_to_more_than_the_index_says_is_not_unpacked(tmp_path, monkeypatch, member, kind):
+    """A snapshot of some kilobytes took all memory when it was restored."""
+    put, unpacked = ArchiveWriter._put, []
+
+    def bomb(self, name, data, *method):
+        put(self, name, *(bytes(1 << 24), zipfile.ZIP_DEFLATED) if name.endswith(member) else (data, *method))
+
+    monkeypatch.setattr(ArchiveWriter, "_put", bomb)
+    entry = Entry("foo", b'{"a":1}', (".z",), (Value(".z", kind, (b"a", b"1") if kind == "hash" else (b"1",)),))
+    file = made(tmp_path / "a.zip", [entry])
+    assert file.stat().st_size < 100_000
+    read = zipfile.ZipFile.read
+    monkeypatch.setattr(zipfile.ZipFile, "read", lambda *words: unpacked.append(read(*words)) or unpacked[-1])
+    with Archive(file) as archive, pytest.raises(BadData, match=r"damaged.* would unpack to 16777216 bytes"):
+        archive.read("foo")
+    assert max(map(len, unpacked)) < 1000
 
 
 @pytest.mark.parametrize(("kind", "pieces"), [("zset", (b"a",)), ("hash", (b"a",)), ("ReJSON-RL", ())])

@@ -191,7 +191,7 @@ class Archive:
         with _believed(self._path):
             row = self._rows[name]
             values = tuple([self._value(each) for each in row["values"]])
-            return Entry(name, self._zip.read(row["file"]), tuple(row["registry"]), values)
+            return Entry(name, self._member(row["file"], row["size"]), tuple(row["registry"]), values)
 
     def __enter__(self) -> Self:
         return self
@@ -230,8 +230,19 @@ class Archive:
         content: dict[str, Any] = orjson.loads(self._zip.read(member))
         return content
 
+    def _member(self, name: str, size: int | None) -> bytes:
+        """Return the content of a member that has the size which the index says; None for one that is not compressed.
+
+        It is compared before anything is unpacked: a few bytes may claim to unpack to any size.
+        """
+        info = self._zip.getinfo(name)
+        if info.file_size != (info.compress_size if size is None else size):
+            raise ValueError(f"{name} would unpack to {info.file_size} bytes")
+        return self._zip.read(info)
+
     def _value(self, row: dict[str, Any]) -> Value:
-        blob = self._zip.read(row["file"])
+        # Of what has parts, the index says the size without what is between them.
+        blob = self._member(row["file"], row["size"] if row["type"] == "string" else None)
         # Hashes hold pairs, sorted sets members and scores, JSON is one text.
         pieces = (blob,) if row["type"] == "string" else tuple(split(blob))
         if (row["type"] in ("hash", "zset") and len(pieces) % 2) or (row["type"] == "ReJSON-RL" and len(pieces) != 1):
