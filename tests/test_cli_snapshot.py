@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
+import pathlib
 import pty
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,6 +26,9 @@ import reem
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import app, period
+from reem_async.tools.snapshots import files, portable
+from reem_async.tools.snapshots.archive import ArchiveWriter, header
+from reem_async.tools.snapshots.values import Entry
 
 MAIN = """
 from reem_async.tools.cli.commands import Entry
@@ -259,6 +265,67 @@ def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     kept = {os.path.basename(line["path"]) for line in lines[-2:]}
     assert set(names(tmp_path)) == kept | {mine, "reem-auto-20000101T000000Z.zip"}
     assert all(re.fullmatch(r"reem-auto-\d{8}T\d{6}Z(-\d+)?\.zip", name) for name in kept)
+
+
+def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(kvs, env, tmp_path, monkeypatch):
+    """Which had begun in the same second: one of the two was lost, and both said that they had saved."""
+    kvs["foo"] = 1
+    named, survey, given = files.new_name, portable.survey, []
+
+    def new_name(*words, **options):
+        given.append(named(*words, **options))
+        return given[-1]
+
+    async def meanwhile(*words):
+        if len(given) == 1:
+            given[0].write_text("another program's")
+        return await survey(*words)
+
+    monkeypatch.setattr(files, "new_name", new_name)
+    monkeypatch.setattr(portable, "survey", meanwhile)
+    said, errors = snapshot("save", "-d", tmp_path, **env)
+    assert said.startswith(f"{given[1]}: 1 key")
+    assert errors == ""
+    assert given[0].read_text() == "another program's"
+    assert names(tmp_path) == sorted(path.name for path in given)
+
+
+def test_what_cannot_be_deleted_does_not_make_it_unsaved(kvs, env, tmp_path, monkeypatch):
+    """It said "not saved", and with one snapshot nothing but the error."""
+    kvs["foo"] = 1
+    snapshot("save", "-d", tmp_path, "--keep", "1", **env)
+    (old,) = names(tmp_path)
+
+    def refused(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / old))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pathlib.Path, "unlink", refused)
+        for options in ((), ("--json",)):
+            said, errors = snapshot("save", "-d", tmp_path, "--keep", "1", *options, code=1, **env)
+            assert said.count("\n") == 1
+            assert json.loads(said)["deleted"] == [] if options else "1 key" in said
+            assert f"saved, but an older one could not be deleted: {tmp_path / old}: Permission denied" in errors
+    said, errors = snapshot("save", "-d", tmp_path, "--keep", "1", "--json", **env)
+    assert (len(json.loads(said)["deleted"]), len(names(tmp_path)), errors) == (3, 1, "")
+
+
+def test_a_listing_ends_with_its_reader(tmp_path):
+    """A traceback was what `| head -1` had for it."""
+    writer = ArchiveWriter(tmp_path / "a.zip", header("s", "", "*", "1"))
+    for number in range(3000):
+        writer.add(Entry(f"a_key_of_some_length_{number}", b"1", (), ()))
+    writer.finish([])
+    words = shlex.join([*REEM, "list", str(tmp_path / "a.zip")])
+    run = subprocess.run(
+        ["bash", "-c", f"{words} | head -1; exit ${{PIPESTATUS[0]}}"],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert (run.returncode, run.stdout.count("\n"), run.stderr) == (0, 1, "")
 
 
 def test_by_period_it_outlives_the_server(tmp_path):

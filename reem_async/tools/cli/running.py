@@ -108,11 +108,11 @@ def guarded(name: str, work: Callable[[], int | None], *, live: bool = False) ->
 
 
 def prepared(name: str, make: Callable[[], Result]) -> Result:
-    """Return what `make` returns; what goes wrong becomes one line, before anything is sent."""
+    """Return what `make` returns; what goes wrong, a closed pipe too, ends the command before anything is sent."""
     # A list, since the exit code takes the place of the return value.
     result: list[Result] = []
     code = guarded(name, lambda: result.append(make()))
-    if code:
+    if not result or code:
         raise typer.Exit(code)
     return result[0]
 
