@@ -20,6 +20,7 @@ import reem_async
 from reem_async.errors import BadValue
 from reem_async.recording import Recorder, RecordingFailed, open_log
 from reem_async.tools.partfile import PartFile
+from reem_async.tools.recording import recorder, sink
 from reem_async.tools.recording.output import Output
 
 
@@ -239,6 +240,28 @@ def test_who_cannot_begin_says_nothing_of_the_old_recording(tmp_path):
         out, err = process.communicate(timeout=30)
     assert (process.returncode, out) == (1, ""), err
     assert file.read_bytes() == b"old"
+
+
+def test_what_a_full_disk_keeps_from_beginning_is_not_there(binterface, file):
+    """An empty file was, and had to be deleted by hand before the next try."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with pytest.raises(RecordingFailed, match="File too large"):
+            Recorder(binterface, path=file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(
+    ("module", "part"), [(recorder, "Monitor"), (recorder, "Sampler"), (recorder, "RecordedKeys"), (sink, "Writer")]
+)
+def test_whatever_keeps_a_recorder_from_being_made_leaves_no_file(binterface, file, monkeypatch, module, part):
+    monkeypatch.setattr(module, part, lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        Recorder(binterface, path=file)
+    assert not file.exists()
 
 
 async def test_what_replaces_a_recording_has_something_in_it(key, apspace, binterface, file):

@@ -136,9 +136,6 @@ class Recorder:
         self._samples = samples_of(sample)
         if not self.patterns and not self._samples:
             raise BadValue("nothing to record: give a pattern such as '*', or sample=")
-        described = description(self.session, patterns, self._samples, keyframe)
-        self._sink = Sink(self.path, compression, described, overwrite=overwrite)
-        self.writer_thread = WriterThread(self._sink, self.session.ships, queue_bytes, self.patterns)
         self._keyframe_seconds = keyframe
         self._keyframes = 0
         self._keys = RecordedKeys(self, interface, self.patterns)
@@ -154,6 +151,10 @@ class Recorder:
         self._dropped = 0
         self._failure: Exception | None = None
         self._done = asyncio.Event()
+        # Last, so that whatever goes wrong leaves no file.
+        described = description(self.session, patterns, self._samples, keyframe)
+        self._sink = Sink(self.path, compression, described, overwrite=overwrite)
+        self.writer_thread = WriterThread(self._sink, self.session.ships, queue_bytes, self.patterns)
 
     # Lifetime.
 

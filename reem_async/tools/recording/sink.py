@@ -77,13 +77,16 @@ class Sink:
         if compression not in COMPRESSIONS:
             raise BadValue(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
         self.output = Output(path, overwrite=overwrite)
-        self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
-        self._writer.add_metadata("reem", dict(metadata))
         try:
+            self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
+            self._writer.add_metadata("reem", dict(metadata))
             self.output.flush()
         except OSError as error:
-            self.close()
+            self.output.discard()
             raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
+        except BaseException:
+            self.output.discard()
+            raise
         self._schemas: dict[Any, int] = {}
         self._channels: dict[Any, int] = {}
         self._matched: dict[Any, int] = {}  # which channel messages of a signature go to: found once
