@@ -422,3 +422,41 @@ def test_an_idle_blocking_connection_survives_a_restart(tmp_path):
             store["bar"] = 2
             assert store["bar"].read() == 2
             assert interface.states().__next__().restarted
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize("json", [True, False], ids=["json", "plain"])
+@pytest.mark.parametrize("front", ["tasks", "threads"])
+async def test_calls_that_wait_for_each_other_share_the_time_limit(json, front):
+    """Without the module those who change parts of one document go one after the other."""
+    took, told = [], []
+
+    def note(begin, error):
+        took.append(time.monotonic() - begin)
+        told.append(error)
+
+    with EmbeddedServer(json=json) as own, reem.RedisInterface(own, timeout=0.5) as blocking:
+        async with reem_async.RedisInterface(own, timeout=0.5) as interface:
+            foo, here = reem_async.KeyValueStore(interface)["foo"], reem.KeyValueStore(blocking)["foo"]
+            await foo.write({})
+
+            async def write(number):
+                begin = time.monotonic()
+                try:
+                    if front == "tasks":
+                        await foo[f"n{number}"].write(number)
+                    else:
+                        await asyncio.to_thread(here[f"n{number}"].write, number)
+                except (ConnectionLost, NotConnected) as error:
+                    note(begin, error)
+
+            for _ in range(2):
+                await asyncio.gather(*map(write, range(6)))
+            assert not told
+            with stopped(own):
+                await asyncio.gather(*map(write, range(6)))
+            assert len(told) == 6
+            assert max(took) < 1.4, took
+            if not json:
+                assert sum(isinstance(error, ConnectionLost) for error in told) == 1, told
+            await foo["after"].write(1)

@@ -10,11 +10,11 @@ import secrets
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 from zlib import crc32
 
 from ..concurrency.timeouts import patience
-from ..errors import NoJsonSupport
+from ..errors import ConnectionLost, NoJsonSupport, NotConnected
 from ..plain.batches import Known, Steps, Watched, concerns, has_json
 from ..plain.changes import after_look
 from ..plain.translation import directly, finished, looked_at, shortcut, translated
@@ -79,6 +79,8 @@ class Text:
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
         self.known = Known()
+        # By turn: the last one whose holder lost the server.
+        self._lost: dict[str, _Lost] = {}
 
     def shortcut(self, commands: Sequence[Command]) -> list[Command] | None:
         """Return what to send for what programs do most, None for all else; `finished` makes the answers."""
@@ -129,12 +131,30 @@ class Text:
         self, turns: Sequence[str], lending: Lending, attempt: _Attempt, bulk: bool
     ) -> list[Reply] | None:
         if turns:
+            came = time.monotonic()
             async with lending.ordered(turns[0]):
-                return await self._in_turn(turns[1:], lending, attempt, bulk)
+                self._check_reached(turns[0], came)
+                try:
+                    return await self._in_turn(turns[1:], lending, attempt, bulk)
+                except (ConnectionLost, NotConnected) as error:
+                    self._lost[turns[0]] = _Lost(time.monotonic(), patience(self.timeout), error)
+                    raise
         async with lending.hold() as held:
             if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
                 return await held.roundtrip(attempt.given, bulk=bulk)
             return await attempt.made(held, bulk)
+
+    def _check_reached(self, turn: str, came: float) -> None:
+        """Raise NotConnected if the server was lost while a call waited for its turn, after as much time as it has.
+
+        Else each of those who wait would have a time limit of its own, one after the other.
+        """
+        lost = self._lost.get(turn)
+        if lost is not None and lost.time > came and lost.limit >= patience(self.timeout):
+            raise NotConnected(
+                "the call before this one lost the server, so nothing of this one was sent and nothing was applied: "
+                f"call again (of that one it was said: {lost.error})"
+            ) from lost.error
 
 
 class HeldText:
@@ -169,6 +189,20 @@ class HeldText:
     async def attempt(self, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool) -> list[Reply] | None:
         """Look at `keys` and change them where nothing is watched before; return None if somebody else was first."""
         return await _carried_out(self._held.roundtrip, after_look(commands, keys, self._known, error_of, None), bulk)
+
+
+class _Lost(NamedTuple):
+    """A call that lost the server.
+
+    Attributes:
+        time: When.
+        limit: Its time limit, in seconds.
+        error: What it raised.
+    """
+
+    time: float
+    limit: float
+    error: Exception
 
 
 class _Attempt:
