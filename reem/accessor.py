@@ -208,7 +208,9 @@ class Accessor(Handle):
         from .subscribe import Watch
 
         # What follows lives on the background loop: the connections of the caller's thread only ask and answer.
-        return Watch(self._interface, self._interface._followers, self._core.full_path, policy, stored=stored)
+        kind, writer = type(self._core), self._core._writer.maker()
+        followed = core.rebuilt(kind, writer, self._interface._followers.session, self._core.full_path)
+        return Watch(self._interface, followed.watch(policy, stored=stored))
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
         """Return a local copy of what is here that follows every change: `with kvs["arm"].mirror() as arm:`."""

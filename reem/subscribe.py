@@ -9,12 +9,10 @@ from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-import reem_async
 from reem_async.concurrency.aside import aside
-from reem_async.concurrency.queues import Ended, Newest, Policy
+from reem_async.concurrency.queues import EMPTY, Ended, Policy
 from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.errors import BadType, InterfaceClosed, QueueFull
-from reem_async.plan.paths import Path
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
@@ -55,29 +53,17 @@ class Watch(Following):
 
     Args:
         interface: The server.
-        followers: The interface's side on the background loop.
-        path: The path, top-level key first.
-        policy: What to keep for a loop that is slower than the updates.
-        stored: Yield what is only stored, too.
+        watch: The core's, which lives on the background loop.
     """
 
-    def __init__(
-        self,
-        interface: RedisInterface,
-        followers: reem_async.RedisInterface,
-        path: Path,
-        policy: Policy | None,
-        *,
-        stored: bool = True,
-    ) -> None:
+    def __init__(self, interface: RedisInterface, watch: core.Watch | PatternWatchCore) -> None:
         self._interface = interface
-        session = followers.session
-        self._core: Any = core.Watch(session, session.keys(path[0]), path[1:], policy or Newest(), stored=stored)
+        self._core = watch
 
     @property
     def dropped(self) -> int:
         """How many updates were skipped since they were not taken in time."""
-        return self._core.dropped  # type: ignore[no-any-return]
+        return self._core.dropped
 
     def listen(self) -> None:
         """Begin to follow."""
@@ -85,19 +71,24 @@ class Watch(Following):
 
     def close(self) -> None:
         """Stop following and end the loop."""
-        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
+        try:
             self._interface._wait(self._core.close())
+        except InterfaceClosed:  # the event loop that would do it has ended, or is too busy for that
+            aside(self._core.queue.close)
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> core.Update:
-        # A loop need not be told to begin; `listen` has no update missed that is published after it.
-        if not self._core._following:
-            self.listen()
+        # On the caller's thread: the loop puts updates into the queue and knows nothing of who takes them.
+        queue = self._core.queue
         try:
-            # On the caller's thread: the loop puts updates into the queue and knows nothing of who takes them.
-            return self._core.queue.take_waiting()  # type: ignore[no-any-return]
+            if (update := queue.take()) is EMPTY:
+                # A loop need not be told to begin; `listen` has no update missed that is published after it.
+                if not self._core._following:
+                    self.listen()
+                update = queue.take_waiting()
+            return update  # type: ignore[no-any-return]
         except Ended:
             raise StopIteration from None
 
@@ -120,10 +111,9 @@ class PatternWatch(Watch):
     def __init__(
         self, interface: RedisInterface, patterns: Sequence[str], policy: Policy | None, *, largest: int | None
     ) -> None:
-        self._interface = interface
-        session = interface._followers.session
-        self._core: Any = PatternWatchCore(session, patterns, policy, largest=largest)
-        self.patterns = self._core.patterns
+        watch = PatternWatchCore(interface._followers.session, patterns, policy, largest=largest)
+        super().__init__(interface, watch)
+        self.patterns = watch.patterns
 
 
 @documented_by(core.SilentSubscriber)
@@ -172,8 +162,7 @@ class SilentSubscriber(Following):
 
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an iterator over the updates."""
-        policy = policy or self._core.policy
-        return Watch(self.interface, self._core.interface, self._core.full_path, policy, stored=self.stored)
+        return Watch(self.interface, self._core.watch(policy))
 
     def __iter__(self) -> Watch:
         return self.watch()
