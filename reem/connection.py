@@ -108,7 +108,7 @@ class _Background:
     def _begun(self) -> tuple[Portal, reem_async.RedisInterface]:
         # After a fork it is the parent's: what was made from it goes on here, and ends with the rest.
         before = [*self._made.values()]
-        interface = before[0][1] if before else self._interface()
+        interface = before[0][1] if before else self._new_interface()
         portal = Portal("reem-loop")
         # One step of C, so of two threads that come here at once the second finds what the first has made.
         made = self._made.setdefault(os.getpid(), (portal, interface))
@@ -122,7 +122,7 @@ class _Background:
             raise
         return made
 
-    def _interface(self) -> reem_async.RedisInterface:
+    def _new_interface(self) -> reem_async.RedisInterface:
         host, ships, settings = self._direct._given
         interface = reem_async.RedisInterface(host, ships, **settings)
         # Both have one state: a user knows of one interface.

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import assert_no_orphans, assert_same, eventually, keys_of, nothing_sent
+from conftest import aeventually, assert_no_orphans, assert_same, eventually, keys_of, nothing_sent
 
 import reem
 import reem_async
@@ -235,6 +235,58 @@ async def test_an_async_subscriber_sees_ships_too(server_url, key):
         await space[key()]["at"].write(Pose(1.0, 1.0))
         update = await asyncio.wait_for(anext(updates), 10)
         assert (update.value, update.data) == (Pose(1.0, 1.0), {"at": Pose(1.0, 1.0)})
+
+
+class AskingShip(reem_async.SpecialDatatypeShip):
+    """Asks for something, which may have been cancelled."""
+
+    carries = bytes
+
+    def __init__(self):
+        self.asked, self.asks = None, False
+
+    async def check_fit(self, value):
+        return type(value) is bytes
+
+    async def get_label(self):
+        return "asking"
+
+    async def write(self, key, value, client):
+        client.set(key, value)
+
+    async def read(self, key, client):
+        client.get(key)
+
+    async def interpret_read(self, replies):
+        if self.asked is not None:
+            self.asks = True
+            await self.asked
+        return replies[0]
+
+
+async def test_a_ship_that_asks_for_what_was_cancelled_leaves_out_one_update(server_url, key, caplog):
+    """As with any other error of a ship, the next update is told; an end of its own is still one."""
+    ship = AskingShip()
+    async with reem_async.RedisInterface(server_url, ships=[ship]) as interface:
+        space = reem_async.PublishSpace(interface)
+        await space[key()].write({"x": b"1", "n": 0})
+        mirror = reem_async.SilentSubscriber(key(), interface)
+        await mirror.listen()
+        ship.asked = asyncio.get_running_loop().create_future()
+        ship.asked.cancel()
+        await space[key()].write({"x": b"2", "n": 1})
+        await aeventually(lambda: "an update could not be read and is skipped" in caplog.text)
+        assert "CancelledError" in caplog.text
+        ship.asked = None
+        await space[key()]["n"].write(2)
+        await aeventually(lambda: mirror.value() == {"x": b"2", "n": 2})
+        caplog.clear()
+        ship.asked, ship.asks = asyncio.get_running_loop().create_future(), False
+        await space[key()].write({"x": b"3", "n": 3})
+        await aeventually(lambda: ship.asks)
+        (task,) = [task for task in asyncio.all_tasks() if task.get_name() == f"reem ships {key()}"]
+    assert task.cancelled()
+    assert not caplog.text
 
 
 def npy(header, content=bytes(64), version=b"\x01\x00", length=None):

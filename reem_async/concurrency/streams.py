@@ -57,7 +57,7 @@ class Stream(Following, Generic[Item]):
 
     @property
     def _following(self) -> bool:
-        """Whether it follows, or did until it was closed."""
+        """Whether it follows, or did until it was closed; what began elsewhere does not (after a fork, say)."""
         raise NotImplementedError
 
     async def close(self) -> None:
@@ -73,8 +73,6 @@ class Stream(Following, Generic[Item]):
         return self
 
     async def __anext__(self) -> Item:
-        if not self._following:
-            await self.listen()
         while True:
             try:
                 item = self.queue.take()
@@ -82,22 +80,23 @@ class Stream(Following, Generic[Item]):
                 raise StopAsyncIteration from None
             if item is not EMPTY:
                 return item  # type: ignore[no-any-return]
-            await self._changed()
+            await (self._changed() if self._following else self.listen())
 
     async def _changed(self) -> None:
         """Wait until something was put into the queue."""
-        if self._waiter is not None:
+        if self._waiter is not None and not self._waiter.get_loop().is_closed():
             raise BadType("two tasks take updates from one subscription; make one for each")
-        self._waiter = asyncio.get_running_loop().create_future()
+        waiter = self._waiter = asyncio.get_running_loop().create_future()
         self.queue.wake = self._wake
         try:
-            await self._waiter
+            await waiter
         finally:
-            self._waiter = None
-            self.queue.wake = unheard  # a reference back would keep a stream that was dropped
+            if self._waiter is waiter:  # else it was left behind by an event loop that was closed
+                self._waiter = None
+                self.queue.wake = unheard  # a reference back would keep a stream that was dropped
 
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
+        if self._waiter is not None and not self._waiter.done() and not self._waiter.get_loop().is_closed():
             try:
                 self._waiter.set_result(None)
             except asyncio.InvalidStateError:  # Ctrl-C cancels between any two steps of Python

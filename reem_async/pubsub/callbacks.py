@@ -159,7 +159,7 @@ class Calls:
 
     def _go_on(self) -> None:
         """Have the calls made that are due, unless that is under way."""
-        if not self._busy:
+        if not self._busy and not self.loop.is_closed():
             self._busy = True
             self.loop.call_soon(self._call_waiting, context=self._context)
 

@@ -98,10 +98,11 @@ class Mirror(Following):
     def age(self) -> float:
         """Seconds for which the server may have had something else than the copy; infinite before `listen`.
 
-        While nothing changes it goes up to the time between two signs of life: a second, or a third of `max_age`.
+        So it is in a forked child, and once its event loop was closed, until `listen` is called there. While nothing
+        changes it goes up to the time between two signs of life: a second, or a third of `max_age`.
         """
         follower = self._link.follower
-        return math.inf if follower is None else follower.age()
+        return follower.age() if follower is not None and self._link.follows else math.inf
 
     def value(self) -> Any:
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call.
@@ -118,13 +119,20 @@ class Mirror(Following):
         follower = self._link.follower
         if follower is None:
             raise Stale(f"{self.channel}: this mirror does not follow yet; use it in a `with`, or call listen() first")
+        if not self._link.follows:
+            raise Stale(
+                f"{self.channel}: this mirror has followed in another process, or in an event loop that was closed; "
+                "call listen() here"
+            )
         return follower
 
     def _check(self) -> None:
         """Raise Stale if the copy must not be relied on."""
-        follower = self._check_begun()
         if self._link.closed:
             raise Stale(f"{self.channel}: this mirror is closed; make a new one")
+        if self._link.interface_closed:
+            raise Stale(f"{self.channel}: the RedisInterface of this mirror is closed; make new ones")
+        follower = self._check_begun()
         age = follower.age()
         # Before the age: it says more than that the copy is old.
         if follower.down:
@@ -142,7 +150,7 @@ class Mirror(Following):
         Raises:
             TimeoutError: It did not come true in time.
             Stale: The mirror does not follow yet.
-            InterfaceClosed: The mirror was closed.
+            InterfaceClosed: The mirror was closed, or the interface.
         """
         # Kept, to tell its end from a TimeoutError that the predicate raises.
         limit = asyncio.timeout(timeout)
@@ -160,6 +168,8 @@ class Mirror(Following):
         """Return whether the value is as wanted now; not where the copy must not be relied on."""
         if self._link.closed:
             raise InterfaceClosed(f"{self.channel}: this mirror was closed")
+        if self._link.interface_closed:
+            raise InterfaceClosed(f"{self.channel}: the RedisInterface of this mirror was closed")
         self._check_begun()
         # Before the copy is looked at: a change in between is then no reason to wait.
         seen = self._seen
@@ -190,7 +200,7 @@ class Mirror(Following):
     def _wake(self) -> None:
         self._seen += 1
         for waiter in self._waiting:
-            if not waiter.done():
+            if not waiter.done() and not waiter.get_loop().is_closed():
                 waiter.set_result(None)
 
     def __getitem__(self, key: str | int) -> MirrorAccessor:

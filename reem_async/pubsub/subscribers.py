@@ -26,7 +26,13 @@ __all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "U
 
 
 class Link:
-    """A follower and the manager it is at: made by the first `follow`, anew after a fork or in another loop."""
+    """A follower and the manager it is at: made by the first `follow`, anew after a fork or in another loop.
+
+    Attributes:
+        told: Called after each step that may have changed the copy.
+        closed: It was closed, and does not begin anew.
+        follower: Who follows, or has followed elsewhere; None before it has begun.
+    """
 
     def __init__(
         self,
@@ -52,6 +58,16 @@ class Link:
         self.closed = False
         self.follower: Follower | None = None
 
+    @property
+    def follows(self) -> bool:
+        """Whether it has begun, in this process and in an event loop that is not closed. Any thread may ask."""
+        return self.follower is not None and self._manager is not None and self._manager.is_here
+
+    @property
+    def interface_closed(self) -> bool:
+        """Whether the interface is closed, or is about to be. Any thread may ask."""
+        return self._session.closed
+
     async def follow(self) -> None:
         """Begin to follow, if it has not begun; several callers wait for the same beginning."""
         if self.closed:
@@ -59,7 +75,8 @@ class Link:
         manager = manager_of(self._session)
         if manager is not self._manager:
             # The manager of another loop, or of the process before a fork, has taken its followers with it.
-            self._manager, self.follower, self._following = manager, None, asyncio.Lock()
+            # The follower first: other threads ask for both.
+            self.follower, self._manager, self._following = None, manager, asyncio.Lock()
         assert self._following is not None
         # Two callers that begin at once share one follower.
         async with self._following:
@@ -87,7 +104,7 @@ class Link:
     async def unfollow(self) -> None:
         """Stop following, for good. Idempotent; also after the interface was closed."""
         self.closed = True
-        if self._manager is not None and self.follower is not None:
+        if self._manager is not None and self._manager.is_here and self.follower is not None:
             await self._manager.unfollow(self.follower)
 
 
@@ -122,7 +139,7 @@ class Watch(Stream[Update]):
 
     @property
     def _following(self) -> bool:
-        return self._link.follower is not None or self._closed
+        return self._link.follows or self._closed
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; two or three round trips."""
@@ -162,7 +179,8 @@ class SilentSubscriber(Following):
         self.policy = policy or Newest()
         self.stored = stored
         self._link = Link(self.interface.session, self._keys, self._path, [], stored=stored)
-        self._watches: weakref.WeakSet[Watch] = weakref.WeakSet()  # a loop that was left by `break` drops its own
+        # By identity, held weakly: a loop that was left by `break` drops its own. Any thread may add one meanwhile.
+        self._watches: weakref.WeakValueDictionary[int, Watch] = weakref.WeakValueDictionary()
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later publish is missed. Idempotent; two or three round trips.
@@ -175,8 +193,9 @@ class SilentSubscriber(Following):
 
     async def close(self) -> None:
         """Stop following; the value stays as it is. Idempotent."""
-        for watch in list(self._watches):
-            await watch.close()
+        for reference in self._watches.valuerefs():
+            if (watch := reference()) is not None:
+                await watch.close()
         await self._link.unfollow()
 
     def value(self) -> Any:
@@ -196,7 +215,7 @@ class SilentSubscriber(Following):
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an async iterator over the updates, beginning with the value that is there."""
         watch = Watch(self.interface.session, self._keys, self._path, policy or self.policy, stored=self.stored)
-        self._watches.add(watch)
+        self._watches[id(watch)] = watch
         return watch
 
     def __aiter__(self) -> Watch:
@@ -317,7 +336,7 @@ class CallbackSubscriber(SilentSubscriber):
         session = self.interface.session
         queue = Places(self.policy)
         self._updates = Watch(session, self._keys, self._path, self.policy, queue, stored=self.stored)
-        self._watches.add(self._updates)
+        self._watches[id(self._updates)] = self._updates
         self._link = self._updates._link  # one follower serves the calls and value()
         self._calls: Calls | None = None
 
@@ -325,7 +344,7 @@ class CallbackSubscriber(SilentSubscriber):
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
         manager = manager_of(self.interface.session)  # raises, before anything is changed, where this cannot be used
         if self._calls is not None and self._calls.loop is not asyncio.get_running_loop() and not self._link.closed:
-            self._watches.discard(self._updates)  # it ended with the other event loop
+            self._watches.pop(id(self._updates), None)  # it ended with the other event loop
             self._begin()
         await self._updates.listen()
         if self._calls is None:
