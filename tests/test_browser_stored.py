@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import time
@@ -285,3 +286,27 @@ async def test_nothing_is_kept_of_keys_that_are_gone(server_url, key, akvs):
         await aeventually(lambda: not kept())
         await akvs[names[0]].write({"n": 1})
         await seen(source, {"n": 1}, names[0])
+
+
+async def test_a_clock_that_is_set_back_costs_nothing_of_the_past(server_url, key, apspace, monkeypatch):
+    """For an hour there was no past, no plot and no rate, and each look took what was published for stored."""
+    real, back = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() - back[0])
+    name, published = key("n"), 0
+    async with past_of(server_url) as source:
+        for back[0] in (0.0, 3600.0, 7200.0):
+            for _ in range(8):
+                published += 1
+                await apspace[name].write(published)
+                await asyncio.sleep(0.05)
+        await aeventually(lambda: source.history.tree((name,), source.status().end) == published)
+        await asyncio.sleep(0.6)  # looks for what was stored besides are over
+        start, end = source.status()[:2]
+        assert 1.5 < end - start < 60
+        (line,) = (await source.series((name,), start, end)).lines
+        assert [value for value in line if value is not None] == list(range(1, published + 1))
+        assert source.history.rate(name, end) > 1
+        assert len(source.history.times((name,))) == published
+        assert (await source.nodes([(name,)], end - 0.3))[0].text == str(published)
+        back[0] = -3600.0  # as after a computer has slept
+        assert source.status().end == pytest.approx(time.time(), abs=1)

@@ -188,11 +188,11 @@ class Fetcher:
 
     def _note(self, path: Path, tree: Any) -> None:
         if path not in self._checks:
-            self._history.add_read(path, tree, time.time(), answer=True)
+            self._history.add_read(path, tree, self._history.clock.now(), answer=True)
         elif path not in self._owed:  # else its turn comes
             self._checks.discard(path)
-            if not identical(tree, self._history.tree(path, time.time())):
-                self._history.add_read(path, tree, time.time())
+            if not identical(tree, self._history.tree(path, self._history.clock.now())):
+                self._history.add_read(path, tree, self._history.clock.now())
 
     async def _read(self, path: Path, with_arrays: bool) -> tuple[Any, Reply]:
         """Return the document's part, with its arrays if it is their turn, and the note of what it includes."""

@@ -155,11 +155,12 @@ class Follower:
             self._forget(name)
         elif len(event.path) == 1 or name not in self._history.names:
             self._note_name(name)
+        when = self._history.clock.of(event.received)
         if event.value is ANNOUNCED:
-            self._fetcher.want(event.path, event.received)
+            self._fetcher.want(event.path, when)
         else:
             value = MISSING if event.deleted else event.value
-            self._history.add(event.path, value, event.size, event.received)
+            self._history.add(event.path, value, event.size, when)
 
     def _last_heard(self, name: str) -> Heard:
         return self._heard.get(name, Heard())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from bisect import bisect_right
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,6 +11,7 @@ from typing import Any
 
 from ...plan.paths import Path
 from ...plan.trees import MISSING
+from .clock import Clock
 from .frames import Frames
 from .source import rate_span
 from .timeline import PENDING, UNKNOWN, Change, Kept, Timeline
@@ -43,6 +43,7 @@ class History:
         budget: Bytes that all of it may take; the oldest goes first.
 
     Attributes:
+        clock: The time of all that is in it.
         start: From when on the past is known, in seconds since 1970.
         frames: The arrays that were read.
         dropped: How many changes had to go before their time.
@@ -51,7 +52,8 @@ class History:
     def __init__(self, seconds: float, budget: int) -> None:
         self.seconds = seconds
         self.budget = budget
-        self.start = time.time()
+        self.clock = Clock()
+        self.start = self.clock.now()
         self.frames = Frames(seconds)
         self.dropped = 0
         self._bytes = 0  # of all but the frames
@@ -224,7 +226,7 @@ class History:
         line = self._lines.get(name)
         if line is None:
             return None
-        span = rate_span(at, self.start, max(time.time(), at), over)
+        span = rate_span(at, self.start, max(self.clock.now(), at), over)
         if span is None:
             return None
         some = line.changes[line.upto(span[0]) : line.upto(span[1])]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -90,7 +89,7 @@ class LiveSource:
             notes.append(f"{self._follower.skipped} updates came too fast to be kept")
         if not self._follower.hears_of_changes:
             notes.append(_UNTOLD)
-        end = time.time()
+        end = self.history.clock.now()
         return Status(
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
         )
@@ -103,7 +102,7 @@ class LiveSource:
 
     async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
         """Return what is at each path: three round trips at most."""
-        when = time.time() if at is None else at
+        when = self.history.clock.now() if at is None else at
         # What has not changed since an instant is still there: it is asked of the server, and costs no memory here.
         now = [path for path in paths if at is None or self.history.unchanged(str(path[0]), at)]
         try:
@@ -291,7 +290,7 @@ class LiveSource:
         needle = text.lower()
         found: dict[Path, None] = {(name,): None for name in self._names(at) if needle in address((name,)).lower()}
         walked = 0
-        for name, tree in self.history.matching(_words(needle), time.time() if at is None else at):
+        for name, tree in self.history.matching(_words(needle), self.history.clock.now() if at is None else at):
             for path, _ in walk(tree, (name,)):
                 walked += 1
                 if len(found) >= most or walked > _WALKED:

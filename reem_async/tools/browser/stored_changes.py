@@ -257,7 +257,7 @@ class StoredChanges:
         """
         if not self._history.knows(name):
             self._history.begin(name, text if name in self._unseen else None)
-        has_arrays, when = text is not None and marked(text), time.time()
+        has_arrays, when = text is not None and marked(text), self._history.clock.now()
         # Not if it is not needed: most are what they were.
         tree = tree_of(text, name) if text is not None and (has_arrays or later) else MISSING
         changed = self._changed_in(name, self._arrays_in((name,), tree) if has_arrays else {})
