@@ -160,3 +160,18 @@ async def test_early_the_first_array_under_a_new_key_is_told_without_a_gap_to_as
     assert any(each.early for each in told)
     assert not any(each.gap for each in told)
     assert not any(each.missed for each in told)
+
+
+@pytest.mark.parametrize("index", [0, -1])
+async def test_what_counts_from_the_end_is_told_once_and_without_a_gap(index, server_url, key):
+    """Which item it is nobody knows before the server has the update: it is told then."""
+    async with parties(server_url, key("cam")) as (spaces, _, told, _):
+        await spaces[0][key("cam")].write({"frames": [0, 1]})
+        assert (await next_of(told)).data == {"frames": [0, 1]}
+        for number in range(4):
+            await spaces[0][key("cam")]["frames"][index].write(IMAGE + number)
+            update = await next_of(told)
+            assert (update.path, update.early, update.gap) == (f"{key('cam')}.frames[{index % 2}]", index == 0, False)
+            assert_same(update.data["frames"][index], IMAGE + number)
+        await spaces[0][key("cam")].write({})
+        assert (await next_of(told)).data == {}
