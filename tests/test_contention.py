@@ -128,15 +128,23 @@ def test_the_limit_of_one_call_is_its_own(server, raw, monkeypatch):
 
 
 @pytest.mark.parametrize("outage", ["raise", "newest"])
-async def test_an_update_that_others_are_always_faster_than_is_no_outage(server, raw, monkeypatch, outage):
+@pytest.mark.parametrize("index", [0, -1])
+async def test_an_update_that_others_are_always_faster_than_is_neither_outage_nor_gap(
+    server, raw, monkeypatch, outage, index
+):
     async with reem_async.RedisInterface(server, timeout=LIMIT) as interface:
         space = reem_async.PublishSpace(interface, outage=outage)
         await space["robot"].write(VALUE)
-        with overtaken(monkeypatch, touching(raw, server, "robot")), pytest.raises(reem.Conflict):
-            await space["robot"]["l"][-1].write(7)
-        assert (space.dropped, space.waiting) == (0, 0)
-        await space["robot"]["l"][-1].write(7)
-        assert (await reem_async.KeyValueStore(interface)["robot"].read())["l"] == [1, 7]
+        async with reem_async.SilentSubscriber("robot", interface) as subscriber:
+            told = subscriber.watch(reem_async.Every(100))
+            await anext(told)
+            if index < 0 or not server.json:
+                with overtaken(monkeypatch, touching(raw, server, "robot")), pytest.raises(reem.Conflict):
+                    await space["robot"]["l"][index].write(7)
+                assert (space.dropped, space.waiting) == (0, 0)
+            await space["robot"]["l"][index].write(8)
+            update = await anext(told)
+            assert (update.gap, update.data["l"][index]) == (False, 8)
 
 
 async def test_a_cluster_says_so_too(cluster, monkeypatch):

@@ -7,6 +7,7 @@ import operator
 
 import numpy as np
 import pytest
+from conftest import assert_same
 
 import reem_async
 from reem_async.concurrency.queues import Every
@@ -99,3 +100,27 @@ async def test_a_small_change_is_over_when_its_replies_are_read(apspace, akvs, k
     keys = space.interface.session.keys(key())
     replies = await space.interface.session.transport.roundtrip([("SMEMBERS", keys.registry)])
     assert list(replies[0]) == []
+
+
+@pytest.mark.parametrize("length", [2048, 2049, 5000])
+async def test_a_path_of_any_length_is_told_without_a_loss(apspace, akvs, binterface, key, length):
+    """Subscribers take no longer one than 2048 characters: what is deeper is told as a change of what is above it."""
+    name = "k" * (length - 1)
+    place = f"{key()}.a" if length > 2048 else f"{key()}.a.{name}"
+    await apspace[key()].write({"a": {}})
+    async with reem_async.SilentSubscriber(key(), binterface) as subscriber:
+        told = subscriber.watch(Every(100))
+        await anext(told)
+        a = apspace[key()]["a"]
+        for step in (
+            lambda: a[name].write(1),
+            lambda: a[name].increment(),
+            lambda: a[name].write(np.arange(20_000.0)),
+            lambda: a.update({name: 2}),
+            lambda: a[name].delete(),
+        ):
+            await step()
+            update = await anext(told)
+            assert (update.path, update.gap) == (place, False)
+            assert_same(update.data, await akvs[key()].read())
+    assert binterface.unreadable == 0

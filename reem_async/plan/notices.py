@@ -25,7 +25,7 @@ from .slots import Slot, named, starts
 
 __all__ = [
     "LARGEST_INLINE", "Notice", "View", "announce", "decode", "in_slot", "note_of", "parsed_note", "published",
-    "sizes_of_parts", "with_value",
+    "sizes_of_parts", "told_at", "with_value",
 ]  # fmt: skip
 
 VERSION = 1
@@ -101,6 +101,17 @@ def parsed_note(note: Any) -> tuple[str, int]:
     text = bytes(note).decode(errors="replace") if isinstance(note, bytes | bytearray) else ""
     publisher, _, sequence = text.partition(" ")
     return publisher, int(sequence) if sequence.isascii() and sequence.isdigit() and len(sequence) < 19 else 0
+
+
+def told_at(path: Path) -> Path:
+    """Return the place that a change is told at: `path` itself, or the deepest above it if that is too long."""
+    room = _LONGEST_PATH
+    for depth, key in enumerate(path):
+        if isinstance(key, str):
+            room -= len(key)
+            if room < 0:
+                return path[:depth]
+    return path
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:

@@ -9,13 +9,13 @@ from functools import partial
 from types import TracebackType
 from typing import Any, NoReturn
 
-from ..errors import ConnectionLost, NotConnected, WriteOnly
+from ..errors import ConnectionLost, Contended, NotConnected, WriteOnly
 from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import EncodedAttachment, Telling
 from ..plan.keys import Keys
-from ..plan.notices import announce, in_slot, published, sizes_of_parts, with_value
-from ..plan.paths import Path, show
+from ..plan.notices import announce, in_slot, published, sizes_of_parts, told_at, with_value
+from ..plan.paths import Path, counts_from_end, show
 from ..plan.slots import Slot
 from ..session import Session
 from .accessor import _NOTHING, Accessor
@@ -73,6 +73,8 @@ class _Turn:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if isinstance(error, Contended):
+            self.not_sent(len(self._tellings))
         # Before the next call's turn begins: it takes the numbers from where this one has left them.
         self.settle()
         await self._order.__aexit__(kind, error, trace)
@@ -145,7 +147,10 @@ class _Telling:
         # The reserved number; a further one where the replies say that what was told is to be told anew.
         it = self._notifier
         self._made = stamp = self._reserved.pop() if self._reserved else it.session.stamp(it.keys)
-        return published(it.keys, *stamp, payload(stamp, path), everywhere=self._everywhere)
+        place = told_at(path)
+        # Told as a change of the place above: what is there is looked at.
+        text = payload(stamp, path) if place is path else announce(*stamp, self._time or time.time(), place)
+        return published(it.keys, *stamp, text, everywhere=self._everywhere)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
         return announce(*stamp, self._time or time.time(), path, deleted=self._deleted)
@@ -170,7 +175,7 @@ class _Setting(_Telling):
         One round trip more for each early update, and else for one update a second.
         """
         sizes = sizes_of_parts(self._text, self._attachments)
-        if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments):
+        if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or told_at(path) is not path:
             return
         it, local = self._notifier, self._notifier.session.local
         if not local.host:
@@ -181,7 +186,8 @@ class _Setting(_Telling):
             return
         pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
         self._slot = local.put(it.keys, pieces, sizes)
-        if self._slot is not None and local.early:
+        # Which item an index from the end names is known once the server has the update: it is told then.
+        if self._slot is not None and local.early and not counts_from_end(path):
             await self._tell_near(self._payload(self._reserved[0], path))
 
     async def _tell_near(self, payload: bytes) -> None:
