@@ -26,7 +26,7 @@ import reem
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import app, period
-from reem_async.tools.snapshots import files, portable
+from reem_async.tools.snapshots import files, portable, rdb
 from reem_async.tools.snapshots.archive import ArchiveWriter, header
 from reem_async.tools.snapshots.values import Entry
 
@@ -267,24 +267,31 @@ def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     assert all(re.fullmatch(r"reem-auto-\d{8}T\d{6}Z(-\d+)?\.zip", name) for name in kept)
 
 
-def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(kvs, env, tmp_path, monkeypatch):
+@pytest.mark.parametrize("options", [(), ("--force",), ("--rdb",)], ids=["portable", "force", "rdb"])
+def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(
+    kvs, env, tmp_path, monkeypatch, options
+):
     """Which had begun in the same second: one of the two was lost, and both said that they had saved."""
     kvs["foo"] = 1
-    named, survey, given = files.new_name, portable.survey, []
+    named, survey, place, given = files.new_name, portable.survey, rdb._place, []
 
     def new_name(*words, **options):
         given.append(named(*words, **options))
         return given[-1]
 
-    async def meanwhile(*words):
-        if len(given) == 1:
-            given[0].write_text("another program's")
-        return await survey(*words)
+    def meanwhile(work):
+        async def done(*words):
+            if len(given) == 1:
+                given[0].write_text("another program's")
+            return await work(*words)
+
+        return done
 
     monkeypatch.setattr(files, "new_name", new_name)
-    monkeypatch.setattr(portable, "survey", meanwhile)
-    said, errors = snapshot("save", "-d", tmp_path, **env)
-    assert said.startswith(f"{given[1]}: 1 key")
+    monkeypatch.setattr(portable, "survey", meanwhile(survey))
+    monkeypatch.setattr(rdb, "_place", meanwhile(place))
+    said, errors = snapshot("save", "-d", tmp_path, *options, **env)
+    assert said.startswith(f"{given[1]}: ")
     assert errors == ""
     assert given[0].read_text() == "another program's"
     assert names(tmp_path) == sorted(path.name for path in given)

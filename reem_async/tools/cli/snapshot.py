@@ -135,7 +135,7 @@ class _Saver:
         self._match = match
         self._rdb = rdb
         self._keep = keep
-        self._overwrite = overwrite
+        self._overwrite = overwrite and file is not None  # what is named by time has a name that is free
         self._as_json = as_json
         self._made: list[Path] = []
         self._noted: set[str] = set()
