@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
@@ -198,6 +199,22 @@ def test_samples_for_some_time(key, kvs, reem, tmp_path):
     assert run.stdout.startswith("run.mcap: ")
     with open_log(tmp_path / "run.mcap") as log:
         assert set(log[key("a.joint")].history()[1].tolist()) == {1.5}
+
+
+def test_samples_that_are_late_or_fail_are_told(key, kvs, raw, reem, tmp_path):
+    """They were counted in the file alone; where all had failed it was said that nothing was there."""
+    kvs[key("a")] = 1
+    raw.lpush(key("list"), 1)  # no document: it cannot be read
+    (tmp_path / "both.csv").write_text(f"{key('a')}, 0.0001\n{key('list')}.x, 0.02\n")
+    (tmp_path / "bad.csv").write_text(f"{key('list')}.x, 0.02\n")
+    run = reem("record", "--sample", "both.csv", "--duration", "0.3")
+    assert re.search(r"0 skipped, [1-9]\d* samples late, [1-9]\d* samples failed$", run.stdout.strip()), run
+    said = re.search(r"missing +(.*)", reem("log", "info", "run.mcap").stdout)[1]
+    assert re.fullmatch(r"0 dropped, 0 skipped, 0 gaps, [1-9]\d* samples late, [1-9]\d* samples failed", said)
+    run = reem("record", "--sample", "bad.csv", "--duration", "0.3", "-o", "bad.mcap", "--json")
+    last = json.loads(run.stdout.splitlines()[-1])
+    assert (last["messages"], last["failed"] > 0, "late" in last) == (0, True, True)
+    assert f"none of the paths of the samples could be read: {last['failed']} readings failed" in run.stderr
 
 
 def test_what_cannot_be(key, reem, tmp_path):

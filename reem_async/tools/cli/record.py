@@ -103,7 +103,7 @@ def record(
             if begun:
                 _end(recorder, as_json)
                 if not recorder.status.messages:
-                    note(_nothing(wanted))
+                    note(_nothing(wanted, recorder.status.failed))
         return 0
 
     run("record", work, url, namespace)
@@ -169,9 +169,10 @@ def _begin(recorder: Recorder, duration: float | None, as_json: bool) -> None:
         note(f"recording into {recorder.path} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
 
 
-def _nothing(patterns: list[str]) -> str:
+def _nothing(patterns: list[str], failed: int) -> str:
     if not patterns:
-        return "warning: nothing was recorded: none of the paths of the samples was there"
+        why = f"could be read: {failed} readings failed, and all others found nothing" if failed else "was there"
+        return f"warning: nothing was recorded: none of the paths of the samples {why}"
     return (
         f"warning: nothing was recorded: nothing was published, and nothing is stored, under {', '.join(patterns)}; "
         "`reem ls` lists the keys, `reem top` what is published"
@@ -191,13 +192,31 @@ def _end(recorder: Recorder, as_json: bool) -> None:
 
 
 def _fields(status: RecorderStatus) -> dict[str, Any]:
-    names = ("seconds", "messages", "bytes", "file_bytes", "dropped", "skipped", "gaps", "lost", "rate")
+    names = (
+        "seconds",
+        "messages",
+        "bytes",
+        "file_bytes",
+        "dropped",
+        "skipped",
+        "gaps",
+        "lost",
+        "late",
+        "failed",
+        "rate",
+    )
     return {name: round(getattr(status, name), 3) for name in names}
 
 
 def _missing(status: RecorderStatus) -> str:
-    extra = [f"{count} {word}" for count, word in ((status.gaps, "gaps"), (status.lost, "not recordable")) if count]
-    return ", ".join([f"{status.dropped} dropped", f"{status.skipped} skipped", *extra])
+    extra = {
+        "gaps": status.gaps,
+        "not recordable": status.lost,
+        "samples late": status.late,
+        "samples failed": status.failed,
+    }
+    found = [f"{count} {word}" for word, count in extra.items() if count]
+    return ", ".join([f"{status.dropped} dropped", f"{status.skipped} skipped", *found])
 
 
 def _clock(seconds: float) -> str:

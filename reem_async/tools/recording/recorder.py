@@ -61,6 +61,8 @@ class RecorderStatus:
             fetched: what they wrote cannot be had any more.
         gaps: How often updates were lost on the way from the server.
         lost: Values that cannot be recorded: of custom types that are not made of bytes.
+        late: Readings of samples left out since the ones before took too long.
+        failed: Readings of samples that failed: what is there cannot be read, or the server did not answer.
         rate: Messages a second, on average.
     """
 
@@ -72,6 +74,8 @@ class RecorderStatus:
     skipped: int
     gaps: int
     lost: int
+    late: int
+    failed: int
     rate: float
 
 
@@ -278,6 +282,8 @@ class Recorder:
             counts.skipped,
             counts.gaps,
             counts.lost,
+            self._sampler.late,
+            self._sampler.failed,
             counts.messages / seconds if seconds else 0.0,
         )
 
