@@ -177,6 +177,19 @@ def test_strings_of_other_programs_are_left_alone(front, raw, text):
     raw.delete("mine")
 
 
+def test_what_has_taken_the_place_of_a_document_is_not_deleted(front, raw):
+    """Also right after a document was seen there."""
+    raw.delete("seen")
+    front.write(["seen"], {"a": 1})
+    front.write(["seen"], {"a": 2})
+    raw.delete("seen")
+    raw.rpush("seen", 1)
+    with pytest.raises(reem.WrongKind, match="list"):
+        front.delete(["seen"])
+    assert raw.lrange("seen", 0, -1) == [b"1"]
+    raw.delete("seen")
+
+
 def test_what_is_no_string_is_left_alone(front, raw):
     raw.delete("row")
     raw.rpush("row", 1)
@@ -493,6 +506,24 @@ def test_a_refused_transaction_says_why_at_its_command():
     with pytest.raises(StopIteration) as end:
         steps.send([b"OK", oom, b"QUEUED", aborted])
     assert end.value.value == [b"OK", oom, b"QUEUED", aborted]
+
+
+@pytest.mark.parametrize("asking", [True, False])
+def test_a_document_is_deleted_by_itself_where_there_is_no_memory_for_a_transaction(asking):
+    """Redis queues nothing then, but takes what makes room."""
+    ask = [("ASKING",)] if asking else []
+    steps = translated([*ask, ("JSON.DEL", "k", "$"), *ask, ("SMEMBERS", "{k}:ships")], Known(), error_of)
+    looked = [word for look in (("WATCH", b"k"), ("TYPE", b"k"), ("GETRANGE", b"k", "0", "0")) for word in (*ask, look)]
+    assert next(steps) == looked
+    replies = iter([b"OK", b"string", b" "])
+    sent = steps.send([b"OK" if word[0] == "ASKING" else next(replies) for word in looked])
+    assert sent == [*ask, ("MULTI",), ("UNLINK", b"k"), ("EXEC",), *ask, ("SMEMBERS", "{k}:ships")]
+    oom, aborted = error_of("OOM command not allowed"), error_of("EXECABORT Transaction discarded")
+    sent = steps.send([*([b"OK"] * (len(ask) + 1)), oom, aborted, *([b"OK"] * len(ask)), []])
+    assert sent == [*ask, ("UNLINK", b"k"), *ask, ("SMEMBERS", "{k}:ships")]
+    with pytest.raises(StopIteration) as end:
+        steps.send([word for reply in (1, []) for word in (*([b"OK"] * len(ask)), reply)])
+    assert [reply for reply in end.value.value if reply != b"OK"] == [1, []]
 
 
 def test_a_look_that_is_redirected_is_an_answer_of_the_node():

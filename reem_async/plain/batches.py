@@ -12,7 +12,8 @@ from .paths import Refusal
 
 __all__ = [
     "ASKING", "EXEC", "MULTI", "OTHER_TYPE", "UNWATCH", "Known", "MakeError", "Steps", "Watched", "asks", "body_of",
-    "concerns", "framed", "has_json", "is_json", "is_look", "is_whole", "key_of", "kind_told", "run", "text_told",
+    "concerns", "framed", "has_json", "is_json", "is_look", "is_whole", "key_of", "kind_told", "replaces", "run",
+    "text_told",
 ]  # fmt: skip
 
 MakeError = Callable[[str], Exception]
@@ -106,7 +107,12 @@ def key_of(command: Command) -> bytes:
 
 def is_whole(command: Command) -> bool:
     """Return whether it sets or deletes a document as a whole."""
-    return command[0] in ("JSON.SET", "JSON.DEL") and (len(command) < 3 or command[2] in ("$", "."))
+    return replaces(command) or (command[0] == "JSON.DEL" and (len(command) < 3 or command[2] in ("$", ".")))
+
+
+def replaces(command: Command) -> bool:
+    """Return whether it sets a document as a whole."""
+    return bool(command[0] == "JSON.SET" and command[2] in ("$", "."))
 
 
 def asks(commands: Sequence[Command]) -> bool:

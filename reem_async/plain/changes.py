@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..errors import PartialWrite
+from ..errors import PartialWrite, ServerFull
 from ..plan import Command, Reply
 from .batches import (
     ASKING,
@@ -58,6 +58,8 @@ def after_look(
     change = _Change(commands, look.documents(replies), error)
     sent = change.commands(watched is not None)
     outcome = (yield sent) if sent else []
+    if any(isinstance(reply, ServerFull) for reply in outcome) and change.only_deletes():
+        outcome = yield change.alone()
     # EXEC has ended the watch, whatever came of it.
     if watched is not None and sent:
         watched.clear()
@@ -158,6 +160,24 @@ class _Change:
             for place in self._others:
                 self._sent += asking
                 self._add(place)
+        return self._sent
+
+    def only_deletes(self) -> bool:
+        """Return whether it deletes documents, and else only looks, and is no transaction."""
+        return (
+            self._end > 0
+            and not self.is_whole
+            and not any(_is_there(self._documents[key]) for key in self._last.values())
+            and all(self._commands[place][0] == "SMEMBERS" for place in self._others)
+        )
+
+    def alone(self) -> list[Command]:
+        """Return what to send without a transaction: Redis without memory queues nothing, but does what makes room."""
+        self._sent, self._end = [], 0
+        asking = [ASKING] if asks(self._commands) else []
+        for place in sorted(self._places):
+            self._sent += asking
+            self._add(place)
         return self._sent
 
     def _add(self, place: int) -> None:

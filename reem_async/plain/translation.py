@@ -10,7 +10,8 @@ answered. Whoever owns a connection steps it. There are two ways:
         MULTI; SET foo ...; EXEC   the new text, and whatever else was in the batch; nil if somebody else was first
 
 A whole document is written directly only where it was seen, a moment ago, that a document is under the key: a SET would
-replace anything else, which the module refuses. That is the only thing here that is remembered; see `Known`.
+replace anything else, which the module refuses. That is the only thing here that is remembered; see `Known`. Before one
+is deleted, which is rare, there is always a look.
 """
 
 from __future__ import annotations
@@ -30,9 +31,9 @@ from .batches import (
     framed,
     is_json,
     is_look,
-    is_whole,
     key_of,
     kind_told,
+    replaces,
     run,
     text_told,
 )
@@ -75,7 +76,7 @@ def looked_at(commands: Sequence[Command], known: Known) -> list[bytes]:
     """Return the keys of documents that have to be looked at before commands are sent; none if they go directly."""
     # A change inside of a document needs its text, and a whole one needs to know what is under the key.
     for command in commands:
-        if command[0] in WRITES and not (is_whole(command) and key_of(command) in known):
+        if command[0] in WRITES and not (replaces(command) and key_of(command) in known):
             return list({key_of(each): None for each in commands if is_json(each)})
     return []
 
@@ -125,7 +126,7 @@ class _Sending:
             self.add(("GET", key))
 
     def write(self, command: Command) -> None:
-        """Send what sets or deletes a whole document."""
+        """Send what sets a whole document."""
         # A read behind it sees what it has written, so it cannot share the GET from before.
         self._read.pop(key_of(command), None)
         self.add(_whole(command))
@@ -170,14 +171,11 @@ def directly(commands: Sequence[Command], known: Known, error: MakeError, watche
 
 
 def _whole(command: Command) -> Command:
-    """Return what sets or deletes the string of a document."""
-    key = key_of(command)
-    if command[0] == "JSON.DEL":
-        return ("UNLINK", key)
+    """Return what sets the string of a document."""
     text = command[3]
     # A large text is not copied only to put one byte before it: the transport sends pieces as they are.
     marked = stored(text) if len(text) < LARGE or isinstance(text, str) else (MARK, text)
-    return ("SET", key, marked, "KEEPTTL", *command[4:])
+    return ("SET", key_of(command), marked, "KEEPTTL", *command[4:])
 
 
 class _Answers:
@@ -197,8 +195,6 @@ class _Answers:
         if command[0] in READS and len(command) > 1:
             document = self._document(place)
             return document if isinstance(document, Exception) else run(document, command, self._error)
-        if command[0] == "JSON.DEL" and not isinstance(reply, Exception):
-            self._known.saw(key_of(command), False)
         if command[0] == "TYPE" and is_look(command) and reply == b"string":
             return kind_told(self._replies[place + (2 if self._asking else 1)])
         return reply
