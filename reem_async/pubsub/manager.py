@@ -410,15 +410,11 @@ class SubscriptionManager:
         if self.place != (os.getpid(), asyncio.get_running_loop()):
             return  # its connections are the parent's, or went with their event loop
         # First, since a task may be slow to end: loops over what is followed do not wait for it.
-        await self._unfollow_all()
+        for listener in self._everybody():
+            await self.unfollow(listener)
         await self.tasks.end()
         for wire in list(self._wires.values()):
             await wire.close()
-        await self._unfollow_all()  # who came meanwhile
-
-    async def _unfollow_all(self) -> None:
-        for listener in self._everybody():
-            await self.unfollow(listener)
 
     def end_loops(self) -> None:
         """End the loops of threads over what is followed, though the event loop may be busy. Any thread may."""
