@@ -237,6 +237,28 @@ def test_an_outage_ends_for_several_keys_that_are_published_all_the_time(publish
         assert caplog.text.count("until the server is back") == 1
 
 
+async def test_what_is_kept_has_the_time_of_its_call(server):
+    """And not that at which the server, or the call before it, was given up."""
+    async with (
+        reem_async.RedisInterface(server.url, timeout=0.5) as interface,
+        reem_async.RedisInterface(server.url, timeout=PATIENCE) as other,
+        reem_async.SilentSubscriber("arm", other) as subscriber,
+    ):
+        told, arm = subscriber.watch(Every(100)), reem_async.PublishSpace(interface, outage="newest")["arm"]
+        await reem_async.KeyValueStore(other)["arm"].write({})
+        await anext(told)
+        os.kill(server.pid, signal.SIGSTOP)
+        try:
+            called = time.time()
+            await asyncio.gather(arm["a"].write(1), arm["b"].write(2))  # the second waits for the first, which is lost
+            assert time.time() - called > 0.4
+        finally:
+            os.kill(server.pid, signal.SIGCONT)
+        while (update := await asyncio.wait_for(anext(told), PATIENCE)).path != "arm.b":
+            assert update.path == "arm.a"
+        assert abs(update.time - called) < 0.2
+
+
 def test_what_depends_on_what_is_there_raises_and_comes_behind_what_is_kept(publisher, server, reader):
     front = publisher("newest")
     front.write(["l"], [1])

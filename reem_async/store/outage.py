@@ -146,8 +146,9 @@ class Outage:
 
     async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
         """Send the updates of one call; in an outage do as the policy says."""
+        called = time.time()  # before it waits for its turn, and for a server that does not answer
         try:
-            await writer.in_turn(self._put, writer, assignments)
+            await writer.in_turn(self._put, writer, assignments, called)
         except _AWAY as error:
             if isinstance(error, TlsRefused):
                 raise
@@ -156,16 +157,16 @@ class Outage:
         """Send what depends on what is there, behind what is kept; raises in an outage."""
         return await writer.in_turn(self._demand, writer, send, what)
 
-    async def _put(self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
+    async def _put(self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
         if self._is_out(writer.keys):
-            self._take(writer, assignments)
+            self._take(writer, assignments, called)
             self._have_asked()
             return
         try:
             await writer.send(turn, assignments)
         except _AWAY as error:
             if not isinstance(error, TlsRefused):
-                self._begin(turn, writer, assignments, error)
+                self._begin(turn, writer, assignments, called, error)
             raise
 
     async def _demand(
@@ -183,7 +184,9 @@ class Outage:
         # Once it answers, a key whose turn has come stays within reach while others wait for theirs.
         return keys.document in self._out or (self._away and not self._session.transport.sharded)
 
-    def _begin(self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], error: ReemError) -> None:
+    def _begin(
+        self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float, error: ReemError
+    ) -> None:
         """Note that a key is out of reach, and do with the updates that met this as the policy says."""
         if not self._out:
             self._told = self.dropped
@@ -195,22 +198,21 @@ class Outage:
             self._count(writer.keys, len(assignments))
         else:
             turn.not_sent(len(assignments))
-            self._take(writer, assignments)
+            self._take(writer, assignments, called)
         self._have_asked()
 
-    def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
+    def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
         """Drop updates, or keep them in place of older ones."""
         out = self._out.setdefault(writer.keys.document, _Out(writer))
         if self.policy == "drop":
             self._drop(writer.keys, len(assignments))
             return
-        now = time.time()
         for it in assignments:
             replaced = [place for place in out.kept if below(place, it.path)]
             for place in replaced:
                 out.pop(place)
             own = _owned(it)
-            out.put(_Kept(own, _size(own), now))
+            out.put(_Kept(own, _size(own), called))
             self._drop(writer.keys, len(replaced))
         while out.kept and sum([each.size for each in list(self._out.values())]) > _MOST:
             out.pop(next(iter(out.kept)))
