@@ -206,10 +206,10 @@ async def test_the_rdb_file_of_a_server_elsewhere(tmp_path):
     source = tmp_path / "dump.rdb"
     rdb._check_readable(source)  # the server will make it
     with pytest.raises(RdbUnavailable, match="another server's"):
-        await rdb._copy(source, None, tmp_path / "b.rdb")
+        await rdb._copy(source, None, tmp_path / "b.rdb", overwrite=False)
     source.write_bytes(b"REDIS0011 of another server")
     with pytest.raises(RdbUnavailable, match="another server's"):
-        await rdb._copy(source, rdb._identity(source), tmp_path / "b.rdb")
+        await rdb._copy(source, rdb._identity(source), tmp_path / "b.rdb", overwrite=False)
     assert left_in(tmp_path) == ["dump.rdb"]
 
 
