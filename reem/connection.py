@@ -6,7 +6,6 @@ import os
 import sys
 import weakref
 from collections.abc import Callable, Coroutine, Sequence
-from functools import partial
 from importlib import import_module
 from threading import current_thread, get_ident, main_thread
 from types import TracebackType
@@ -65,21 +64,9 @@ class _OnThread(reem_async.RedisInterface):
 class _States(States):
     """The states of an interface whose main thread may be interrupted anywhere: all that takes the lock is aside."""
 
-    def changes(self) -> StateChanges:
-        """Return an iterator over the state and its changes."""
-        return aside(super().changes)
-
-    def opened(self, address: str, server: str | None) -> None:
-        """Note a new connection."""
-        aside(partial(super().opened, address, server))
-
-    def lost(self, reason: Exception) -> bool:
-        """Note that a connection broke."""
-        return aside(partial(super().lost, reason))
-
-    def closed(self) -> None:
-        """Note the end, which ends all iterators."""
-        aside(super().closed)
+    def apart(self, step: Callable[[], Result]) -> Result:
+        """Take a step that takes the lock."""
+        return aside(step)
 
 
 class _Background:

@@ -10,14 +10,14 @@ from typing import Any, Literal, Self
 from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
-from .transport import Transport
+from .transport.addresses import NewTransport, ToOneServer
 from .transport.options import Options
 from .transport.state import State, StateChange, StateChanges
 
 __all__ = ["RedisInterface"]
 
 
-def _on_event_loop(options: Options) -> Transport:
+def _on_event_loop(options: Options) -> ToOneServer:
     """Return a transport for event loops; imported here, so that blocking programs start without it."""
     from .transport.aio import AsyncTransport
 
@@ -67,7 +67,7 @@ class RedisInterface:
         BadType, BadValue: An option or URL that means nothing.
     """
 
-    _new_transport: Callable[[Options], Transport] = staticmethod(_on_event_loop)
+    _new_transport: NewTransport = staticmethod(_on_event_loop)
 
     def __init__(
         self,
@@ -180,9 +180,11 @@ class RedisInterface:
 
     async def close(self) -> None:
         """End all subscriptions and close all connections. Idempotent."""
-        await self.session.close()
-        if self._client is not None:
-            await self._close_client()
+        try:
+            await self.session.close()
+        finally:
+            if self._client is not None:
+                await self._close_client()
 
     async def _close_client(self) -> None:
         await self._client.aclose()

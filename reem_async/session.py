@@ -261,20 +261,27 @@ class Session:
     async def release(self) -> None:
         """End all subscriptions and close all connections of this event loop; another one may go on."""
         subscriptions, self.subscriptions = self.subscriptions, None
-        if subscriptions is not None:
-            await subscriptions.close()
-        await self.tasks.end()
-        # `readers` may be the way to replicas, which closes the one to the primary with it.
-        await self.readers.release()
+        # The last comes first, and each is taken, also if one is cancelled.
+        async with contextlib.AsyncExitStack() as steps:
+            # `readers` may be the way to replicas, which closes the one to the primary with it.
+            steps.push_async_callback(self.readers.release)
+            steps.push_async_callback(self.tasks.end)
+            if subscriptions is not None:
+                steps.push_async_callback(subscriptions.close)
 
     async def close(self) -> None:
         """End all subscriptions and close all connections."""
         self.closed = True
-        if self.subscriptions is not None:
-            await self.subscriptions.close()
-        # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has kept.
-        await self.readers.close()
+        async with contextlib.AsyncExitStack() as steps:  # as above
+            steps.callback(self.local.close)
+            steps.push_async_callback(self.tasks.end)
+            steps.callback(self._tell_of_end)
+            # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has
+            # kept.
+            steps.push_async_callback(self.readers.close)
+            if self.subscriptions is not None:
+                steps.push_async_callback(self.subscriptions.close)
+
+    def _tell_of_end(self) -> None:
         for each in list(self.closing):
             each.close()
-        await self.tasks.end()
-        self.local.close()

@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 from urllib.parse import urlsplit, urlunsplit
 
 from ..errors import BadValue
 from . import Transport
 from .options import Options
 
-__all__ = ["NewTransport", "address_of", "listed"]
+__all__ = ["NewTransport", "ToOneServer", "address_of", "listed"]
 
-NewTransport = Callable[[Options], Transport]
+
+class ToOneServer(Transport, Protocol):
+    """The transport to one server."""
+
+    def retire(self) -> bool:
+        """Close the connections on which nothing is due, since no new calls will come; return whether all are closed.
+
+        To be called again if not. One that is given back, in a blocking program, is closed then.
+        """
+        ...
+
+
+NewTransport = Callable[[Options], ToOneServer]
 """Makes the transport to one server: on an event loop, or for plain threads."""
 
 

@@ -21,7 +21,7 @@ from .identity import WHO, who
 from .options import Options, ShorterWay
 from .state import States
 from .text import HeldText, Text
-from .wire import BUFFER, Wire, open_wire
+from .wire import BUFFER, Wire, close_all, first_answer, open_wire
 
 __all__ = ["AsyncTransport"]
 
@@ -152,6 +152,13 @@ class AsyncTransport:
         large: bool = False,
     ) -> Wire:
         """Return a new connection, unless the interface was closed while it was made."""
+        has_answered = False
+
+        def answered(replies: list[Reply] | Exception) -> None:
+            nonlocal has_answered
+            if isinstance(replies, list):
+                has_answered = True
+                self.states.opened(self._options.address, who(replies))
 
         def gone(wire: Wire, reason: Exception) -> None:
             self._open.discard(wire)
@@ -159,7 +166,7 @@ class AsyncTransport:
                 self.states.lost(reason)
                 on_lost(wire, reason)
             elif not isinstance(reason, InterfaceClosed):
-                self._missed(reason)
+                self._missed(reason, anew=has_answered)
 
         nearby = self._options.nearby
         wire = await (open_wire(self._options, large=large) if nearby is None else self._nearest(nearby, large))
@@ -169,15 +176,18 @@ class AsyncTransport:
             self.check()
         self._open.add(wire)
         wire.on_push, wire.on_lost = on_push, gone
-        wire.send([WHO], lambda replies: self.states.opened(self._options.address, who(replies)))
+        wire.send([WHO], answered)
         return wire
 
-    def _missed(self, reason: Exception) -> None:
-        """Find out whether the server is gone with a connection for calls: nobody may call for a long time."""
+    def _missed(self, reason: Exception, *, anew: bool) -> None:
+        """Find out whether the server is gone with a connection for calls: nobody may call for a long time.
+
+        `anew`: then try to connect, once. What hangs up on whom it has greeted would be connected to without end.
+        """
         for other in list(self._open):  # one that does not answer in time breaks as well; the last one tells
             if not other.busy:  # else what it owes already tells, and sooner: whoever asks last would be waited for
                 other.send([_PING], lambda _: None)
-        if not self._open and self.states.lost(reason):
+        if not self._open and self.states.lost(reason) and anew:
             self._tasks.start(self._made_anew(), "reem connect")
 
     async def _made_anew(self) -> None:
@@ -190,9 +200,9 @@ class AsyncTransport:
         if through is not None:
             return through
         wire = await open_wire(self._options, large=large)
+        # Only the server itself says where its socket is, so the first connection always goes to the address.
+        nearby.learn(await first_answer(wire, WHO, self._options.address))
         try:
-            # Only the server itself says where its socket is, so the first connection always goes to the address.
-            nearby.learn(await wire.roundtrip([WHO]))
             through = await self._through(nearby, large)
         except BaseException:
             await wire.close()
@@ -353,17 +363,26 @@ class AsyncTransport:
         self.states.closed()
         farewell, self._farewell = self._farewell, None
         if self._loop is asyncio.get_running_loop():
-            await self.release()
-            if farewell is not None:
-                await farewell.aclose()
+            try:
+                await self.release()
+            finally:
+                if farewell is not None:
+                    await farewell.aclose()
         self._forget()
+
+    def retire(self) -> bool:
+        """Close the connections on which nothing is due; return whether none is left."""
+        if self._loop is asyncio.get_running_loop():
+            for wire in (*self._lanes.values(), *self._spare):
+                if not wire.busy:
+                    wire.abort(InterfaceClosed("the server is not used any more"))
+        return not self._opening and not any(wire.alive for wire in self._open)
 
     async def release(self) -> None:
         """Close the connections of this event loop; another one may go on with this transport."""
         wires = [*self._lanes.values(), *self._spare, *self._leaving]
         self._forget()
-        for wire in wires:
-            await wire.close()
+        await close_all(wires)
 
 
 class _Lent:

@@ -10,10 +10,10 @@ import collections
 import os
 import select
 import socket
-import struct
 import time
+import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from functools import partial
 
 import redis.exceptions
@@ -25,7 +25,7 @@ from ..concurrency.timeouts import LOOKS, moved_last, patience, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from . import Held
-from .identity import WHO, who
+from .identity import WHO, unanswered, who
 from .options import Options, ShorterWay
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
@@ -45,10 +45,15 @@ _NAP, _NAPS = 2e-5, 16
 
 
 class _Line:
-    """One blocking connection, used by one caller at a time."""
+    """One blocking connection, used by one caller at a time.
 
-    def __init__(self, options: Options, states: States, under_way: set[_Line]) -> None:
-        self._states, self._under_way = states, under_way
+    Attributes:
+        broken: It is not to be used again; so it is while a call is under way.
+        waiting: A call is under way that has nothing large to send.
+    """
+
+    def __init__(self, options: Options, states: States, lines: list[weakref.ref[_Line]]) -> None:
+        self._states, self._lines = states, lines
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
@@ -57,6 +62,8 @@ class _Line:
             raise options.refused(error) from error
         self._socket: socket.socket = self._connection._sock
         self._tls = hasattr(self._socket, "context")
+        # Python asks whether a socket with a time limit is ready before it sends, too. This one knows of no limit.
+        self._out = self._socket if self._tls else socket.socket(fileno=os.dup(self._socket.fileno()))
         self._timeout = options.timeout
         self._limit = 0.0
         self._moved = 0.0  # when a byte of a large value, or of the reply to it, was last seen to move
@@ -68,23 +75,20 @@ class _Line:
         self._small = SmallReader(options.largest)
         self._largest = options.largest
         self._large: LargeReader | None = None
-        self.broken = False
+        self.broken = self.waiting = False
         known = lists_json(self._connection.handshake_metadata)
-        self.introduction, *probed = self.exchange([WHO] if known else [WHO, PROBE])
+        try:
+            self.introduction, *probed = self.exchange([WHO] if known else [WHO, PROBE])
+        except ConnectionLost as error:
+            raise unanswered(options.address, error) from error
         self.plain = bool(probed) and is_plain(probed[0])
-        self._states.opened(options.address, who([self.introduction]))
+        self._states.opened(options.address, who([self.introduction]), tell=False)
+        lines.append(weakref.ref(self, lines.remove))
 
     def _set_limit(self, limit: float) -> None:
-        """Let the kernel watch the time: with Python's own timeouts every read would cost two calls."""
+        """Have Python watch the time: the kernel's own limits begin anew after each signal."""
         self._limit = limit
-        if self._tls:  # its reads need Python's timeout
-            self._socket.settimeout(limit)
-            return
-        self._socket.settimeout(None)
-        whole, part = divmod(limit, 1)
-        packed = struct.pack("ll", int(whole), max(int(part * 1e6), 0 if whole else 1))
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, packed)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, packed)
+        self._socket.settimeout(limit)
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` and read their replies, all on this thread."""
@@ -97,17 +101,23 @@ class _Line:
         limit = patience(self._timeout)
         try:
             receive = self._socket.recv_into
-            if len(pieces) == 1 and len(pieces[0]) < SLOW:
+            if len(pieces) == 1 and len(piece := pieces[0]) < SLOW:
+                self.waiting = True
                 if limit != self._limit:
                     self._set_limit(limit)
-                self._socket.sendall(pieces[0])
+                try:
+                    sent = self._out.send(piece)
+                except BlockingIOError:
+                    sent = 0
+                if sent < len(piece):
+                    self._socket.sendall(memoryview(piece)[sent:])
             else:
                 self._send_large(pieces, limit)
                 receive = partial(self._receive_patiently, limit)
             if bulk and self._large is None:
                 self._large = LargeReader(self._largest)
             replies = self._replies((bulk and self._large) or self._small, len(commands), receive)
-            self.broken = False
+            self.broken = self.waiting = False
             return replies
         except (BlockingIOError, TimeoutError):
             raise self.lost(
@@ -150,7 +160,6 @@ class _Line:
         if limit / LOOKS != self._limit:
             self._set_limit(limit / LOOKS)
         self._moved, self._left = time.monotonic(), 0
-        self._under_way.discard(self)
         step, naps = _RECORD if self._tls else _SLICE, _NAPS  # over TLS, nothing is said of a part that was sent
         for piece in pieces:
             view, sent = memoryview(piece), 0
@@ -161,10 +170,14 @@ class _Line:
                 except (BlockingIOError, TimeoutError):
                     self._check_moved(limit)
                 give_way()
-                while naps and self._under_way:
+                while naps and self._others_wait():
                     step = min(step, _SMALL_SLICE)
                     naps -= 1
                     time.sleep(_NAP)
+
+    def _others_wait(self) -> bool:
+        """Return whether small calls of other threads are under way."""
+        return any(line.waiting for each in tuple(self._lines) if (line := each()) is not None)
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""
@@ -204,8 +217,13 @@ class _Line:
 
     def close(self) -> None:
         """Close the connection."""
-        self.broken = True
+        self.broken, self.waiting = True, False
+        self._out.close()
         self._connection.disconnect()
+
+    def __del__(self) -> None:  # an interrupted call may have kept it from being given back
+        if hasattr(self, "_out"):
+            self._out.close()
 
 
 class BlockingTransport:
@@ -221,12 +239,11 @@ class BlockingTransport:
 
     def __init__(self, options: Options) -> None:
         self._options = options
-        self._idle: collections.deque[_Line] = collections.deque()
-        self._under_way: set[_Line] = set()  # lines of calls that have nothing large to send
-        self._pid = os.getpid()
         self._closed = False
-        self._orders = Locks(ThreadLock)
+        self._keeps = True  # connections, for the next call
         self._text = Text(options.timeout)
+        self._begin()
+        _all.append(weakref.ref(self, _all.remove))
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
 
@@ -235,17 +252,15 @@ class BlockingTransport:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
 
-    def _forked(self) -> None:
-        # The sockets and locks are the parent's: use new ones. (redis-py closes only the child's
-        # descriptors, without a word to the server.)
-        self._idle, self._orders, self._pid = collections.deque(), Locks(ThreadLock), os.getpid()
-        self._under_way = set()
+    def _begin(self) -> None:
+        """Begin without connections and locks; in a forked child too, since those it has are its parent's."""
+        self._idle: collections.deque[_Line] = collections.deque()
+        self._lines: list[weakref.ref[_Line]] = []  # all there are, also those in use; leaving a list is one step
+        self._orders = Locks(ThreadLock)
 
     def _take(self) -> _Line:
         if self._closed:
             self.check()
-        if self._pid != os.getpid():
-            self._forked()
         stale: _Line | None = None
         while True:
             try:
@@ -253,7 +268,9 @@ class BlockingTransport:
             except IndexError:
                 if stale is not None:  # there was none left
                     stale.lost("the server closed an idle connection")
-                return aside(self._opened)
+                line = aside(self._opened)
+                self.states.tell()  # here: what is called back may need a lock that this thread has
+                return line
             if line.fresh():
                 return line
             line.close()
@@ -263,11 +280,11 @@ class BlockingTransport:
         """Return a new connection: through the server's socket, if that is looked for and found."""
         nearby = self._options.nearby
         if nearby is None:
-            return _Line(self._options, self.states, self._under_way)
+            return _Line(self._options, self.states, self._lines)
         through = self._through(nearby)
         if through is not None:
             return through
-        line = _Line(self._options, self.states, self._under_way)
+        line = _Line(self._options, self.states, self._lines)
         nearby.learn([line.introduction])
         try:
             through = self._through(nearby)
@@ -284,25 +301,29 @@ class BlockingTransport:
         if way is None:
             return None
         try:
-            return _Line(way, self.states, self._under_way)
+            return _Line(way, self.states, self._lines)
         except ReemError as error:
             nearby.give_up(way, error)
             return None
 
     def _give(self, line: _Line) -> None:
-        self._under_way.discard(line)
-        if line.broken or self._closed:
+        if line.broken:
             line.close()
-            while self._idle:  # likely of the same fate; a new one says how things are
-                self._idle.pop().close()
+            self._close_idle()  # likely of the same fate; a new one says how things are
             return
         self._idle.append(line)
+        if not self._keeps:  # asked behind it: another thread closes what it finds
+            self._close_idle()
+
+    def _close_idle(self) -> None:
+        with suppress(IndexError):  # other threads take, and close, too
+            while True:
+                self._idle.pop().close()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` on a free connection and return their replies."""
         line = self._take()
         try:
-            self._under_way.add(line)
             if not line.plain:
                 return line.exchange(commands, bulk)
             sent = self._text.shortcut(commands)
@@ -317,7 +338,6 @@ class BlockingTransport:
         """Lend a connection; it is broken if the caller leaves with an error."""
         line = self._take()
         try:
-            self._under_way.add(line)
             yield HeldText(line, self._text) if line.plain else line
         except BaseException:
             line.close()
@@ -360,8 +380,6 @@ class BlockingTransport:
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return the lock of `key`."""
-        if self._pid != os.getpid():
-            self._forked()
         return self._orders.of(key)
 
     def broken_off(self) -> None:
@@ -372,13 +390,18 @@ class BlockingTransport:
     async def close(self) -> None:
         """Close all connections that are not in use; the others are closed when given back."""
         self._closed = True
+        self.retire()
         self.states.closed()
-        await self.release()
+
+    def retire(self) -> bool:
+        """Close all connections that are not in use, and the others when they are given back."""
+        self._keeps = False
+        self._close_idle()
+        return True
 
     async def release(self) -> None:
         """Close all connections that are not in use; new ones are made when needed."""
-        while self._idle:
-            self._idle.pop().close()
+        self._close_idle()
 
 
 class _Mine:
@@ -399,3 +422,17 @@ class _Mine:
     async def __aexit__(self, kind: object, *_: object) -> None:
         if kind is not None:
             self._line.close()
+
+
+_all: list[weakref.ref[BlockingTransport]] = []
+
+
+def _begin_all() -> None:
+    # redis-py closes only the child's descriptors of the parent's connections, without a word to the server.
+    for reference in tuple(_all):
+        if (transport := reference()) is not None:
+            transport._begin()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_begin_all)

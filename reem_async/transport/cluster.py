@@ -100,6 +100,8 @@ class ClusterTransport(Rooted):
         # Nodes that a connection was lost to, and that nobody has reached since.
         self._gone: set[Address] = set()
         self._looked = 0.0
+        # When a look was in vain last, and why.
+        self._vain: tuple[float, Exception] | None = None
         self.states = States()
         # Any node will do: it lends its locks and its event loop, and lives as long as this.
         self._root = self._node(options.seeds[0])
@@ -207,6 +209,8 @@ class ClusterTransport(Rooted):
     async def look(self, suspects: Collection[Address] = ()) -> None:
         """Ask a node who has which slots, unless that was just done; the `suspects` only if no other answers.
 
+        Two nodes are asked in any case, more only within the call's time limit: the next look begins with the others.
+
         Raises:
             NotConnected: No node answers.
             redis.exceptions.RedisError: It is no cluster, or this user may not ask.
@@ -214,27 +218,40 @@ class ClusterTransport(Rooted):
         self.check()
         asked = time.monotonic()
         async with self._root.ordered("the layout of the cluster"):
-            # Another caller has looked while this one waited for the lock.
+            # Another caller has looked while this one waited for the lock, perhaps in vain.
             if self._looked > asked - _LOOK_PAUSE:
                 return
-            known = {*self._primaries, *self._nodes, *self._options.seeds}
-            reason: Exception | None = None
-            order = {each: (each in suspects, self._failed.get(each, 0.0), random.random()) for each in known}  # noqa: S311
-            for address in sorted(known, key=order.__getitem__):
-                try:
-                    (reply,) = await self._node(address).roundtrip([("CLUSTER", "SLOTS")])
-                except (NotConnected, ConnectionLost) as error:
-                    self._failed[address], reason = time.monotonic(), error
-                    continue
-                if isinstance(reply, Exception):
-                    raise self._no_layout(address, reply)
-                self._failed.pop(address, None)
-                self._learn(reply, address[0])
-                self._looked = time.monotonic()
-                return
+            if self._vain is None or self._vain[0] < asked:
+                reason = await self._ask_nodes(suspects)
+                if reason is None:
+                    return
+                self._vain = time.monotonic(), reason
+            reason = self._vain[1]
         # A certificate that is not trusted needs somebody to act, and no waiting mends it.
         kind = TlsRefused if isinstance(reason, TlsRefused) else NotConnected
         raise kind(f"no node of the cluster answers; the last one tried: {reason}") from reason
+
+    async def _ask_nodes(self, suspects: Collection[Address]) -> Exception | None:
+        """Ask one node after the other until one tells the layout; return None, or why the last one did not."""
+        known = {*self._primaries, *self._nodes, *self._options.seeds}
+        order = {each: (each in suspects, self._failed.get(each, 0.0), random.random()) for each in known}  # noqa: S311
+        deadline = time.monotonic() + self.timeout
+        reason: Exception | None = None
+        for number, address in enumerate(sorted(known, key=order.__getitem__)):
+            if number >= 2 and time.monotonic() > deadline:
+                break
+            try:
+                (reply,) = await self._node(address).roundtrip([("CLUSTER", "SLOTS")])
+            except (NotConnected, ConnectionLost) as error:
+                self._failed[address], reason = time.monotonic(), error
+                continue
+            if isinstance(reply, Exception):
+                raise self._no_layout(address, reply)
+            self._failed.pop(address, None)
+            self._learn(reply, address[0])
+            self._looked = time.monotonic()
+            return None
+        return reason
 
     def _no_layout(self, address: Address, reply: Exception) -> Exception:
         where = f"{address[0]}:{address[1]}"
@@ -388,11 +405,11 @@ class ClusterTransport(Rooted):
         self.states.lost(reason)
         return address in self._gone and self.states.last.state != "closed"
 
-    def opened(self, address: Address, server: str | None) -> None:
+    def opened(self, address: Address, server: str | None, *, tell: bool) -> None:
         """Note a connection to a node; all is well when no node is missed any more."""
         self._gone.discard(address)
         if not self._gone:
-            self.states.opened(f"{address[0]}:{address[1]}", server)
+            self.states.opened(f"{address[0]}:{address[1]}", server, tell=tell)
 
 
 def _address(host: bytes | str | None, port: Any, asked: str) -> Address:
@@ -409,9 +426,13 @@ class _NodeStates(States):
         self._cluster = cluster
         self._node = address
 
-    def opened(self, address: str, server: str | None) -> None:
+    def opened(self, address: str, server: str | None, *, tell: bool = True) -> None:
         """Pass it on."""
-        self._cluster.opened(self._node, server)
+        self._cluster.opened(self._node, server, tell=tell)
+
+    def tell(self) -> None:
+        """Pass it on."""
+        self._cluster.states.tell()
 
     def lost(self, reason: Exception) -> bool:
         """Pass it on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
 from . import Transport
 from .options import Options
@@ -73,13 +73,15 @@ class Rooted(ABC):
 
     async def release(self) -> None:
         """Close the connections that are not in use; new ones are made when needed."""
-        for each in self._all():
-            await each.release()
+        async with AsyncExitStack() as steps:  # the last comes first, and each is taken, also if one is cancelled
+            for each in reversed(list(self._all())):
+                steps.push_async_callback(each.release)
 
     async def close(self) -> None:
         """Close all connections. Idempotent."""
-        for each in self._all():
-            await each.close()
+        async with AsyncExitStack() as steps:  # as above
+            for each in reversed(list(self._all())):
+                steps.push_async_callback(each.close)
 
 
 class Standing(Rooted):

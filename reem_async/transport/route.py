@@ -78,6 +78,7 @@ class Route:
         self._cluster = cluster
         self._slot = slot
         self._node = asked
+        self._began = time.monotonic()
         self._deadline = 0.0
         self._tries = 0
         self._source: Transport | None = None
@@ -99,8 +100,7 @@ class Route:
 
     async def refused(self, problem: Exception) -> None:
         """Note why nothing was applied, and wait if need be; raise NotConnected if time is over."""
-        # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.
-        self._check_time(_reason(problem), TlsRefused if isinstance(problem, TlsRefused) else NotConnected)
+        self._check_time(problem)
         asked, self._node, self._source = self._node, None, None
         pause = _PAUSES[min(self._tries, len(_PAUSES) - 1)]
         self._tries += 1
@@ -134,13 +134,18 @@ class Route:
             return redis.exceptions.TryAgainError(f"{look[1].decode(errors='replace')} has not followed its slot yet")
         return None
 
-    def _check_time(self, reason: str, kind: type[NotConnected]) -> None:
-        now = time.monotonic()
-        if not self._deadline:
-            self._deadline = now + self._cluster.timeout
-        if now > self._deadline:
+    def _check_time(self, problem: Exception) -> None:
+        now, limit = time.monotonic(), self._cluster.timeout
+        if not self._tries:
+            # A node that answers has taken as long as it needed; waiting for one that does not is waiting.
+            self._deadline = limit + (self._began if isinstance(problem, NotConnected) else now)
+        # After the first node that fails there is always a look for another one, else nothing new would be learned.
+        looked = self._tries > 0 or self._node is None
+        if looked and now > self._deadline:
+            # A node that is about to start may refuse TLS too, so there is another try; but it is said which it was.
+            kind = TlsRefused if isinstance(problem, TlsRefused) else NotConnected
             raise kind(
-                f"the cluster did not take the call within {self._cluster.timeout:g} s ({reason}); "
+                f"the cluster did not take the call within {limit:g} s ({_reason(problem)}); "
                 "nothing was applied: call again, or give it longer with timeout="
             )
 

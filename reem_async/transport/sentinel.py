@@ -11,8 +11,9 @@ from __future__ import annotations
 import asyncio
 import os
 import threading
+import time
 import weakref
-from collections.abc import Awaitable, Callable, Collection, Sequence
+from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
@@ -23,7 +24,7 @@ from ..concurrency.aside import aside
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
-from .addresses import NewTransport, address_of, listed
+from .addresses import NewTransport, ToOneServer, address_of, listed
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .rooted import Standing
 from .state import States
@@ -77,6 +78,8 @@ class SentinelOptions(Options):
         self.found: Address | None = None
         self.changed: Callable[[], None] = _nothing
         self._sentinels = [address_of(one, 26379) for one in plain]
+        # When they were asked last, of those that have not answered since: they are asked behind all others.
+        self._silent: dict[Address, float] = {}
         super().__init__(plain[0], timeout, options)
         tls = {"ssl": True, **{name: value for name, value in self.settings.items() if name.startswith("ssl_")}}
         self._asking = {
@@ -122,21 +125,37 @@ class SentinelOptions(Options):
         if before not in (None, address):
             self.changed()
 
-    def sentinels(self) -> list[Options]:
-        """Return how to reach each of the sentinels."""
-        return [NodeOptions(self, address, self._asking) for address in self._sentinels]
+    def sentinels(self) -> Iterator[Options]:
+        """Yield how to reach each of the sentinels: those that did not answer when they were asked last come last."""
+        for address in sorted(self._sentinels, key=lambda each: self._silent.get(each, 0.0)):
+            yield NodeOptions(self, address, self._asking)
+
+    def _in_turn(self) -> Iterator[tuple[Options, Address, float]]:
+        """Yield the sentinels to ask within the limit for connecting, with their addresses and time limits.
+
+        At first each has a share, so that there is time for the last one; who was silent before has more, since it
+        may only be slow.
+        """
+        deadline = time.monotonic() + self.handshake_timeout
+        for sentinel in self.sentinels():
+            address: Address = (sentinel.settings["host"], sentinel.settings["port"])
+            limit = self.handshake_timeout / (2 if address in self._silent else len(self._sentinels) + 1)
+            now = time.monotonic()
+            if now >= deadline:
+                return
+            self._silent[address] = now  # until it has answered, however the asking ends
+            yield sentinel, address, min(limit, deadline - now)
 
     async def _asked(self) -> Address:
         """Ask the sentinels where the primary is; raises what `primary` raises."""
         problems: list[Exception] = []
-        for sentinel in self.sentinels():
+        for sentinel, address, limit in self._in_turn():
             connection = sentinel.asynchronous_connection()
             try:
-                # So that a second sentinel still has time within the limit for connecting.
-                async with asyncio.timeout(self.handshake_timeout / 2):
+                async with asyncio.timeout(limit):
                     await connection.connect()
                     await connection.send_command(*_MASTERS)
-                    return self._named(await connection.read_response())
+                    return self._named(await connection.read_response(), address)
             except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
                 problems.append(sentinel.refused(error))
             finally:
@@ -151,26 +170,28 @@ class SentinelOptions(Options):
             NotConnected: No sentinel names it.
         """
         problems: list[Exception] = []
-        for sentinel in self.sentinels():
+        for sentinel, address, limit in self._in_turn():
             connection = sentinel.blocking_connection()
-            connection.socket_timeout = self.handshake_timeout / 2
+            connection.socket_timeout = connection.socket_connect_timeout = limit
             try:
                 connection.connect()
                 connection.send_command(*_MASTERS)
-                return self._named(connection.read_response())
+                return self._named(connection.read_response(), address)
             except Exception as error:  # as above
                 problems.append(sentinel.refused(error))
             finally:
                 connection.disconnect()
         raise self._nowhere(problems)
 
-    def _named(self, masters: Any) -> Address:
+    def _named(self, masters: Any, sentinel: Address) -> Address:
         """Return where a sentinel says that the primary is; raises NotConnected if it knows of none that is up."""
         for row in masters:
             if row[b"name"] == self.service.encode():
                 if any(word in row[b"flags"] for word in _UNFIT):
                     raise NotConnected(f"a sentinel says that the primary of {self.service!r} is down")
-                return row[b"ip"].decode(), int(row[b"port"])
+                primary = row[b"ip"].decode(), int(row[b"port"])
+                self._silent.pop(sentinel, None)
+                return primary
         raise NotConnected(f"a sentinel knows no {self.service!r}; the URL ends with the name that it was given there")
 
     def _nowhere(self, problems: Sequence[Exception]) -> Exception:
@@ -210,13 +231,14 @@ class SentinelTransport(Standing):
     def __init__(self, options: SentinelOptions, new_transport: NewTransport) -> None:
         self._options = options
         self._new_transport = new_transport
-        self._root = new_transport(options)  # for what must outlive a failover: locks and the event loop
-        self._now = self._root
+        self._now: ToOneServer = new_transport(options)
+        self._root = self._now  # for what must outlive a failover: locks and the event loop
         self._states = self._root.states
-        # Ways to primaries of before, closed with this: calls may still wait for replies on them.
-        self._demoted: list[Transport] = []
-        # Subscription connections: a primary of before sends nothing any more, and would not be missed.
-        self._listening: weakref.WeakSet[Wire] = weakref.WeakSet()
+        # Ways to primaries of before on which calls still wait for replies.
+        self._demoted: list[ToOneServer] = []
+        # Subscription connections: a primary of before sends nothing any more, and would not be missed. No WeakSet:
+        # another thread goes through them.
+        self._listening: list[weakref.ref[Wire]] = []
         self._lookout: _Lookout | None = None
         self._moved = False
         self._replicas: tuple[Address, ...] = ()
@@ -230,7 +252,7 @@ class SentinelTransport(Standing):
         now = self._current()
         return self._checked(now, await now.roundtrip(commands, bulk=bulk))
 
-    def _current(self) -> Transport:
+    def _current(self) -> ToOneServer:
         """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
             self._lookout = aside(partial(_Lookout, self._options, self, SentinelTransport._on_moved))
@@ -238,26 +260,30 @@ class SentinelTransport(Standing):
         if self._moved:
             self._moved = False
             self._renew()
+        if self._demoted:
+            self._demoted = [each for each in self._demoted if not each.retire()]
         return self._now
 
     def _on_moved(self) -> None:
         """Take note that the sentinels name another primary. Runs on a thread of its own."""
         self._moved = True
         reason = ConnectionLost(f"the sentinels name another primary for {self._options.service!r}")
-        for wire in list(self._listening):
-            wire.abort_soon(reason)
+        for reference in tuple(self._listening):
+            if (wire := reference()) is not None:
+                wire.abort_soon(reason)
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         """Open a connection to the primary whose pushed messages go to `on_push`."""
         self._root.check()
         wire = await cast("AsyncTransport", self._current()).listen(on_push, on_lost)
-        self._listening.add(wire)
+        self._listening.append(weakref.ref(wire, self._listening.remove))
         return wire
 
     def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:
         for reply in replies:
-            # The only sign, before the connection breaks, that the server was demoted.
-            if isinstance(reply, redis.exceptions.ReadOnlyError):
+            # The only sign, before the connection breaks, that the server was demoted. A primary that cannot save, or
+            # that lacks replicas, refuses writes with another code.
+            if isinstance(reply, redis.exceptions.ReadOnlyError) and "READONLY" in str(reply):
                 self._leave(asked)
                 raise NotConnected(
                     f"the server that was the primary of {self._options.address} is a replica now ({reply}); "
@@ -272,12 +298,14 @@ class SentinelTransport(Standing):
             self._renew()
 
     def _renew(self) -> None:
-        self._demoted.append(self._now)
         # The user hears of one primary. What becomes of the connections to the old one is not its state.
-        self._now.states = States()  # what becomes of its connections says nothing any more
-        self._now.states.closed()
-        self._now = self._new_transport(self._options)
-        self._now.states = self._states
+        demoted, fresh = self._now, self._new_transport(self._options)
+        demoted.states = States()
+        demoted.states.closed()
+        fresh.states = self._states
+        self._now = fresh
+        if not demoted.retire():
+            self._demoted.append(demoted)
 
     @property
     def states(self) -> States:

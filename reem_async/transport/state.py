@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import collections
 import logging
+import os
 import threading
 import time
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, TypeVar
 
 from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
@@ -17,6 +20,8 @@ from ..errors import InterfaceClosed
 __all__ = ["State", "StateChange", "StateChanges", "States"]
 
 logger = logging.getLogger("reem.connection")
+
+Result = TypeVar("Result")
 
 State = Literal["idle", "connected", "lost", "reconnecting", "closed"]
 """idle: nothing was connected yet. lost: a connection broke and none is left that answers; the next call makes a
@@ -56,8 +61,19 @@ class StateChanges(Stream[StateChange]):
         """Nothing to wait for: it follows from the beginning."""
 
 
+class _Turn:
+    """To call back: it ends with the call that has it, also where that is interrupted."""
+
+
+def _nobody() -> None:
+    """Nobody has the turn."""
+
+
 class States:
     """The state of one interface. Any thread may call; what is called back runs on the thread that noticed.
+
+    Or on one that is calling back already, so that changes are told in order. No lock is held meanwhile: what is
+    called back may call REEM, and wait for what another thread has.
 
     Attributes:
         unreadable: How many messages on followed channels could not be read.
@@ -69,10 +85,69 @@ class States:
         self._lock = threading.RLock()
         self._queues: list[weakref.ref[BoundedQueue]] = []  # leaving a WeakSet takes steps that a signal may divide
         self._callbacks: list[Callable[[StateChange], object]] = []
+        self._untold: collections.deque[StateChange] = collections.deque()  # to the callbacks
+        self._turn: Callable[[], _Turn | None] = _nobody
         self._servers: dict[str, str] = {}
+        _all.append(weakref.ref(self, _all.remove))
+
+    def apart(self, step: Callable[[], Result]) -> Result:
+        """Take a step that takes the lock."""
+        return step()
 
     def changes(self) -> StateChanges:
         """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
+        return self.apart(self._changes)
+
+    def call(self, callback: Callable[[StateChange], object]) -> None:
+        """Call `callback` with each change from now on; it must not block. What it raises is logged."""
+        self._callbacks.append(callback)
+
+    def opened(self, address: str, server: str | None, *, tell: bool = True) -> None:
+        """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so).
+
+        Without `tell`, nobody is called back before `tell` is called: on a thread that works for another one, which
+        waits for it.
+        """
+        self.apart(partial(self._opened, address, server))
+        if tell:
+            self.tell()
+
+    def lost(self, reason: Exception) -> bool:
+        """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
+        is_lost = self.apart(partial(self._lost, reason))
+        self.tell()
+        return is_lost
+
+    def answered(self) -> None:
+        """Note that the server answers over another connection than the one that was lost."""
+        self.apart(self._answered)
+        self.tell()
+
+    def retrying(self) -> None:
+        """Note that a connection is made again."""
+        self.apart(self._retrying)
+        self.tell()
+
+    def closed(self) -> None:
+        """Note the end, which ends all iterators."""
+        self.apart(self._closed)
+        self.tell()
+
+    def tell(self) -> None:
+        """Call back with what was not told yet, unless another call, of this or of another thread, is at it."""
+        if not self._untold:
+            return
+        turn = _Turn()
+        while (change := self.apart(partial(self._next, turn))) is not None:
+            for callback in tuple(self._callbacks):
+                try:
+                    callback(change)
+                except Exception:
+                    logger.exception("a callback for changes of the connection raised")
+
+    # With the lock.
+
+    def _changes(self) -> StateChanges:
         changes = StateChanges(Last(_KEPT))
         with self._lock:
             changes.queue.put(self.last)
@@ -81,12 +156,7 @@ class States:
             self._queues.append(weakref.ref(changes.queue, self._queues.remove))
         return changes
 
-    def call(self, callback: Callable[[StateChange], object]) -> None:
-        """Call `callback` with each change from now on; it must not block. What it raises is logged."""
-        self._callbacks.append(callback)
-
-    def opened(self, address: str, server: str | None) -> None:
-        """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so)."""
+    def _opened(self, address: str, server: str | None) -> None:
         with self._lock:
             # Per address: another node of a cluster is another process without anything having been restarted.
             before = self._servers.get(address, server)
@@ -96,32 +166,39 @@ class States:
             if restarted or self.last.state not in ("connected", "closed"):
                 self._change("connected", f"the server at {address} was restarted" if restarted else "", restarted)
 
-    def lost(self, reason: Exception) -> bool:
-        """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
+    def _lost(self, reason: Exception) -> bool:
         with self._lock:
             if self.last.state in ("connected", "idle") and not isinstance(reason, InterfaceClosed):
                 self._change("lost", str(reason))
             return self.last.state == "lost"
 
-    def answered(self) -> None:
-        """Note that the server answers over another connection than the one that was lost."""
+    def _answered(self) -> None:
         with self._lock:
             if self.last.state == "lost":
                 self._change("connected", "")
 
-    def retrying(self) -> None:
-        """Note that a connection is made again."""
+    def _retrying(self) -> None:
         with self._lock:
             if self.last.state in ("connected", "lost"):
                 self._change("reconnecting", self.last.reason)
 
-    def closed(self) -> None:
-        """Note the end, which ends all iterators."""
+    def _closed(self) -> None:
         with self._lock:
             if self.last.state != "closed":
                 self._change("closed", "")
             for queue in self._listening():
                 queue.close()
+
+    def _next(self, turn: _Turn) -> StateChange | None:
+        """Return the next change to tell for who has the turn, or takes it; None if there is none, or another has."""
+        with self._lock:
+            if self._turn() not in (None, turn):
+                return None
+            if not self._untold:
+                self._turn = _nobody
+                return None
+            self._turn = weakref.ref(turn)
+            return self._untold.popleft()
 
     def _listening(self) -> list[BoundedQueue]:
         return [queue for reference in tuple(self._queues) if (queue := reference()) is not None]
@@ -130,8 +207,22 @@ class States:
         self.last = StateChange(state, reason, time.time(), restarted)
         for queue in self._listening():
             queue.put(self.last)
-        for callback in list(self._callbacks):
-            try:
-                callback(self.last)
-            except Exception:
-                logger.exception("a callback for changes of the connection raised")
+        if self._callbacks:
+            self._untold.append(self.last)
+
+    def _forked(self) -> None:
+        # A thread that the child does not have may hold the lock, or have the turn.
+        self._lock, self._turn = threading.RLock(), _nobody
+
+
+_all: list[weakref.ref[States]] = []
+
+
+def _forked_all() -> None:
+    for reference in tuple(_all):
+        if (states := reference()) is not None:
+            states._forked()
+
+
+if hasattr(os, "register_at_fork"):  # before that of `wire`, which notes a loss
+    os.register_at_fork(after_in_child=_forked_all)

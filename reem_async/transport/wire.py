@@ -14,7 +14,7 @@ import os
 import socket
 import sys
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import hiredis
@@ -24,12 +24,13 @@ from ..concurrency.timeouts import LOOKS, confirmed, moved_last, patience, unsen
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
+from .identity import unanswered
 from .options import Options, is_this_machine
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .text import PROBE, is_plain, lists_json, over_wire
 
-__all__ = ["BUFFER", "Wire", "open_wire"]
+__all__ = ["BUFFER", "Wire", "close_all", "first_answer", "open_wire"]
 
 _BUSY = 2.5
 """The connection is busy if three reads come within so many times `pace`."""
@@ -39,6 +40,9 @@ _LEISURELY = 0.005
 
 BUFFER = 1 << 22
 """Bytes of a send buffer that Linux grants with its default limits (net.ipv4.tcp_wmem)."""
+
+_FAREWELL = 1.0
+"""Seconds for which what was to be sent is waited for when a connection is closed."""
 
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
@@ -266,13 +270,23 @@ class Wire(asyncio.BufferedProtocol):
 
     async def close(self) -> None:
         """Close the connection and wait until it is."""
-        if self._transport is None:
-            return
-        self._fail(
-            InterfaceClosed("this RedisInterface was closed during the call, which was applied once or not at all")
-        )
-        self._transport.close()
-        await asyncio.wait([self._gone], timeout=1.0)
+        await close_all([self])
+
+    def hang_up(self) -> asyncio.Future[None]:
+        """Begin to close the connection; the result is there when it is closed."""
+        if self._transport is not None:
+            self._fail(
+                InterfaceClosed("this RedisInterface was closed during the call, which was applied once or not at all")
+            )
+            self._transport.close()
+        elif not self._gone.done():  # it was given up
+            self._gone.set_result(None)
+        return self._gone
+
+    def cut_off(self) -> None:
+        """Do not wait any longer for what was to be sent before the connection is closed."""
+        if self._transport is not None and not self._gone.done():
+            self._transport.abort()
 
     # What asyncio calls.
 
@@ -395,6 +409,32 @@ class Wire(asyncio.BufferedProtocol):
             self.on_lost(self, reason)
 
 
+async def close_all(wires: Collection[Wire]) -> None:
+    """Close connections, and wait until they are; who is cancelled meanwhile leaves none behind."""
+    going = [wire.hang_up() for wire in wires]
+    try:
+        if going:
+            await asyncio.wait(going, timeout=_FAREWELL)
+    finally:
+        for wire in wires:
+            wire.cut_off()
+
+
+async def first_answer(wire: Wire, question: Command, address: str) -> list[Reply]:
+    """Ask something over a new connection; if that does not go well, close it.
+
+    Raises:
+        NotConnected: It broke.
+    """
+    try:
+        return await wire.roundtrip([question])
+    except BaseException as error:
+        await wire.close()
+        if isinstance(error, ConnectionLost):
+            raise unanswered(address, error) from error
+        raise
+
+
 async def open_wire(options: Options, *, large: bool = False) -> Wire:
     """Connect, log in, and return the wire; `large` replies are received in place.
 
@@ -412,11 +452,7 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
     wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
     wire.take_over(connection)
     if not lists_json(connection.handshake_metadata):
-        try:
-            (reply,) = await wire.roundtrip([PROBE])
-        except BaseException:
-            await wire.close()
-            raise
+        (reply,) = await first_answer(wire, PROBE, options.address)
         wire.plain = is_plain(reply)
     return wire
 
