@@ -1,0 +1,249 @@
+"""Connections that break, stand still or are broken off: no call waits longer, and none of them stays."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import redis
+from conftest import FRONTS, aeventually, eventually
+from own_servers import caller, liar
+from test_connection import stopped
+
+import reem
+import reem_async
+from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected
+from reem_async.server import EmbeddedServer
+from reem_async.transport.blocking import BlockingTransport
+from reem_async.transport.options import Options
+
+LARGE = np.zeros(1_000_000)
+
+
+@pytest.fixture
+def server():
+    """A server of the test's own, to be stopped."""
+    with EmbeddedServer() as own:
+        yield own
+
+
+@pytest.fixture
+def clients(server):
+    """How many are connected to it."""
+    with redis.Redis(port=server.port) as admin:
+        yield lambda: int(admin.info("clients")["connected_clients"]) - 1
+
+
+def sockets():
+    """How many sockets this process has."""
+    found = 0
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            found += os.readlink(f"/proc/self/fd/{name}").startswith("socket")
+    return found
+
+
+@contextlib.contextmanager
+def signalled(every):
+    """A signal is handled each `every` seconds inside the block."""
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    signal.setitimer(signal.ITIMER_REAL, every, every)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.alone
+@pytest.mark.parametrize(
+    "call",
+    [lambda at: at.read(), lambda at: at.write(1), lambda at: at.write(LARGE), lambda at: at["large"].read()],
+    ids=["read", "write", "large write", "large read"],
+)
+def test_signals_give_a_server_that_stands_still_no_more_time(server, call):
+    """The kernel's own time limits begin anew after each."""
+    with reem.RedisInterface(server.url, timeout=0.4) as interface:
+        at = reem.KeyValueStore(interface)["foo"]
+        at.write({"large": LARGE})
+        call(at)
+        at.write({"large": LARGE})
+        timer = threading.Timer(5, os.kill, (server.pid, signal.SIGCONT))  # else a failing test would never end
+        timer.start()
+        with stopped(server), signalled(0.02):
+            began = time.monotonic()
+            with pytest.raises(ConnectionLost, match=r"0\.4 s"):
+                call(at)
+            assert 0.3 < time.monotonic() - began < 1.5
+        timer.cancel()
+
+
+def test_threads_that_give_back_broken_connections_do_not_come_in_each_others_way():
+    """Each closes what it finds; an IndexError went out in place of ConnectionLost."""
+
+    class Line:
+        broken = True
+
+        def close(self):
+            sum(range(5))
+
+    transport, problems, until = BlockingTransport(Options("127.0.0.1", 1.0, {})), [], time.monotonic() + 1
+
+    def give():
+        while time.monotonic() < until and not problems:
+            transport._idle.extend((Line(), Line(), Line()))
+            try:
+                transport._give(Line())
+            except Exception as error:
+                problems.append(error)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        threads = [threading.Thread(target=give) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(before)
+    assert problems == []
+
+
+def test_a_connection_that_is_given_back_as_the_interface_is_closed_does_not_stay():
+    """The other thread has looked through all that were idle just before."""
+
+    class Line:
+        closed = False
+
+        @property
+        def broken(self):  # looked at between the two
+            transport.retire()
+            return False
+
+        def close(self):
+            self.closed = True
+
+    transport, line = BlockingTransport(Options("127.0.0.1", 1.0, {})), Line()
+    transport._give(line)
+    assert line.closed
+    assert not transport._idle
+
+
+def test_an_interrupt_as_a_connection_is_given_back_leaves_none_behind(server, clients):
+    """It was kept among those under way, also after the interface was closed."""
+    interface = reem.RedisInterface(server)
+    at = reem.KeyValueStore(interface)["a"]
+    at.write(1)
+    code, armed = BlockingTransport._give.__code__, False
+
+    def trace(frame, event, arg):
+        nonlocal armed
+        if armed and frame.f_code is code:
+            armed = False
+            raise KeyboardInterrupt
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        for _ in range(10):
+            armed = True
+            with contextlib.suppress(KeyboardInterrupt):
+                at.read()
+            assert not armed
+            sys.settrace(trace)
+    finally:
+        sys.settrace(before)
+    gc.collect()
+    assert len(interface._direct.session.transport._lines) <= 1
+    interface.close()
+    eventually(lambda: clients() == 0)
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_what_greets_and_hangs_up_has_taken_no_call_in_the_blocking_front(name):
+    """A proxy whose server is gone, say. In asyncio the call is sent together with the first question."""
+    with liar(lambda words: None) as url, caller(name, url) as made:
+        with pytest.raises(NotConnected if name == "blocking" else ConnectionLost):
+            made(made.calls[2])
+
+
+async def test_what_greets_without_json_and_hangs_up_has_taken_no_call(monkeypatch):
+    """Then whether it has is asked before the call is sent."""
+    monkeypatch.setattr("own_servers.HELLO", b"%2\r\n$6\r\nserver\r\n$5\r\nredis\r\n$5\r\nproto\r\n:3\r\n")
+    with liar(lambda words: None) as url:
+        interface = reem_async.RedisInterface(url)
+        with pytest.raises(NotConnected, match="nothing was applied"):
+            await reem_async.KeyValueStore(interface)["a"].write(1)
+        await interface.close()
+
+
+async def test_what_greets_and_hangs_up_is_not_connected_to_without_end():
+    """An idle program made a hundred connections a second, and told of two changes of state for each."""
+    asked, states = [], []
+    with liar(lambda words: asked.append(words)) as url:
+        interface = reem_async.RedisInterface(url)
+        interface.on_state(lambda change: states.append(change.state))
+        with pytest.raises(ConnectionLost):
+            await reem_async.KeyValueStore(interface)["a"].read()
+        await asyncio.sleep(0.3)
+        await interface.close()
+    assert len(asked) <= 2
+    assert states == ["lost", "closed"]
+
+
+@pytest.mark.parametrize("turns", [0, 1, 2, 5])
+async def test_close_that_is_cancelled_leaves_no_connection(server, clients, turns):
+    """Whenever that is: all are hung up before any is waited for."""
+    interface = reem_async.RedisInterface(server)
+    store = reem_async.KeyValueStore(interface)
+    await store["a"].write(LARGE)
+    await store["a"].read()
+    assert clients() == 2
+    closing = asyncio.create_task(interface.close())
+    for _ in range(turns + 1):
+        await asyncio.sleep(0)
+    closing.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await closing
+    await aeventually(lambda: clients() == 0)
+    await interface.close()
+    with pytest.raises(InterfaceClosed):
+        await store["a"].read()
+
+
+async def test_close_beside_a_server_that_stands_still_keeps_no_socket(server):
+    """What was to be sent is waited for for a second, and no longer."""
+    before = sockets()
+    interface = reem_async.RedisInterface(server.url, timeout=0.3)
+    store = reem_async.KeyValueStore(interface)
+    await store["a"].write(LARGE)
+    with stopped(server):
+        writing = asyncio.create_task(store["a"].write(np.zeros(4_000_000)))
+        await asyncio.sleep(0.1)
+        await interface.close()
+        with pytest.raises(InterfaceClosed):
+            await writing
+        await aeventually(lambda: sockets() == before, timeout=2)
+
+
+async def test_a_way_that_is_not_used_any_more_is_closed_once_nothing_is_due_on_it(server, clients):
+    """A primary of before, mostly."""
+    interface = reem_async.RedisInterface(server)
+    transport = interface.session.transport
+    await interface.initialize()
+    waiting = asyncio.ensure_future(transport.roundtrip([("BLPOP", "nothing", "0.3")]))
+    await asyncio.sleep(0.05)
+    assert not transport.retire()
+    assert await waiting == [None]
+    assert transport.retire()
+    await aeventually(lambda: clients() == 0)
+    await interface.close()
