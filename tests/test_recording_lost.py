@@ -147,3 +147,19 @@ async def test_a_value_of_an_unknown_ship_does_not_hide_what_is_beside_it(key, s
         with pytest.raises(ValueError, match="'tag'"):
             log[f"{key()}.tag"].at(log.end)
         assert log[f"{key()}.n"].at(log.end) == 0
+
+
+def test_where_there_is_no_channel_any_more_it_is_said_once_and_the_file_stays_whole(file, monkeypatch, caplog):
+    """Each new path had a schema all the same, which are numbered with 16 bits as channels are."""
+    monkeypatch.setattr(sink, "_MOST_CHANNELS", 10)
+    writing = Writing(file)
+    for number in range(100):
+        writing.put(Role.UPDATE, {"n": number}, f"p{number}")
+        writing.put(Role.UPDATE, np.zeros(100), f"q{number}")
+    writing.told()
+    assert writing.thread.counts.lost > 150
+    assert len(writing.thread._sink._schemas) < 15
+    (said,) = [record.getMessage() for record in caplog.records if record.name == "reem.recording"]
+    assert "as many channels as MCAP can have" in said
+    with open_log(file) as log:
+        assert (log.indexed, log.verify()) == (True, 0)

@@ -104,6 +104,11 @@ class KeyRecorder:
         self.absent = False
         self.looks = Looks(self, KeyRecorder._look, _QUICKEST, _SLOWEST, _PATIENCE)
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the key is gone, and nothing of it is left to be read, looked at or written."""
+        return self.absent and self.busy is None and not self._queue.items and not self.looks.due
+
     def on_event(self, event: Event) -> None:
         """Take one update."""
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)

@@ -32,6 +32,7 @@ class RecordedKeys:
         self._patterns = patterns
         self.tops = list(dict.fromkeys(pattern.top for pattern in patterns))
         self._recorders: dict[str, KeyRecorder] = {}
+        self._over: set[str] = set()  # keys that were gone at the last keyframe
 
     def of(self, name: str) -> KeyRecorder:
         """Return what records a key; made when first asked for."""
@@ -123,6 +124,19 @@ class RecordedKeys:
 
     def keyframe(self, number: int) -> None:
         """Write the whole of all keys as the recording has it."""
+        self._let_go()
         for recorder in self._recorders.values():
             recorder.keyframe(number)
         self.forget_news()
+
+    def _let_go(self) -> None:
+        """Keep nothing of keys that were gone at the last keyframe, too. One that comes again is a new one.
+
+        Programs may publish under ever new names. Those that were asked for by name stay: they are listed as if they
+        were there, and would be read again each time.
+        """
+        over = {name for name, recorder in self._recorders.items() if recorder.is_over and name not in self.tops}
+        for name in over & self._over:
+            del self._recorders[name]
+            self._collector.writer_thread.stored.discard(name)
+        self._over = over

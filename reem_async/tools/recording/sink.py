@@ -111,10 +111,12 @@ class Sink:
         return self._message(channel, [document.text], stamp)
 
     def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Signature) -> int:
-        known = self._known.setdefault((path, role, kind, wrapped), [])
+        place = path, role, kind, wrapped
+        known = self._known.get(place, [])
         for types, channel in known:
             if fits(found, types):
                 return channel
+        self._check_room()
         # A path that changes its type all the time gets a schema without types.
         if len(known) == _MOST_SCHEMAS:
             found = OPEN
@@ -123,7 +125,7 @@ class Sink:
         schema = self._schema(name if role == Role.UPDATE else "reem.event", "jsonschema", found)
         extra = {"reem.wrapped": "1"} if wrapped else {}
         channel = self._channel(path, role, kind, "json", schema, **extra)
-        known.append((found, channel))
+        self._known[place] = [*known, (found, channel)]
         return channel
 
     def part(
@@ -133,6 +135,7 @@ class Sink:
         key = path, role, kind, label, encoded.schema, encoded.channels
         channel = self._channels.get(key)
         if channel is None:
+            self._check_room()
             schema = self._schema(encoded.schema, "protobuf", None)
             extra = {"reem.ship": label, **({"reem.channels": encoded.channels} if encoded.channels else {})}
             channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
@@ -154,9 +157,12 @@ class Sink:
             self._schemas[key] = self._writer.register_schema(name, encoding, text)
         return self._schemas[key], name
 
-    def _channel(self, path: Path, role: Role, kind: Kind, encoding: str, schema: tuple[int, str], **extra: str) -> int:
+    def _check_room(self) -> None:
+        """Raise FullError if there can be no other channel; before it has a schema, which have 16 bits, too."""
         if self._count >= _MOST_CHANNELS:
             raise FullError
+
+    def _channel(self, path: Path, role: Role, kind: Kind, encoding: str, schema: tuple[int, str], **extra: str) -> int:
         self._count += 1
         metadata = {"reem.path": orjson.dumps(path).decode(), "reem.role": role.value, "reem.kind": kind.value, **extra}
         return self._register(_SHARED_TOPICS.get(role) or topic_of(path), encoding, schema, metadata)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import logging
 import os
 import sys
 import threading
@@ -31,6 +32,8 @@ from .state import differing, planted, pruned, without
 from .stored import LOST, NotWritten, Stored, Unchanged, extract, opened
 
 __all__ = ["Counts", "Operation", "WriterThread"]
+
+logger = logging.getLogger("reem.recording")
 
 # For which small operations are collected: waking for each would cost as much as writing it.
 _BATCH_SECONDS = 0.04
@@ -130,8 +133,10 @@ class WriterThread:
         self._lacking: set[str] = set()
         self._ending = False
         self._flushed = threading.Event()
-        # What each key held after the last operation: keyframes are made of it, and reads are compared with it.
+        # What each key held after the last operation: keyframes are made of it, and reads are compared with it. Keys
+        # that are gone are not in it.
         self._trees: dict[str, Any] = {}
+        self._full = False  # there is no channel any more, which was said
         self._recent = Recent()
         self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
 
@@ -244,14 +249,32 @@ class WriterThread:
             # A method for each role that is written.
             getattr(self, f"_write_{it.role}")(it)
         except FullError:  # reading it again would not help
-            self.counts.lose(it.path)
+            self._lose_for_good(it.path)
         except NotWritten:
             self._fall_behind(str(it.path[0]))
+
+    def _lose_for_good(self, path: Path) -> None:
+        """Count what there is no channel for, and say so once."""
+        self.counts.lose(path)
+        if not self._full:
+            self._full = True
+            logger.warning(
+                "%s, and what comes at other new paths, is not recorded any more: the file has as many channels as "
+                "MCAP can have; begin another one, or record fewer paths",
+                show(path),
+            )
 
     def _fall_behind(self, name: str) -> None:
         """Note that the tree of a key lacks something."""
         self.behind.add(name)
         self._lacking.add(name)
+
+    def _keep(self, name: str, tree: Any) -> None:
+        """Note what a key holds."""
+        if tree is MISSING:
+            self._trees.pop(name, None)  # programs may publish under ever new names
+        else:
+            self._trees[name] = tree
 
     def _write_update(self, it: Operation) -> None:
         name, rest = str(it.path[0]), it.path[1:]
@@ -259,10 +282,10 @@ class WriterThread:
         # A long list is a message of its own: to change one of its items, it becomes a list again.
         before = opened(self._trees.get(name, MISSING), rest, _as_list)
         if it.kind == Kind.READ:
-            self._trees[name] = planted(before, rest, tree)
+            self._keep(name, planted(before, rest, tree))
         else:
             try:
-                self._trees[name] = replaced(before, rest, tree)
+                self._keep(name, replaced(before, rest, tree))
             except CannotApply:  # the server has refused it too, or an update is missing here
                 self._fall_behind(name)
         lost = type(tree) is Stored and tree.label == LOST
@@ -280,7 +303,7 @@ class WriterThread:
         # A read that finds nothing where nothing was known is no news.
         if it.kind == Kind.READ and get(before, rest) is MISSING:
             return
-        self._trees[name] = without(before, rest, it.kind)
+        self._keep(name, without(before, rest, it.kind))
         self._event(it, {"op": "delete", "path": show(it.path)})
 
     def _write_skip(self, it: Operation) -> None:
@@ -370,7 +393,7 @@ class WriterThread:
             try:
                 self._count(self._sink.part(path, role, it.kind, label, encoded, it.stamp))
             except FullError:
-                self.counts.lose(path)
+                self._lose_for_good(path)
                 return Stored(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
             return stored
 
