@@ -142,6 +142,27 @@ def test_what_is_older_than_the_span_is_forgotten():
     assert history.tree(("n",), 95.0) == 95
 
 
+def test_nothing_is_kept_of_keys_that_came_and_went():
+    """Under ever new names there was a line of each for ever."""
+    history = History(10.0, 1 << 20)
+    history.start = 0.0
+    history.add(("stays",), 1, 8, 0.0)
+    for number in range(1, 200):
+        name = f"job{number}"
+        history.begin(name, None)
+        history.add((name,), {"n": number}, 8, number / 2)
+        history.add((name,), MISSING, 0, number / 2 + 0.25)
+    assert len(list(history.names)) < 30
+    assert history.bytes < 30 * 1500
+    assert history.tree(("stays",), 99.5) == 1
+    assert history.tree(("job195", "n"), 97.6) == 195
+    assert history.existed("job195", 98.0) is False
+    assert not history.knows("job5")
+    history.begin("job5", None)
+    history.add(("job5",), 7, 8, 99.6)
+    assert (history.existed("job5", 99.5), history.tree(("job5",), 99.7)) == (False, 7)
+
+
 def test_a_document_that_differs_from_what_was_heard_is_noticed_once(history):
     history.begin("k", b'{"a": 1}')
     assert not history.differs("k", b'{"a": 1}', 1.0)

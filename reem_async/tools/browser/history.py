@@ -160,8 +160,14 @@ class History:
             counts[str(first.path[0])] += 1
             self.start = max(self.start, first.time)
         for name, changes in counts.items():
-            self._bytes -= self._lines[name].fold(changes)
-            self._heavy.add(name)
+            line = self._lines[name]
+            self._bytes -= line.fold(changes)
+            if line.is_over:  # programs may publish under ever new names
+                del self._lines[name]
+                self._bytes -= _OVERHEAD
+                self._heavy.discard(name)
+            else:
+                self._heavy.add(name)
 
     # --- what there was
 

@@ -255,7 +255,7 @@ class StoredChanges:
             text: Its document's text, None if there is none.
             later: The updates in the buffer that are not in it.
         """
-        if not self._history.knows(name):
+        if text is not None and not self._history.knows(name):
             self._history.begin(name, text if name in self._unseen else None)
         has_arrays, when = text is not None and marked(text), self._history.clock.now()
         # Not if it is not needed: most are what they were.

@@ -93,6 +93,11 @@ class Timeline:
             self._moves.append(number)
         self.whole = self.whole or (len(change.path) == 1 and change.value is not PENDING)
 
+    @property
+    def is_over(self) -> bool:
+        """Whether there is no such key, and was not as far back as is known."""
+        return not self.changes and self._base is MISSING
+
     def upto(self, at: float) -> int:
         """Return how many of the changes are not after `at`."""
         return bisect_right(self._times, at)
