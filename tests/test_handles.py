@@ -346,9 +346,21 @@ def test_writing_an_item_of_an_array_says_to_write_it_as_a_whole(kvs, key):
     for place in (kvs[key()]["image"], kvs[key()]["l"]):
         with pytest.raises(PathRefused, match=r"\[7\]: .*"):
             place[7] = 3
-    if not PLAIN:
-        with pytest.raises(PathRefused, match="write an array as a whole"):
-            kvs[key()]["image"][0] = 3
+    with pytest.raises(PathRefused, match="write an array as a whole"):
+        kvs[key()]["image"][0] = 3
+
+
+@pytest.mark.parametrize("space", ["kvs", "pspace"])
+def test_an_item_where_no_list_is_is_refused_with_what_is_there(request, kvs, key, space):
+    """Servers with the module say of all of them that the index is out of range."""
+    kvs[key()] = {"d": {"x": 1}, "s": "text", "n": 5, "l": [1]}
+    place = request.getfixturevalue(space)[key()]
+    for name, kind in (("d", "object"), ("s", "string"), ("n", "integer")):
+        with pytest.raises(PathRefused, match=rf"\.{name} is of type {kind} and has no element 0"):
+            place[name][0] = 1
+    with pytest.raises(PathRefused, match=r"the list index is out of range; use append\(\) to make a list longer$"):
+        place["l"][1] = 1
+    assert kvs[key()].read() == {"d": {"x": 1}, "s": "text", "n": 5, "l": [1]}
 
 
 def test_a_key_with_a_dot_is_shown_quoted(kvs, key):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import MissingKey, PartialWrite
+from ..errors import MissingKey, PartialWrite, PathRefused
 from . import Command, Plan, Reply
 from .changes import REFUSED, Change
 from .orphans import clean, place_of
@@ -68,7 +68,9 @@ class Outcome:
         """Return the result, REFUSED, or the error to raise."""
         reply = self.replies[self.main]
         if isinstance(reply, Exception):
-            return explained(reply, self.it.keys, self.it.path)
+            error = explained(reply, self.it.keys, self.it.path)
+            # The server says of every item that it cannot set that its index is out of range, also where no list is.
+            return REFUSED if type(error) is PathRefused else error
         try:
             judged = self.it.judge(reply)
         except Exception as error:

@@ -187,7 +187,9 @@ def settable(keys: Keys, path: Path) -> Plan:
                 refusal = PathRefused if place else MissingTop
                 raise refusal(f"{whole}: there is no {outer} to write into")
             if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
-                raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}")
+                # To the server an array is a short text.
+                hint = "; write an array as a whole" if kind == "string" and isinstance(inner, int) else ""
+                raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}{hint}")
         if kinds[-1] is None and isinstance(path[-1], int):
             raise out_of_range(keys, path)
 
@@ -206,11 +208,8 @@ def diagnose(keys: Keys, path: Path) -> Plan:
 
 
 def out_of_range(keys: Keys, path: Path) -> PathRefused:
-    """Return the error for an item beyond the end of a list, or of an array: to the server that is a short text."""
-    return PathRefused(
-        f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer, and write an "
-        "array as a whole"
-    )
+    """Return the error for an item beyond the end of a list."""
+    return PathRefused(f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer")
 
 
 def type_name(reply: Reply) -> str | None:
