@@ -108,6 +108,22 @@ def test_what_others_were_faster_than_some_times_is_applied(server, raw, monkeyp
         assert len(writes) == 5
 
 
+@pytest.mark.parametrize("name", FRONTS)
+@pytest.mark.parametrize("method", ["increment", "multiply"])
+def test_nobody_is_faster_than_the_server_calculates(server, raw, monkeypatch, name, method):
+    """Not even the first time, when nothing is known of the number."""
+    with contextlib.closing(FRONTS[name](server.url, timeout=LIMIT)) as front:
+        front.write(["robot"], VALUE)
+        with overtaken(monkeypatch, touching(raw, server, "robot")) as writes:
+            if server.json:
+                getattr(front, method)(["robot", "n"], 3)
+                assert front.read(["robot", "n"]) == {"increment": 11, "multiply": 24}[method]
+                assert len(writes) == 2
+            else:
+                with pytest.raises(reem.Conflict):
+                    getattr(front, method)(["robot", "n"], 3)
+
+
 def test_there_are_two_attempts_however_long_they_take():
     commands = [("UNLINK", "{robot}.image"), ("JSON.SET", "robot", "$", b"1")]
     contention = Contention(1e-6)

@@ -53,11 +53,33 @@ def calculate(
         WrongType: Not a number.
         Overflow: The result is out of range; the old value stays.
     """
-    # A result seen here a moment ago says how near the ends of 64 bits the next one will be. It is only a guess: the
-    # transaction below reads the number before and after, so whatever somebody else made of it meanwhile shows.
-    known = cache.number(keys.document, path)
-    if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
-        return compute(keys, path, lambda number: operation(number, operand), notices, cache)
+
+    def attempt(known: Any) -> Plan:
+        # A number seen here a moment ago says how near the ends of 64 bits the result will be. It is only a guess: the
+        # transaction reads the number before and after, so whatever somebody else made of it meanwhile shows.
+        if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
+            return computed()
+        return _on_server(keys, path, command, operation, operand, text, notices, cache, computed)
+
+    def computed() -> Plan:
+        # If others were faster, the number that was seen is such a guess, and nobody can be faster than the server.
+        return compute(keys, path, lambda number: operation(number, operand), notices, cache, attempt)
+
+    return attempt(cache.number(keys.document, path))
+
+
+def _on_server(
+    keys: Keys,
+    path: Path,
+    command: str,
+    operation: Operation,
+    operand: float,
+    text: bytes,
+    notices: Telling,
+    cache: ShapeCache,
+    computed: Callable[[], Plan],
+) -> Plan:
+    """Plan to have the server calculate; what it does in another way than Python is `computed`, or put right."""
     place = to_jsonpath(path)
     commands = [
         get_command(keys, path),
@@ -69,7 +91,7 @@ def calculate(
     def decode(replies: Sequence[Reply]) -> Any:
         old = _number(present(replies[0], keys, path), keys, path)
         if replies[1] == [None]:  # a float that is stored as text
-            return compute(keys, path, lambda number: operation(number, operand), notices, cache)
+            return computed()
         # So RedisJSON calls a float that would be infinite; it has left the old value.
         if isinstance(replies[1], Exception) and "not a number" in str(replies[1]):
             raise _overflow(keys, path, old)
@@ -85,8 +107,18 @@ def calculate(
     return Plan(commands, decode, atomic=True)
 
 
-def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Telling, cache: ShapeCache) -> Plan:
-    """Plan to replace the number at `path` by `function` of it; repeats until nobody interferes."""
+def compute(
+    keys: Keys,
+    path: Path,
+    function: Callable[[Any], Any],
+    notices: Telling,
+    cache: ShapeCache,
+    otherwise: Callable[[Any], Plan] | None = None,
+) -> Plan:
+    """Plan to replace the number at `path` by `function` of it; again if somebody else was faster.
+
+    Then `otherwise`, if it is given, is told the number that was seen, and says what is next.
+    """
 
     def look(replies: Sequence[Reply]) -> Any:
         permitted(replies[0], keys.document)
@@ -94,10 +126,10 @@ def compute(keys: Keys, path: Path, function: Callable[[Any], Any], notices: Tel
         # Refused here, so that nothing is sent that the server would wrap around.
         new = _in_range(function(old), keys, path, old)
         place = from_front(replies[2:], keys, path, MissingKey)
-        return _guarded(keys, place, new, notices, again, lambda: finish(new))
+        return _guarded(keys, place, new, notices, lambda: again(old), lambda: finish(new))
 
-    def again() -> Plan:
-        return compute(keys, path, function, notices, cache)
+    def again(old: Any) -> Plan:
+        return compute(keys, path, function, notices, cache) if otherwise is None else otherwise(old)
 
     def finish(new: Any) -> Any:
         cache.saw_number(keys.document, path, new)
@@ -184,5 +216,6 @@ def _in_range(number: Any, keys: Keys, path: Path, old: Any) -> Any:
 
 def _overflow(keys: Keys, path: Path, old: Any) -> Overflow:
     return Overflow(
-        f"{show(full(keys, path))}: the result is out of range of 64-bit numbers; the old value {old!r} stays"
+        f"{show(full(keys, path))}: the result is out of range of signed 64-bit numbers, which servers calculate with; "
+        f"the old value {old!r} stays"
     )

@@ -301,12 +301,14 @@ class Accessor(Handle):
     async def increment(self, number: float = 1) -> Any:
         """Add `number` to the number here; returns the result.
 
-        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits.
+        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits; one more if
+        somebody else writes to the same top-level key in between.
 
         Raises:
             MissingKey: Nothing is here.
             WrongType: It is not a number.
-            Overflow: The result is out of range; the old value is kept.
+            Overflow: The result is out of range (of integers, -2^63 to 2^63-1: servers calculate with these); the old
+                value is kept.
             Conflict: As `write`.
         """
         return await self._writer.calculate(self._path, "JSON.NUMINCRBY", operator.add, number)
