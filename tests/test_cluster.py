@@ -76,6 +76,34 @@ os.kill(os.getpid(), signal.SIGKILL)
     eventually(lambda: not [pid for pid in pids if os.path.exists(f"/proc/{pid}")])
 
 
+@pytest.mark.parametrize("then", ["", "cluster.stop()", "fork(cluster.stop)", "fork(lambda: cluster.start())"])
+def test_no_noise_on_any_way_out(then):
+    """Not at the interpreter's end either, when no thread can be had any more; a forked child leaves it alone."""
+    code = """
+import os
+from reem_async.server.cluster import EmbeddedCluster
+cluster = EmbeddedCluster(replicas=0)
+cluster.start()
+
+def fork(then):
+    cluster._lock.acquire()  # as another thread may have it
+    if child := os.fork():
+        assert os.waitpid(child, 0)[1] == 0
+    else:
+        import signal
+        signal.alarm(5)
+        then()
+        os._exit(0)
+    cluster._lock.release()
+    assert "cluster_state:ok" in cluster.nodes[0].say("CLUSTER", "INFO")
+
+print(*[node.pid for node in cluster.nodes], flush=True)
+"""
+    done = python(code + then)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert not [pid for pid in done.stdout.split() if os.path.exists(f"/proc/{pid}")]
+
+
 @pytest.mark.parametrize("wrong", [{"primaries": 2}, {"replicas": 6}, {"node_timeout": 0}])
 def test_a_cluster_that_cannot_be_is_refused(wrong):
     """Before anything is started."""

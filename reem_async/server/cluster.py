@@ -125,7 +125,7 @@ class EmbeddedCluster(Startable):
             ServerMissing: No server program was found; says what to install.
             ServerFailed: A node ended, or they did not find each other; nothing is left behind.
         """
-        if not self.nodes:
+        if not self._is_in_fork() and not self.nodes:
             self._start_aside()
 
     def _start(self) -> None:
@@ -152,11 +152,12 @@ class EmbeddedCluster(Startable):
 
     def stop(self) -> None:
         """Stop all nodes and wait until they are gone; nothing if they do not run."""
-        aside(self._stop)
+        if not self._is_in_fork():
+            aside(self._stop)
 
     def _stop(self) -> None:
         with self._lock:
-            if self._finalizer is not None and self._owner == os.getpid():
+            if self._finalizer is not None:
                 self._finalizer()
             self._finalizer, self.nodes = None, []
 
@@ -214,10 +215,11 @@ class EmbeddedCluster(Startable):
 
 
 def stop_all(nodes: list[ClusterNode]) -> None:
-    """Stop the nodes, all at the same time."""
-    if nodes:
-        with ThreadPoolExecutor(len(nodes), "reem-cluster") as threads:
-            list(threads.map(lambda node: node.stop(), nodes))
+    """Stop the nodes, all at the same time; without threads, which cannot be had any more as the interpreter ends."""
+    for node in nodes:
+        node.order_to_end()
+    for node in nodes:
+        node.stop()
 
 
 def packed(*words: str) -> bytes:

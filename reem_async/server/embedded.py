@@ -241,10 +241,6 @@ class EmbeddedServer(Startable):
             raise Misuse("the server is not running: use `with EmbeddedServer() as server:` or call start()")
         return self._process
 
-    def _is_in_fork(self) -> bool:
-        # Asked before the lock is touched: a thread that the fork has left behind may hold it.
-        return self._owner is not None and self._owner != os.getpid()
-
 
 def _bindable(port: int) -> int:
     """The port, or a free one for 0; PortTaken or ServerFailed if it cannot be had."""

@@ -124,14 +124,19 @@ class ServerProcess:
                 self._ended = True
         return self._ended
 
+    def order_to_end(self) -> None:
+        """Have the server end, and do not wait for it."""
+        if self._watchdog is not None and os.getpid() == self._owner:
+            _running.discard(self)
+            _close_pipes(self._watchdog)  # this is the order
+
     def stop(self) -> None:
         """End the server, its data safely on disk if it keeps any, and remove the scratch directory."""
         if os.getpid() != self._owner:
             return
+        self.order_to_end()
         watchdog = self._watchdog
         if watchdog is not None:
-            _running.discard(self)
-            _close_pipes(watchdog)  # this is the order to end
             try:
                 watchdog.wait(STOP_SECONDS)
             except subprocess.TimeoutExpired:

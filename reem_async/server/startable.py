@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import Self
@@ -17,6 +18,9 @@ __all__ = ["Startable"]
 class Startable(ABC):
     """A server, or several."""
 
+    _owner: int | None = None
+    """The process that has started it; None if none has."""
+
     @abstractmethod
     def start(self) -> None:
         """Start it, and wait until it answers."""
@@ -28,6 +32,10 @@ class Startable(ABC):
     @abstractmethod
     def _start(self) -> None:
         """Do what `start` does, where no signal interrupts."""
+
+    def _is_in_fork(self) -> bool:
+        # Asked before a lock is touched: a thread that the fork has left behind may hold it.
+        return self._owner is not None and self._owner != os.getpid()
 
     def _start_aside(self) -> None:
         try:
