@@ -79,6 +79,12 @@ class Watched:
                     return raw
         raise AssertionError("there is none")
 
+    def fail_over(self):
+        """Have a sentinel begin a failover; whether it does, since the one before may not be over."""
+        with contextlib.suppress(redis.exceptions.ResponseError):
+            return self.sentinels[0].execute_command("SENTINEL", "FAILOVER", SERVICE)
+        return False
+
     def settle(self):
         """Wait until the sentinels agree with the servers about which is the primary, and the replica follows."""
         eventually(self._agreed)

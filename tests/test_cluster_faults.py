@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import socket
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from clusterkit import Move, kill_primary, owner, raw_of, whole_again
 from conftest import aeventually
 from loadkit import Load
 
+import reem
 import reem_async
+from reem_async.errors import NotConnected
 from reem_async.server.cluster import EmbeddedCluster
 
 SECONDS = float(os.environ.get("REEM_FAULT_SECONDS", "2"))
@@ -78,3 +83,62 @@ async def test_an_idle_connection_to_a_node_that_is_cut_is_made_anew(cluster):
         await aeventually(lambda: any(node._lanes[False] not in wires for node in nodes))
         await aeventually(lambda: interface.state == "connected")
         assert {change.state for change in heard} <= {"lost", "connected"}
+
+
+@pytest.fixture
+def silent(monkeypatch):
+    """The URL of four nodes that take connections and never answer; what a handshake may take is short."""
+    from reem_async.transport.options import Options
+
+    made = Options.__init__
+
+    def short(self, *args, **options):
+        made(self, *args, **options)
+        self.handshake_timeout = self.settings["socket_connect_timeout"] = 0.2
+
+    monkeypatch.setattr(Options, "__init__", short)
+    with contextlib.ExitStack() as stack:
+        nodes = [stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=512)) for _ in range(4)]
+        yield "redis+cluster://" + ",".join(f"127.0.0.1:{node.getsockname()[1]}" for node in nodes)
+
+
+@pytest.mark.alone
+async def test_calls_in_asyncio_share_what_a_look_for_a_node_that_answers_came_to(silent):
+    """Each looked by itself, one after the other: eight calls took eight times as long, and twice at that."""
+    async with asyncio.timeout(20):
+        interface = reem_async.RedisInterface(silent, timeout=0.2)
+        store = reem_async.KeyValueStore(interface)
+        began = time.monotonic()
+        for error in await asyncio.gather(*(store["a"].read() for _ in range(8)), return_exceptions=True):
+            assert isinstance(error, NotConnected)
+        assert time.monotonic() - began < 0.9  # two nodes are asked in any case
+        await interface.close()
+
+
+@pytest.mark.alone
+def test_blocking_calls_share_what_a_look_for_a_node_that_answers_came_to(silent):
+    """Likewise."""
+
+    def read(_):
+        with pytest.raises(NotConnected, match="no node of the cluster answers"):
+            store["a"].read()
+
+    interface = reem.RedisInterface(silent, timeout=0.2)
+    store = reem.KeyValueStore(interface)
+    began = time.monotonic()
+    with ThreadPoolExecutor(8) as threads:
+        list(threads.map(read, range(8)))
+    assert time.monotonic() - began < 0.9
+    interface.close()
+
+
+async def test_the_next_look_begins_with_nodes_that_were_not_asked(silent, cluster):
+    """So one that answers is found, however many do not."""
+    url = f"{silent},127.0.0.1:{cluster.nodes[0].port}"
+    interface = reem_async.RedisInterface(url, timeout=0.2)
+    store = reem_async.KeyValueStore(interface)
+    for _ in range(3):
+        with contextlib.suppress(NotConnected):
+            await store["a"].write(1)
+    assert await store["a"].read() == 1
+    await interface.close()

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import socket
 
 import pytest
 from conftest import FRONTS, aeventually
@@ -14,7 +15,7 @@ from sentinelkit import Watched, eventually
 
 import reem
 import reem_async
-from reem_async.errors import BadType, NotConnected
+from reem_async.errors import BadType, ConnectionLost, NotConnected, ServerReadOnly
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,20 @@ def test_the_primary_is_found_through_any_sentinel_that_answers(watched):
         reem.KeyValueStore(interface)["found"] = 1
         assert interface.hostname.startswith("mymaster (sentinels 127.0.0.1:1,")
     assert watched.now().json().get("found") == 1
+
+
+@pytest.mark.parametrize("name", FRONTS)
+def test_sentinels_that_never_answer_keep_nobody_out(watched, name):
+    """Two at the head of the URL took the whole time that asyncio has for connecting, each time anew."""
+    with contextlib.ExitStack() as stack:
+        silent = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
+        addresses = "".join(f"127.0.0.1:{each.getsockname()[1]}," for each in silent)
+        url = watched.url.replace("redis+sentinel://", f"redis+sentinel://{addresses}")
+        opened = stack.enter_context(contextlib.closing(FRONTS[name](url)))
+        opened.write(("found",), 2)
+        assert opened.interface.hostname.startswith(f"mymaster (sentinels {addresses}")
+        last = list(opened.interface.session.options.sentinels() if name == "asyncio" else [])[-2:]
+        assert all(f"{each.address}," in addresses for each in last)
 
 
 @pytest.mark.parametrize("package", [reem, reem_async])
@@ -74,6 +89,47 @@ def test_a_write_to_a_demoted_primary_is_not_reported_as_done(front, watched):
     front.write(("demoted",), 4)
     assert (front.read(("demoted",)), front.interface.state) == (4, "connected")
     watched.settle()
+
+
+def test_a_primary_that_takes_no_writes_for_want_of_replicas_is_no_replica(front, watched):
+    """It was taken for one, and each refused write left a connection behind."""
+    watched.settle()
+    primary = watched.now()
+    front.write(("wanting",), 1)
+    states = []
+    front.interface.on_state(lambda change: states.append(change.state))
+    primary.config_set("min-replicas-to-write", 5)
+    try:
+        before = primary.info("clients")["connected_clients"]
+        for _ in range(10):
+            with pytest.raises(ServerReadOnly, match="min-replicas-to-write"):
+                front.write(("wanting",), 2)
+        assert front.read(("wanting",)) == 1
+        assert primary.info("clients")["connected_clients"] <= before + 1
+    finally:
+        primary.config_set("min-replicas-to-write", 0)
+    assert states == []
+
+
+def test_a_switch_leaves_no_connection_to_the_primary_of_before(front, watched):
+    """Nothing is due on them."""
+    watched.settle()
+    front.write(("switched",), 1)
+    transport = getattr(front.interface, "_direct", front.interface).session.transport
+    before = transport._now
+    eventually(watched.fail_over)
+
+    def moved():
+        with contextlib.suppress(ConnectionLost, NotConnected):
+            front.write(("switched",), 2)
+        return transport._now is not before
+
+    eventually(moved)
+    watched.settle()
+    front.write(("switched",), 3)
+    assert transport._demoted == []
+    assert not [line for line in getattr(before, "_lines", ()) if line() is not None]
+    assert not [wire for wire in getattr(before, "_open", ()) if wire.alive]
 
 
 async def test_a_switch_by_an_administrator_is_told_to_followers_and_to_who_only_calls(watched):
