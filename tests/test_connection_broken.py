@@ -171,9 +171,9 @@ def test_an_interrupt_as_a_connection_is_given_back_leaves_none_behind(server, c
 @pytest.mark.parametrize("name", FRONTS)
 def test_what_greets_and_hangs_up_has_taken_no_call_in_the_blocking_front(name):
     """A proxy whose server is gone, say. In asyncio the call is sent together with the first question."""
-    with liar(lambda words: None) as url, caller(name, url) as made:
-        with pytest.raises(NotConnected if name == "blocking" else ConnectionLost):
-            made(made.calls[2])
+    error = NotConnected if name == "blocking" else ConnectionLost
+    with liar(lambda words: None) as url, caller(name, url) as made, pytest.raises(error):
+        made(made.calls[2])
 
 
 async def test_what_greets_without_json_and_hangs_up_has_taken_no_call(monkeypatch):
