@@ -169,3 +169,51 @@ def test_an_interface_of_an_event_loop_that_was_closed_can_be_closed_in_the_next
     """Though nothing is followed there."""
     done = python(ONLY_CLOSED, server_url, key(), flags=("-W", "ignore"))
     assert done.stdout == "True False\n", done.stderr
+
+
+PATTERNS = """
+import asyncio, os, signal, sys, reem_async
+from reem_async.pubsub.monitor import Monitor
+url, key, where = sys.argv[1:]
+interface = reem_async.RedisInterface(url)
+space, store = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
+watch, monitor = store.watch(key + "*"), Monitor(interface, [key + "*"])
+
+async def begin():
+    await space[key].write(1)
+    for each in (watch, monitor):
+        await each.listen()
+    assert (await anext(watch)).data == 1
+
+async def again():
+    loops = [asyncio.ensure_future(anext(each)) for each in (watch, monitor)]
+    print((await loops[0]).data)
+    while not monitor._begun:
+        await asyncio.sleep(0.01)
+    await space[key].write(2)
+    print((await loops[1]).value, (await anext(watch)).data)
+    await interface.close()
+    print(await anext(watch, None), await anext(monitor, None))
+
+loop = asyncio.new_event_loop()
+loop.run_until_complete(begin())
+if where == "fork":
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        os._exit(0)
+    signal.alarm(25)
+    asyncio.events._set_running_loop(None)
+else:
+    loop.close()
+asyncio.run(asyncio.wait_for(again(), 20))
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+@pytest.mark.parametrize("where", ["fork", "loop"])
+def test_what_follows_patterns_begins_anew_elsewhere(server_url, key, where):
+    """In a forked child, and in the event loop after one that was closed."""
+    done = python(PATTERNS, server_url, key(), where, flags=("-W", "ignore"))
+    assert done.stdout.splitlines() == ["1", "2 2", "None None"], done.stderr

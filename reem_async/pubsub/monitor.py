@@ -132,15 +132,21 @@ class Monitor(Stream[Event]):
         self._telling = False  # that it begins anew, in this turn of the event loop
 
     @property
+    def _begun(self) -> bool:
+        """Whether it has begun, in this process and in an event loop that is not closed."""
+        return self._manager is not None and self._manager.is_here
+
+    @property
     def _following(self) -> bool:
-        return self._manager is not None or self._closed
+        return self._begun or self._closed
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; one round trip a pattern."""
         if self._closed:
             raise InterfaceClosed("this monitor is closed; make a new one")
-        if self._manager is not None:
+        if self._begun:
             return
+        self._listeners = []  # none but of elsewhere
         manager = self._manager = manager_of(self._session)
         try:
             for top in dict.fromkeys(pattern.top for pattern in self.patterns):
@@ -161,7 +167,7 @@ class Monitor(Stream[Event]):
         """Stop following and end the loop. Idempotent."""
         await super().close()
         for listener in self._listeners:
-            if self._manager is not None:
+            if self._manager is not None and self._begun:
                 self._manager.unwatch(listener)
                 await self._manager.unfollow(listener)
 
@@ -236,6 +242,8 @@ class Monitor(Stream[Event]):
         gap = missed != 0 or whole in self._owed or (self._gaps is not None and whole not in self._gaps)
         lost = max(missed, 0) + self._owed.pop(whole, 0)
         if self._gaps is not None:
+            if len(self._gaps) >= _MOST_OWED:
+                self._gaps.clear()
             self._gaps.add(whole)
         if not any(pattern.concerns(path) for pattern in self.patterns):
             if gap:  # what was lost may have been at a place that one does

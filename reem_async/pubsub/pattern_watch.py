@@ -73,15 +73,21 @@ class PatternWatch(Stream[Update]):
         self._unreadable: set[str] = set()  # of these that was because of what is there, or of rights
 
     @property
+    def _begun(self) -> bool:
+        """Whether it has begun, in this process and in an event loop that is not closed."""
+        return self._manager is not None and self._manager.is_here
+
+    @property
     def _following(self) -> bool:
-        return self._manager is not None or self._closed
+        return self._begun or self._closed
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later change is missed. Idempotent; a few round trips for each key."""
         if self._closed:
             raise InterfaceClosed("this watch is closed; make a new one")
-        if self._manager is not None:
+        if self._begun:
             return
+        await self._leave()  # what was begun elsewhere
         manager = self._manager = manager_of(self._session)
         try:
             for top in dict.fromkeys(pattern.top for pattern in self.patterns):
@@ -110,7 +116,7 @@ class PatternWatch(Stream[Update]):
         self._failed.clear()
         self._unreadable.clear()
         for listener in leaving:
-            if self._manager is not None:
+            if self._manager is not None and self._begun:
                 await self._manager.unfollow(listener)
 
     async def _there(self) -> set[str]:

@@ -97,6 +97,9 @@ class Link:
                 self.follower.queues = self._queues
                 try:
                     await manager.follow(self.follower)
+                    if self.closed:  # meanwhile
+                        await manager.unfollow(self.follower)
+                        raise InterfaceClosed("this subscription was closed before it began")
                 except BaseException:
                     self.follower = None
                     raise
