@@ -72,10 +72,10 @@ def _following(url: str) -> tuple[reem.RedisInterface, reem.KeyValueStore]:
     space["exit"] = {"n": 0}
     heard: list[Any] = []
     mirror = reem.SilentSubscriber("exit", interface)
-    calls = reem.CallbackSubscriber("exit", interface, lambda data, updated_path: heard.append(data))
+    calls = reem.CallbackSubscriber("exit", interface, lambda data, _: heard.extend([data] * bool(shared_in(data))))
     mirror.listen()
     calls.listen()
-    while not (heard and heard[-1] and shared_in(heard[-1])):  # the end meets frames that are looked at
+    while not heard:  # the end meets frames that are looked at
         space["exit"]["frame"] = frame(1)
         time.sleep(0.001)
     KEPT.extend([interface, mirror, calls])
