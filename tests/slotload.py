@@ -19,7 +19,7 @@ from conftest import aeventually, assert_same
 
 import reem
 import reem_async
-from reem_async.errors import NotConnected
+from reem_async.errors import Contended, NotConnected
 
 KEY = "alpha"
 SHAPES = [(3,), (10, 2), (0,), (50, 50), (100, 100)]
@@ -50,11 +50,11 @@ class Worker:
         self.done = self.refused = 0
 
     async def run(self, stopping):
-        """Work until `stopping` is set. Whatever but NotConnected a call raises is a defect."""
+        """Work until `stopping` is set. Whatever a call raises but that nothing was applied is a defect."""
         while not stopping.is_set():
             try:
                 after = await self.step()
-            except NotConnected:
+            except (Contended, NotConnected):
                 self.refused += 1
             else:
                 self.model = after
@@ -186,7 +186,7 @@ class Blocking:
                     try:
                         call(at)
                         self.done += 1
-                    except NotConnected:
+                    except (Contended, NotConnected):
                         self.refused += 1
                     time.sleep(0.004)
 
