@@ -301,7 +301,7 @@ class Accessor(Handle):
     async def increment(self, number: float = 1) -> Any:
         """Add `number` to the number here; returns the result.
 
-        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits; one more if
+        One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits; more if
         somebody else writes to the same top-level key in between.
 
         Raises:
