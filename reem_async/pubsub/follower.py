@@ -15,8 +15,8 @@ from functools import partial
 from typing import Any
 
 from ..concurrency.queues import BoundedQueue, unheard
-from ..concurrency.tasks import Tasks, is_being_cancelled
-from ..errors import BadData, ClusterNode
+from ..concurrency.tasks import is_being_cancelled
+from ..errors import BadData, ClusterNode, is_of_command
 from ..plan import Reply, wire_commands
 from ..plan.keys import Keys
 from ..plan.notices import Notice
@@ -25,11 +25,11 @@ from ..plan.reads import interpret
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
-from ..transport import Transport
+from ..transport.redirects import is_unapplied
 from ..transport.wire import Wire
 from .listeners import Beginning
 from .looks import Looks
-from .manager import Topic
+from .manager import SubscriptionManager, Topic
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
 from .updates import Origin, Update
 
@@ -67,8 +67,7 @@ class Follower:
         path: Path,
         ships: Ships,
         cache: ShapeCache,
-        transport: Transport,
-        tasks: Tasks,
+        manager: SubscriptionManager,
         *,
         stored: bool = False,
         largest: float = math.inf,
@@ -83,8 +82,8 @@ class Follower:
         self.stored = stored
         self.local = largest == math.inf  # else it wants no large values
         self.heartbeat = heartbeat
-        self._transport = transport
-        self._tasks = tasks  # of the manager: its close ends them
+        self._manager = manager
+        self._transport, self._tasks = manager.transport, manager.tasks
         self._replica = Replica(keys, path, ships, cache, largest)
         self._wire: Wire | None = None
         self._loop = asyncio.get_running_loop()
@@ -227,7 +226,13 @@ class Follower:
 
     def _armed(self, number: int, outcome: list[Reply] | Exception) -> None:
         refusals = [outcome] if isinstance(outcome, Exception) else [it for it in outcome if isinstance(it, Exception)]
-        self._replica.armed(number, refusals[0] if refusals else None)
+        # Of a slot that moves, its new node is asked: what is followed begins anew there.
+        refusal = next((it for it in refusals if not is_unapplied(it)), None)
+        if self._wire is not None and refusal is not None and is_of_command(refusal):
+            self._manager.invalidations.may_not_touch(self._wire, refusal)
+            self._replica.untracked(number)
+        else:
+            self._replica.armed(number, refusal)
         self._perform()
 
     def _read(self, command: Read) -> None:

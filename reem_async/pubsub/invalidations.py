@@ -16,8 +16,6 @@ logger = logging.getLogger("reem.subscribe")
 
 _TRACK = ("CLIENT", "TRACKING", "ON")
 """Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
-_TOUCH = ("TYPE", "")
-"""Tells whether the user may use what keys are touched with; no document has that name."""
 
 
 class Invalidations:
@@ -34,13 +32,11 @@ class Invalidations:
         """
         if wire.tracked is not None:
             return
-        tracking, touching = await wire.roundtrip([_TRACK, _TOUCH])
-        if isinstance(tracking, ServerNotReady):
-            raise blamed(tracking, _TRACK)
-        if isinstance(tracking, Exception):
-            self._refused(wire, blamed(tracking, _TRACK), "+client|tracking")
-        elif isinstance(touching, Exception) and is_of_command(touching):
-            self._refused(wire, blamed(touching, _TOUCH), "+type")
+        (reply,) = await wire.roundtrip([_TRACK])
+        if isinstance(reply, ServerNotReady):
+            raise blamed(reply, _TRACK)
+        if isinstance(reply, Exception):
+            self._refused(wire, blamed(reply, _TRACK), "+client|tracking")
         else:
             wire.tracked = True
 
@@ -65,8 +61,12 @@ class Invalidations:
             raise outcome
         refused = [reply for reply in outcome if isinstance(reply, Exception)]
         if any(is_of_command(reply) for reply in refused):
-            self._refused(wire, blamed(refused[0], ("TYPE",)), "+type")
+            self.may_not_touch(wire, refused[0])
         return not refused
+
+    def may_not_touch(self, wire: Wire, refusal: Exception) -> None:
+        """Take it that the user may not read keys so, and warn."""
+        self._refused(wire, blamed(refusal, ("TYPE",)), "+type")
 
     def _refused(self, wire: Wire, reason: Exception, right: str) -> None:
         wire.tracked = False

@@ -25,7 +25,7 @@ from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.redirects import is_moved, is_unapplied
-from ..transport.wire import Wire
+from ..transport.wire import Wire, close_all
 from .heartbeats import Heartbeats
 from .inbox import Inbox
 from .invalidations import Invalidations
@@ -61,6 +61,7 @@ class SubscriptionManager:
         place: The process and the event loop it belongs to.
         callers: What makes calls for updates, kept here although nobody else may hold on to it.
         tasks: All that runs in the background for what is followed; ended by `close`.
+        invalidations: What has servers say which keys were changed.
     """
 
     def __init__(self, transport: Transport, ships: Ships, local: LocalPath) -> None:
@@ -80,7 +81,7 @@ class SubscriptionManager:
         self._closed = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
         self._subscribing = Subscribing(transport, local.host, self._confirmed)
-        self._invalidations = Invalidations()
+        self.invalidations = Invalidations()
         self._heartbeats = Heartbeats(
             self.tasks, self._listeners_over, self._forget_empty, self._answered, self._on_note
         )
@@ -110,7 +111,7 @@ class SubscriptionManager:
         async with self._lock:
             self._inbox.watchers.add(watcher)
             for wire in list(self._wires.values()):
-                await self._invalidations.turn_on(wire)
+                await self.invalidations.turn_on(wire)
 
     def unwatch(self, watcher: Listener) -> None:
         """Tell a listener no more. Idempotent."""
@@ -130,7 +131,7 @@ class SubscriptionManager:
         wire = self._subscribed.get(Topic(channel.encode()))
         if wire is None and not self.transport.sharded:  # all are on one connection
             wire = next(iter(self._wires.values()), None)
-        return wire is not None and await self._invalidations.touch(wire, names, touched)
+        return wire is not None and await self.invalidations.touch(wire, names, touched)
 
     async def subscribe_all(self, listeners: Sequence[Listener]) -> None:
         """Subscribe to many channels ahead of following them, which tries again what cannot be subscribed now."""
@@ -180,7 +181,7 @@ class SubscriptionManager:
                     node = await self.transport.owner(listener.topic.name, anew=anew)
                     wire = await self._subscribe_at(node, [listener.topic], [listener])
                 if listener.stored:
-                    await self._invalidations.turn_on(wire)
+                    await self.invalidations.turn_on(wire)
                 self._invite(wire, listener)
                 listener.start(wire, Beginning.FIRST)
             await ready
@@ -396,7 +397,7 @@ class SubscriptionManager:
         """Subscribe topics at `node` and have who listens begin anew, but for beginners."""
         wire = await self._connected(node)
         if self._inbox.watchers.present() or any(listener.stored for listener in self._listeners(topics)):
-            await self._invalidations.turn_on(wire)
+            await self.invalidations.turn_on(wire)
         self._beginners = beginners
         try:
             await self._subscribing.subscribe(wire, topics)
@@ -412,9 +413,10 @@ class SubscriptionManager:
         # First, since a task may be slow to end: loops over what is followed do not wait for it.
         for listener in self._everybody():
             await self.unfollow(listener)
-        await self.tasks.end()
-        for wire in list(self._wires.values()):
-            await wire.close()
+        try:
+            await self.tasks.end()
+        finally:
+            await close_all(list(self._wires.values()))
 
     def end_loops(self) -> None:
         """End the loops of threads over what is followed, though the event loop may be busy. Any thread may."""

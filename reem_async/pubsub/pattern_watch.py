@@ -154,8 +154,7 @@ class PatternWatch(Stream[Update]):
                     path,
                     session.ships,
                     session.cache,
-                    session.transport,
-                    manager.tasks,
+                    manager,
                     stored=True,
                     largest=self._largest,
                 )

@@ -270,6 +270,12 @@ class Replica:
         self.state = State.READING
         self.outputs.append(Read(number, self._plan))
 
+    def untracked(self, number: int) -> None:
+        """The user may not touch keys: from now on only what is published is told of."""
+        if number == self._number:
+            self._tracked = False
+            self.armed(number)
+
     def _take(self, heard: Heard[Notice]) -> None:
         """Apply an update that follows on a copy that is current; keep any other with the snapshot that tells."""
         notice = heard.update

@@ -35,7 +35,7 @@ class Contention:
             raise Contended(
                 f"{document_of(commands)}: others kept writing to this top-level key for {self._limit:g} s, each time "
                 "between a look at it and the change; nothing was applied: write to it less often, give what is "
-                "written often a top-level key of its own, or give the call longer with timeout="
+                "written often a top-level key of its own, or give it longer with timeout="
             )
 
     def over(self) -> None:
