@@ -133,18 +133,17 @@ class SentinelOptions(Options):
     def _in_turn(self) -> Iterator[tuple[Options, Address, float]]:
         """Yield the sentinels to ask within the limit for connecting, with their addresses and time limits.
 
-        At first each has a share, so that there is time for the last one; who was silent before has more, since it
-        may only be slow.
+        The first one has half of that limit, since it may only be slow, and each of the others a share of the rest, so
+        that there is time for the last one, and for the primary.
         """
-        deadline = time.monotonic() + self.handshake_timeout
-        for sentinel in self.sentinels():
+        deadline, parts = time.monotonic() + self.handshake_timeout, len(self._sentinels)
+        for place, sentinel in enumerate(self.sentinels()):
             address: Address = (sentinel.settings["host"], sentinel.settings["port"])
-            limit = self.handshake_timeout / (2 if address in self._silent else len(self._sentinels) + 1)
             now = time.monotonic()
             if now >= deadline:
                 return
             self._silent[address] = now  # until it has answered, however the asking ends
-            yield sentinel, address, min(limit, deadline - now)
+            yield sentinel, address, (deadline - now) / (parts - place + 1 if place else 2)
 
     async def _asked(self) -> Address:
         """Ask the sentinels where the primary is; raises what `primary` raises."""
