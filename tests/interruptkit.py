@@ -65,6 +65,7 @@ def at_step(place, action, call):
         frame.f_trace_opcodes = True
         return local
 
+    sys._getframe().f_trace_opcodes = True  # Python 3.12 looks, as tracing begins, whether anybody has ever wanted it
     before = sys.gettrace()
     sys.settrace(begin)
     try:

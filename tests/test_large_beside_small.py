@@ -143,7 +143,8 @@ def test_calls_that_failed_are_not_under_way(server, by_tcp, naps):
 
 
 def _under_way(interface):
-    return interface._direct.session.transport._under_way
+    lines = [reference() for reference in interface._direct.session.transport._lines]
+    return [line for line in lines if line is not None and line.waiting]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="each system has its own limits")
