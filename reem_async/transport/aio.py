@@ -18,10 +18,11 @@ from ..plan.sizes import has_large
 from . import Held
 from .contention import document_of
 from .identity import WHO, who
+from .opening import first_answer, open_wire
 from .options import Options, ShorterWay
 from .state import States
 from .text import HeldText, Text
-from .wire import BUFFER, Wire, close_all, first_answer, open_wire
+from .wire import BUFFER, Wire, close_all
 
 __all__ = ["AsyncTransport"]
 

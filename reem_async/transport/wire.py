@@ -24,13 +24,12 @@ from ..concurrency.timeouts import LOOKS, confirmed, moved_last, patience, unsen
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
-from .identity import unanswered
-from .options import Options, is_this_machine
+from .options import is_this_machine
 from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
-from .text import PROBE, is_plain, lists_json, over_wire
+from .parsing import MORE, NOT_THE_PROTOCOL, Reader
+from .text import over_wire
 
-__all__ = ["BUFFER", "Wire", "close_all", "first_answer", "open_wire"]
+__all__ = ["BUFFER", "Wire", "close_all"]
 
 _BUSY = 2.5
 """The connection is busy if three reads come within so many times `pace`."""
@@ -418,43 +417,6 @@ async def close_all(wires: Collection[Wire]) -> None:
     finally:
         for wire in wires:
             wire.cut_off()
-
-
-async def first_answer(wire: Wire, question: Command, address: str) -> list[Reply]:
-    """Ask something over a new connection; if that does not go well, close it.
-
-    Raises:
-        NotConnected: It broke.
-    """
-    try:
-        return await wire.roundtrip([question])
-    except BaseException as error:
-        await wire.close()
-        if isinstance(error, ConnectionLost):
-            raise unanswered(address, error) from error
-        raise
-
-
-async def open_wire(options: Options, *, large: bool = False) -> Wire:
-    """Connect, log in, and return the wire; `large` replies are received in place.
-
-    Raises:
-        NotConnected: Nobody listens there.
-        Refused: The server refused the login.
-    """
-    connection = options.asynchronous_connection()
-    try:
-        async with asyncio.timeout(options.handshake_timeout):
-            await connection.connect()
-    except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
-        await connection.disconnect(nowait=True)
-        raise options.refused(error) from error
-    wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
-    wire.take_over(connection)
-    if not lists_json(connection.handshake_metadata):
-        (reply,) = await first_answer(wire, PROBE, options.address)
-        wire.plain = is_plain(reply)
-    return wire
 
 
 def _is_loopback(sock: Any) -> bool:
