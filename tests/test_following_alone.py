@@ -8,7 +8,7 @@ import logging
 
 import numpy as np
 import pytest
-from conftest import aeventually
+from conftest import PLAIN, aeventually
 
 import reem_async
 from reem_async import Last
@@ -267,7 +267,8 @@ async def test_a_key_that_may_not_be_read_keeps_no_other_from_being_watched(serv
             await aeventually(lambda: {each.path for each in told} == {"a", "c"})
             await theirs["c"].write(2)
             await aeventually(lambda: told[-1].data == 2)
-    assert [record for record in caplog.records if "b cannot be watched" in record.message]
+    # Without the module a document is told from other texts by what is in it, which this user may not read.
+    assert PLAIN or [record for record in caplog.records if "b cannot be watched" in record.message]
 
 
 async def lose_one(other, value):

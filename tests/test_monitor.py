@@ -183,6 +183,7 @@ def test_escaping_leaves_no_pattern():
     assert re.sub(r"\\(.)", r"\1", escaped("a*?[b]\\^")) == "a*?[b]\\^"
 
 
+@pytest.mark.alone
 async def test_a_patient_monitor_is_woken_seldom_unless_somebody_else_is_in_a_hurry(key, server_url, apspace):
     """Updates that wait for each other are all there, in order, and told together."""
 
