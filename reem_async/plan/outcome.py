@@ -30,7 +30,7 @@ class Outcome:
         main: The place of the command that changes the document.
     """
 
-    __slots__ = ("cache", "commands", "it", "main", "replies")
+    __slots__ = ("cache", "commands", "it", "main", "refusal", "replies")
 
     def __init__(
         self, it: Change, cache: ShapeCache, commands: Sequence[Command], replies: Sequence[Reply], main: int
@@ -40,6 +40,7 @@ class Outcome:
         self.commands = commands
         self.replies = replies
         self.main = main
+        self.refusal: PathRefused | None = None  # in the server's words
 
     def next(self) -> Any:
         """Return the result, or the next plan; raise what the replies mean."""
@@ -70,7 +71,10 @@ class Outcome:
         if isinstance(reply, Exception):
             error = explained(reply, self.it.keys, self.it.path)
             # The server says of every item that it cannot set that its index is out of range, also where no list is.
-            return REFUSED if type(error) is PathRefused else error
+            if type(error) is not PathRefused:
+                return error
+            self.refusal = error
+            return REFUSED
         try:
             judged = self.it.judge(reply)
         except Exception as error:
@@ -100,7 +104,7 @@ class Outcome:
 
     def _finish(self, judged: Any) -> Any:
         if judged is REFUSED:
-            return diagnose(self.it.keys, self.it.path)
+            return diagnose(self.it.keys, self.it.path, self.refusal)
         if isinstance(judged, Exception):
             raise judged
         return judged

@@ -196,12 +196,20 @@ def settable(keys: Keys, path: Path) -> Plan:
     return Plan(commands, decode)
 
 
-def diagnose(keys: Keys, path: Path) -> Plan:
-    """Plan to find out why a write at `path` was refused. Its decode always raises PathRefused."""
+def diagnose(keys: Keys, path: Path, refusal: PathRefused | None) -> Plan:
+    """Plan to find out why a write at `path` was refused. Its decode always raises PathRefused.
+
+    That is the `refusal` if the user may not find out more.
+    """
     plan = settable(keys, path)
 
     def decode(replies: Sequence[Reply]) -> Any:
-        plan.decode(replies)
+        try:
+            plan.decode(replies)
+        except NotAllowed:
+            if refusal is None:
+                raise
+            raise refusal from None
         raise PathRefused(f"{show(full(keys, path))}: its parent changed while it was written; write again")
 
     return plan._replace(decode=decode)

@@ -324,6 +324,7 @@ class DocumentWriter:
         else:
             saw_shape(self.session.cache, self.keys, path, attachments)
             return
+        turn.settle()  # that it was refused was told, with numbers of its own
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
         saw_shape(self.session.cache, self.keys, path, attachments)

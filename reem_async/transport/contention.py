@@ -38,6 +38,10 @@ class Contention:
                 "written often a top-level key of its own, or give it longer with timeout="
             )
 
+    def waited(self, seconds: float) -> None:
+        """Leave out of the time for which it is tried again what it has waited for calls of its own interface."""
+        self._deadline += seconds if self._deadline else 0.0
+
     def over(self) -> None:
         """Note that it was applied: what follows from it has a time of its own."""
         self._deadline = 0.0

@@ -31,6 +31,8 @@ PROBE: Command = ("JSON.GET",)
 
 _AT_A_TIME = 8
 """Changes below the top that one interface has under way at the same time, each over a connection of its own."""
+_AS_LONG = 0.9
+"""Of a time limit: who has tried for so long has found out for others; uploads are given up a little early."""
 
 _MODULES = (b"ReJSON", "ReJSON", b"json", "json")
 """What HELLO calls the modules of Redis and of Valkey."""
@@ -119,7 +121,9 @@ class Text:
         contention, attempt = Contention(patience(self.timeout)), _Attempt(keys, commands)
         while True:
             # Each attempt waits for its turn: who is never first must not keep those who write to other keys.
+            came = attempt.begun = time.monotonic()
             replies = await self._in_turn(turns, lending, attempt, bulk)
+            contention.waited(attempt.begun - came)
             if replies is not None:
                 return replies
             contention.given_up(commands)
@@ -137,8 +141,10 @@ class Text:
                 try:
                     return await self._in_turn(turns[1:], lending, attempt, bulk)
                 except (ConnectionLost, NotConnected) as error:
-                    self._lost[turns[0]] = _Lost(time.monotonic(), patience(self.timeout), error)
+                    now = time.monotonic()
+                    self._lost[turns[0]] = _Lost(now, now - attempt.begun, str(error))
                     raise
+        attempt.begun = time.monotonic()
         async with lending.hold() as held:
             if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
                 return await held.roundtrip(attempt.given, bulk=bulk)
@@ -150,11 +156,12 @@ class Text:
         Else each of those who wait would have a time limit of its own, one after the other.
         """
         lost = self._lost.get(turn)
-        if lost is not None and lost.time > came and lost.limit >= patience(self.timeout):
+        # A connection that breaks at once says nothing of the server: the next one may be made.
+        if lost is not None and lost.time > came and lost.took >= _AS_LONG * patience(self.timeout):
             raise NotConnected(
                 "the call before this one lost the server, so nothing of this one was sent and nothing was applied: "
                 f"call again (of that one it was said: {lost.error})"
-            ) from lost.error
+            )
 
 
 class HeldText:
@@ -196,13 +203,13 @@ class _Lost(NamedTuple):
 
     Attributes:
         time: When.
-        limit: Its time limit, in seconds.
-        error: What it raised.
+        took: For how many seconds it had tried.
+        error: What it raised, in words: the error itself would keep what its caller had.
     """
 
     time: float
-    limit: float
-    error: Exception
+    took: float
+    error: str
 
 
 class _Attempt:
@@ -214,11 +221,13 @@ class _Attempt:
 
     Attributes:
         given: The batch.
+        begun: When it had its turn last.
     """
 
     def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
         self._keys = keys
         self.given = commands
+        self.begun = 0.0
 
     async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
         """Try once; return None if somebody else was first."""

@@ -243,9 +243,12 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
     result.unreadable = log.unreadable
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for path in paths:
-            before = log.unreadable
+            before, knew = log.unreadable, log.is_damaged
             try:
                 times, form, count = _shape(log, path)
+                if log.is_damaged != knew:  # found on the way: from now on more is read of keyframes
+                    before = log.unreadable
+                    times, form, count = _shape(log, path)
             except BadData as error:
                 result.left_out[_name(path)] = str(error)
                 continue

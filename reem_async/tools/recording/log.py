@@ -118,6 +118,11 @@ class Log:
         return self._container.damaged
 
     @property
+    def is_damaged(self) -> bool:
+        """Whether anything that was read until now turned out to be damaged."""
+        return self._past.is_damaged
+
+    @property
     def unreadable(self) -> int:
         """How many values were left out until now, since they are damaged, or of a type that was not recorded."""
         return max(self._past.unreadable, self._container.left_out)

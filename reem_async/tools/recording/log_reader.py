@@ -68,6 +68,7 @@ class Past:
         self._ships = ships
         self._timeline = Timeline(container)
         self.unreadable = 0
+        self._has_skipped = False
         by_place: dict[tuple[Path, str, str], Stream] = {}
         self._of_channel: dict[int, Stream] = {}
         # A path has several channels in one role if its type changed: for users they are one stream.
@@ -195,6 +196,7 @@ class Past:
             if loaded is not None:
                 return loaded
         self.unreadable += 1
+        self._has_skipped = True
         return None
 
     def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Stored:
@@ -269,6 +271,11 @@ class Past:
             if loaded is not None:
                 yield ref, stream, loaded[0]
 
+    @property
+    def is_damaged(self) -> bool:
+        """Whether anything that was read until now turned out to be damaged."""
+        return bool(self._container.damaged) or self._has_skipped
+
     def following(self, path: Path, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
         """Yield what was at a full path after each piece of news on it between two instants.
 
@@ -282,7 +289,7 @@ class Past:
         for ref in self._between([each for it in related for each in it.channels], after, until):
             stream = self._of_channel[ref.channel]
             # Keyframes repeat what is known, unless something is damaged: then they are what mends it.
-            if stream.role == Role.KEYFRAME and not (self._container.damaged or self.unreadable):
+            if stream.role == Role.KEYFRAME and not self.is_damaged:
                 continue
             loaded = self._readable(ref, stream)
             if loaded is None:
