@@ -12,6 +12,7 @@ from conftest import PLAIN, aeventually
 
 import reem_async
 from reem_async import Last
+from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import NotAllowed, ServerNotReady
 from reem_async.plan.keys import keys_of
 from reem_async.pubsub.manager import manager_of
@@ -299,3 +300,80 @@ async def test_a_loss_is_told_with_the_next_update_that_a_pattern_names(server, 
             since = [each for each in told if each.value != 2 and not getattr(each, "initial", False)]
             assert [each.missed for each in since if each.gap] == [2]
             assert not since[-1].gap
+
+
+async def test_a_place_that_cannot_be_read_keeps_no_other_of_its_key_from_being_watched(server, other):
+    """Those are told once, and each of their changes; the place itself is once it can be read."""
+    pub = reem_async.PublishSpace(other)
+    await pub["foo"].write({"a": 1, "b": b"x" * 20_000, "c": 3})
+    async with reem_async.RedisInterface(server) as interface:
+        with contextlib.ExitStack() as stack:
+            watch = reem_async.KeyValueStore(interface).watch("foo.a", "foo.b", "foo.c", policy=Last(100))
+            told = await gathered(stack, watch)
+            await aeventually(lambda: {each.path for each in told} == {"foo.a", "foo.c"})
+            await watch.look()
+            await pub["foo"]["a"].write(2)
+            await aeventually(lambda: told[-1].value == 2)
+            await pub["foo"]["b"].write(5)
+            await aeventually(lambda: told[-1].data == 5)
+            await pub["foo"]["c"].write(6)
+            await aeventually(lambda: told[-1].value == 6)
+    told.sort(key=lambda each: each.path)
+    assert [(each.path, each.data, each.gap) for each in told] == [
+        ("foo.a", 1, False),
+        ("foo.a", 2, False),
+        ("foo.b", 5, False),
+        ("foo.c", 3, False),
+        ("foo.c", 6, False),
+    ]
+
+
+async def test_a_subscriber_that_comes_while_a_cancelled_one_is_confirmed_begins_once(server, other, monkeypatch):
+    """It has missed nothing, so it is told of no gap."""
+    await reem_async.KeyValueStore(other)["k"].write(1)
+    async with reem_async.RedisInterface(server) as interface:
+        await following(interface, "beside")
+        manager = manager_of(interface.session)
+        confirmed, turn_on, kept = manager._subscribing._confirmed, manager.invalidations.turn_on, []
+        monkeypatch.setattr(manager._subscribing, "_confirmed", lambda *arguments: kept.append(arguments))
+        task = asyncio.ensure_future(following(interface, "k"))
+        await aeventually(lambda: kept)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+        monkeypatch.setattr(manager._subscribing, "_confirmed", confirmed)
+
+        async def late(wire):
+            while kept:  # the confirmation of the one before comes in between
+                confirmed(*kept.pop())
+            await turn_on(wire)
+
+        monkeypatch.setattr(manager.invalidations, "turn_on", late)
+        with contextlib.ExitStack() as stack:
+            told = await gathered(stack, reem_async.KeyValueStore(interface)["k"].watch(Last(10)))
+            await manager.fence()
+            await reem_async.PublishSpace(other)["k"].write(2)
+            await aeventually(lambda: told and told[-1].data == 2)
+    assert [(each.data, each.gap, each.initial) for each in told] == [(1, False, True), (2, False, False)]
+
+
+async def test_a_monitor_of_ever_so_many_keys_says_once_of_each_that_something_may_be_lost(server, monkeypatch):
+    """Keys that no pattern names do not count."""
+    from reem_async.plan.notices import Notice
+    from reem_async.pubsub import monitor as module
+
+    monkeypatch.setattr(module, "_MOST_OWED", 10)
+    async with reem_async.RedisInterface(server) as interface:
+        for pattern, due in (("*", 30), ("*.other", 0)):
+            async with Monitor(interface, [pattern]) as monitor:
+                broken = []
+                monitor.broken = lambda broken=broken: broken.append(1)
+                monitor._lost()
+                gaps = 0
+                for turn in range(1, 4):
+                    for number in range(30):
+                        name = f"k{number}"
+                        monitor._heard(Notice("p", turn, 0.0, ("x",), False, 1), f"{{{name}}}:notices".encode())
+                        while (event := monitor.queue.take()) is not EMPTY:
+                            gaps += event.gap
+                assert (gaps, broken) == (due, [1])

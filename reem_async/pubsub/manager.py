@@ -13,7 +13,7 @@ import logging
 import os
 import random
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from ..concurrency.queues import unheard
@@ -146,10 +146,20 @@ class SubscriptionManager:
         for listener in listeners:
             if listener.topic not in self._subscribed:
                 nodes.setdefault(await self.transport.owner(listener.topic.name), []).append(listener)
-        for node, there in nodes.items():
-            for listener in there:
-                self._enter(listener)
-            await self._subscribe_at(node, [listener.topic for listener in there], there)
+        with self._beginning(listeners):
+            for node, there in nodes.items():
+                for listener in there:
+                    self._enter(listener)
+                await self._subscribe_at(node, [listener.topic for listener in there])
+
+    @contextlib.contextmanager
+    def _beginning(self, listeners: Sequence[Listener]) -> Iterator[None]:
+        """Have these begin by themselves, for the first time, when their topics are subscribed."""
+        self._beginners = listeners
+        try:
+            yield
+        finally:
+            self._beginners = ()
 
     async def follow_here(self, listener: Listener) -> None:
         """Follow what the servers themselves know as a topic."""
@@ -178,8 +188,9 @@ class SubscriptionManager:
                 self._enter(listener)
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
-                    node = await self.transport.owner(listener.topic.name, anew=anew)
-                    wire = await self._subscribe_at(node, [listener.topic], [listener])
+                    with self._beginning([listener]):
+                        node = await self.transport.owner(listener.topic.name, anew=anew)
+                        wire = await self._subscribe_at(node, [listener.topic])
                 if listener.stored:
                     await self.invalidations.turn_on(wire)
                 self._invite(wire, listener)
@@ -393,16 +404,12 @@ class SubscriptionManager:
         if failure is not None:
             raise failure
 
-    async def _subscribe_at(self, node: Transport, topics: list[Topic], beginners: Sequence[Listener] = ()) -> Wire:
-        """Subscribe topics at `node` and have who listens begin anew, but for beginners."""
+    async def _subscribe_at(self, node: Transport, topics: list[Topic]) -> Wire:
+        """Subscribe topics at `node`, which has who listens begin anew, but for beginners."""
         wire = await self._connected(node)
         if self._inbox.watchers.present() or any(listener.stored for listener in self._listeners(topics)):
             await self.invalidations.turn_on(wire)
-        self._beginners = beginners
-        try:
-            await self._subscribing.subscribe(wire, topics)
-        finally:
-            self._beginners = ()
+        await self._subscribing.subscribe(wire, topics)
         return wire
 
     async def close(self) -> None:

@@ -24,6 +24,8 @@ __all__ = ["ANNOUNCED", "Event", "Monitor"]
 
 # Keys. Beyond that every key is taken to have a gap, once.
 _MOST_OWED = 10_000
+_MOST_GAPS = 100_000
+"""Keys that are heard of after a loss; in a stream of ever new ones, those that come then are taken for new."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,16 +241,16 @@ class Monitor(Stream[Event]):
         whole = namespace + name
         # By publisher and key, since a publisher numbers each key's updates by themselves.
         missed, path = self._numbers.take((notice.publisher, whole), notice.sequence), (name, *notice.path)
+        if not any(pattern.concerns(path) for pattern in self.patterns):
+            if missed != 0:  # what was lost may have been at a place that one does
+                self._owe(whole, max(missed, 0))
+            return
         gap = missed != 0 or whole in self._owed or (self._gaps is not None and whole not in self._gaps)
         lost = max(missed, 0) + self._owed.pop(whole, 0)
         if self._gaps is not None:
-            if len(self._gaps) >= _MOST_OWED:
-                self._gaps.clear()
             self._gaps.add(whole)
-        if not any(pattern.concerns(path) for pattern in self.patterns):
-            if gap:  # what was lost may have been at a place that one does
-                self._owe(whole, lost)
-            return
+            if len(self._gaps) > _MOST_GAPS:
+                self._gaps = None
         self.queue.put(
             Event(
                 path,

@@ -17,7 +17,7 @@ from ..concurrency.queues import BoundedQueue, Last, Policy
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan.notices import Notice
-from ..plan.paths import Path, parse_shown
+from ..plan.paths import Path, parse_shown, show
 from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
 from ..session import Session
 from .follower import Follower
@@ -70,7 +70,8 @@ class PatternWatch(Stream[Update]):
         self._followed: dict[str, list[Follower]] = {}
         self._born: dict[str, list[Notice]] = {}  # about to be followed
         self._failed: set[str] = set()  # could not be followed: what is there later was not made just then
-        self._unreadable: set[str] = set()  # of these that was because of what is there, or of rights
+        self._unreadable: dict[str, tuple[Path, ...]] = {}  # places in keys, because of what is there, or of rights
+        self._warned: set[tuple[str, Path]] = set()
 
     @property
     def _begun(self) -> bool:
@@ -115,6 +116,7 @@ class PatternWatch(Stream[Update]):
         self._born.clear()
         self._failed.clear()
         self._unreadable.clear()
+        self._warned.clear()
         for listener in leaving:
             if self._manager is not None and self._begun:
                 await self._manager.unfollow(listener)
@@ -128,7 +130,8 @@ class PatternWatch(Stream[Update]):
 
     def _new(self, found: set[str]) -> list[str]:
         """Return those that are to be followed and are not."""
-        return sorted(name for name in found if name not in self._followed and self._paths(name))
+        lacking = (found - self._followed.keys()) | (found & self._unreadable.keys())
+        return sorted(name for name in lacking if self._paths(name))
 
     def _paths(self, name: str) -> list[Path]:
         """Return the places to follow in a key: what the patterns spell out, but not what is below another of these."""
@@ -137,60 +140,76 @@ class PatternWatch(Stream[Update]):
 
     async def _follow(self, names: Iterable[str], *, late: bool) -> None:
         """Follow some keys; what cannot be read is told in a warning, and tried again at each look."""
-        manager, session = self._manager, self._session
+        manager = self._manager
         if manager is None or self._closed:  # meanwhile
             return
-        followers: dict[str, list[Follower]] = {}
+        coming: dict[str, dict[Path, Follower]] = {}
         for name in names:
-            if name in self._followed:  # meanwhile
-                continue
-            keys, born = session.keys(name), self._born.setdefault(name, [])
-            is_new = late and name not in self._failed
+            is_new = late and name not in self._failed and name not in self._followed
             self._failed.discard(name)
-            self._followed[name] = there = followers[name] = []
-            for path in self._paths(name):
-                follower = Follower(
-                    keys,
-                    path,
-                    session.ships,
-                    session.cache,
-                    manager,
-                    stored=True,
-                    largest=self._largest,
-                )
-                follower.queues = [_Fitting(self, name, path)]
-                follower.born = born if is_new else None
-                there.append(follower)
-        begun: set[str] = set()
+            if places := self._lacking(name):
+                born = self._born.setdefault(name, [])
+                there = {path: self._follower(name, path, born if is_new else None, manager) for path in places}
+                self._followed.setdefault(name, []).extend(there.values())
+                coming[name] = there
+        followers = [follower for there in coming.values() for follower in there.values()]
         try:
-            await manager.subscribe_all([each for there in followers.values() for each in there])
-            for name, there in followers.items():
-                if await self._begin(name, there, manager):
-                    self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
-                    begun.add(name)
+            await manager.subscribe_all(followers)
+            for name in list(coming):
+                await self._begin(name, coming[name], manager)
+                self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
+                del coming[name]
         finally:
-            for name in followers.keys() - begun:  # they are found again; the others have told what is there
+            for name, there in coming.items():  # they are found again
                 self._born.pop(name, None)
-                self._failed.add(name)
-                self._drop(name)
+                self._put_off(name, there)
             if self._closed:  # meanwhile
-                for name in begun:
-                    self._drop(name)
+                for follower in followers:
+                    self._let_go(follower)
 
-    async def _begin(self, name: str, followers: Iterable[Follower], manager: SubscriptionManager) -> bool:
-        """Begin to follow one key; return False if that fails because of what is there, or of rights to it."""
-        try:
-            for follower in followers:
+    def _lacking(self, name: str) -> Iterable[Path]:
+        """Return the places in a key that are to be followed and are not."""
+        unreadable = self._unreadable.pop(name, ())
+        return unreadable if name in self._followed else self._paths(name)
+
+    def _follower(self, name: str, path: Path, born: list[Notice] | None, manager: SubscriptionManager) -> Follower:
+        session, keys = self._session, self._session.keys(name)
+        follower = Follower(keys, path, session.ships, session.cache, manager, stored=True, largest=self._largest)
+        follower.queues = [_Fitting(self, name, path)]
+        follower.born = born
+        return follower
+
+    async def _begin(self, name: str, there: dict[Path, Follower], manager: SubscriptionManager) -> None:
+        """Begin to follow places in one key, and take them out; what cannot be read is put off."""
+        unreadable: dict[Path, Follower] = {}
+        for path, follower in list(there.items()):
+            try:
                 await manager.follow_here(follower)
-        except ReemError as error:
-            if isinstance(error, RedisError | InterfaceClosed) and not isinstance(error, NotAllowed | WrongKind):
-                raise
-            if name not in self._unreadable:
-                self._unreadable.add(name)
-                logger.warning("%s cannot be watched until that is mended: %s", name, error)
-            return False
-        self._unreadable.discard(name)
-        return True
+            except ReemError as error:
+                if isinstance(error, RedisError | InterfaceClosed) and not isinstance(error, NotAllowed | WrongKind):
+                    raise
+                unreadable[path] = follower
+                if (name, path) not in self._warned:
+                    self._warned.add((name, path))
+                    logger.warning("%s cannot be watched until that is mended: %s", show((name, *path)), error)
+            else:
+                self._warned.discard((name, path))
+            del there[path]
+        if unreadable:
+            self._put_off(name, unreadable)
+            self._unreadable[name] = tuple(unreadable)
+
+    def _put_off(self, name: str, there: dict[Path, Follower]) -> None:
+        """Let go of followers that could not begin, which is tried again; those of other places in the key go on."""
+        left = [each for each in self._followed.get(name, []) if each not in there.values()]
+        for follower in there.values():
+            self._let_go(follower)
+        if left:
+            self._followed[name] = left
+            self._unreadable[name] = (*self._unreadable.get(name, ()), *there)
+        else:
+            self._followed.pop(name, None)
+            self._failed.add(name)
 
     def heard(self, notice: Notice, channel: bytes) -> None:
         """Follow the key of which somebody has published something, unless it is followed."""
@@ -228,10 +247,14 @@ class PatternWatch(Stream[Update]):
             self._drop(name)
 
     def _drop(self, name: str) -> None:
+        self._unreadable.pop(name, None)
         for follower in self._followed.pop(name, []):
-            follower.queues = []  # it tells nothing more: whoever follows the key next does
-            if self._manager is not None:
-                self._manager.tasks.start(self._manager.unfollow_here(follower), "reem unfollow")
+            self._let_go(follower)
+
+    def _let_go(self, follower: Follower) -> None:
+        follower.queues = []  # it tells nothing more: whoever follows the place next does
+        if self._manager is not None:
+            self._manager.tasks.start(self._manager.unfollow_here(follower), "reem unfollow")
 
     async def look(self) -> None:
         """Follow keys that have come to be, and let go of those that are gone."""
@@ -239,7 +262,9 @@ class PatternWatch(Stream[Update]):
         try:
             found = await self._there()
             self._failed &= found
-            self._unreadable &= found
+            for name in self._unreadable.keys() - found:
+                del self._unreadable[name]
+            self._warned = {each for each in self._warned if each[0] in found}
             for name in followed:  # of a place in a key, no update says that all of the key is gone
                 if name not in found:
                     self._drop_if_gone(name)

@@ -159,7 +159,7 @@ class EmbeddedCluster(Startable):
         with self._lock:
             if self._finalizer is not None:
                 self._finalizer()
-            self._finalizer, self.nodes = None, []
+            self._finalizer, self._owner, self.nodes = None, None, []
 
     @property
     def url(self) -> str:

@@ -124,6 +124,7 @@ class EmbeddedServer(Startable):
     def _stop(self) -> None:
         with self._lock:
             self._clear()
+            self._owner = None
 
     @property
     def running(self) -> bool:

@@ -172,7 +172,7 @@ async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
     while type(outcome) is Plan and outcome.held:
         try:
             replies = await held.roundtrip(wire_commands(outcome))
-        except NotConnected as error:
+        except (Contended, NotConnected) as error:
             raise _told(outcome, error) from error
         sent = outcome
         try:

@@ -83,6 +83,8 @@ class AsyncTransport:
 
     async def _connected(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         wire = await self._lane(bulk)
+        if not wire.alive:  # it was retired before its first call
+            wire = await self._lane(bulk)
         if wire.plain:
             return await self._as_text(commands, bulk)
         return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))

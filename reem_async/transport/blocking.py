@@ -54,16 +54,19 @@ class _Line:
 
     def __init__(self, options: Options, states: States, lines: list[weakref.ref[_Line]]) -> None:
         self._states, self._lines = states, lines
+        self._is_made = False
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
+            self._socket: socket.socket = self._connection._sock
+            self._tls = hasattr(self._socket, "context")
+            # Python asks whether a socket with a time limit is ready before it sends, too. This one has none.
+            self._out = self._socket if self._tls else self._socket.dup()
         except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
             self._connection.disconnect()
             raise options.refused(error) from error
-        self._socket: socket.socket = self._connection._sock
-        self._tls = hasattr(self._socket, "context")
-        # Python asks whether a socket with a time limit is ready before it sends, too. This one knows of no limit.
-        self._out = self._socket if self._tls else socket.socket(fileno=os.dup(self._socket.fileno()))
+        if not self._tls:
+            self._out.settimeout(0.0)
         self._timeout = options.timeout
         self._limit = 0.0
         self._moved = 0.0  # when a byte of a large value, or of the reply to it, was last seen to move
@@ -83,6 +86,7 @@ class _Line:
             raise unanswered(options.address, error) from error
         self.plain = bool(probed) and is_plain(probed[0])
         self._states.opened(options.address, who([self.introduction]), tell=False)
+        self._is_made = True
         lines.append(weakref.ref(self, lines.remove))
 
     def _set_limit(self, limit: float) -> None:
@@ -212,14 +216,14 @@ class _Line:
         """Close the connection and return the error that says why."""
         self.close()
         error = ConnectionLost(reason)
-        self._states.lost(error)
+        self._states.lost(error, tell=self._is_made)  # else whoever has it made tells
         return error
 
     def close(self) -> None:
         """Close the connection."""
         self.broken, self.waiting = True, False
-        self._out.close()
         self._connection.disconnect()
+        self._out.close()
 
     def __del__(self) -> None:  # an interrupted call may have kept it from being given back
         if hasattr(self, "_out"):
@@ -268,9 +272,10 @@ class BlockingTransport:
             except IndexError:
                 if stale is not None:  # there was none left
                     stale.lost("the server closed an idle connection")
-                line = aside(self._opened)
-                self.states.tell()  # here: what is called back may need a lock that this thread has
-                return line
+                try:
+                    return aside(self._opened)
+                finally:
+                    self.states.tell()  # here: what is called back may need a lock that this thread has
             if line.fresh():
                 return line
             line.close()

@@ -398,11 +398,11 @@ class ClusterTransport(Rooted):
                 else:
                     await route.refused(problem)
 
-    def lost(self, address: Address, reason: Exception) -> bool:
+    def lost(self, address: Address, reason: Exception, *, tell: bool) -> bool:
         """Note that the connections to a node broke; return whether it is missed."""
         if not isinstance(reason, InterfaceClosed):
             self._gone.add(address)
-        self.states.lost(reason)
+        self.states.lost(reason, tell=tell)
         return address in self._gone and self.states.last.state != "closed"
 
     def opened(self, address: Address, server: str | None, *, tell: bool) -> None:
@@ -434,6 +434,6 @@ class _NodeStates(States):
         """Pass it on."""
         self._cluster.states.tell()
 
-    def lost(self, reason: Exception) -> bool:
+    def lost(self, reason: Exception, *, tell: bool = True) -> bool:
         """Pass it on."""
-        return self._cluster.lost(self._node, reason)
+        return self._cluster.lost(self._node, reason, tell=tell)

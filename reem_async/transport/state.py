@@ -62,7 +62,13 @@ class StateChanges(Stream[StateChange]):
 
 
 class _Turn:
-    """To call back: it ends with the call that has it, also where that is interrupted."""
+    """To call back: it ends with the call that has it, also where that is interrupted.
+
+    Attributes:
+        over: It has ended; somebody may keep it with what was raised.
+    """
+
+    over = False
 
 
 def _nobody() -> None:
@@ -112,10 +118,14 @@ class States:
         if tell:
             self.tell()
 
-    def lost(self, reason: Exception) -> bool:
-        """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
+    def lost(self, reason: Exception, *, tell: bool = True) -> bool:
+        """Note that a connection broke, unless it was closed on purpose; return whether there is none now.
+
+        For `tell` see `opened`.
+        """
         is_lost = self.apart(partial(self._lost, reason))
-        self.tell()
+        if tell:
+            self.tell()
         return is_lost
 
     def answered(self) -> None:
@@ -138,12 +148,16 @@ class States:
         if not self._untold:
             return
         turn = _Turn()
-        while (change := self.apart(partial(self._next, turn))) is not None:
-            for callback in tuple(self._callbacks):
-                try:
-                    callback(change)
-                except Exception:
-                    logger.exception("a callback for changes of the connection raised")
+        try:
+            while (change := self.apart(partial(self._next, turn))) is not None:
+                self._untold.popleft()  # not before: whoever is interrupted on the way to here leaves it to the next
+                for callback in tuple(self._callbacks):
+                    try:
+                        callback(change)
+                    except Exception:
+                        logger.exception("a callback for changes of the connection raised")
+        finally:
+            turn.over = True
 
     # With the lock.
 
@@ -192,13 +206,14 @@ class States:
     def _next(self, turn: _Turn) -> StateChange | None:
         """Return the next change to tell for who has the turn, or takes it; None if there is none, or another has."""
         with self._lock:
-            if self._turn() not in (None, turn):
+            holder = self._turn()
+            if holder not in (None, turn) and not holder.over:
                 return None
             if not self._untold:
                 self._turn = _nobody
                 return None
             self._turn = weakref.ref(turn)
-            return self._untold.popleft()
+            return self._untold[0]
 
     def _listening(self) -> list[BoundedQueue]:
         return [queue for reference in tuple(self._queues) if (queue := reference()) is not None]
