@@ -135,6 +135,30 @@ def test_there_are_two_attempts_however_long_they_take():
         contention.over()  # what follows has a time of its own
 
 
+def test_waiting_for_calls_of_ones_own_interface_is_no_contention():
+    contention = Contention(0.1)
+    contention.given_up([("SET", "{foo}.a", b"")])
+    time.sleep(0.15)
+    contention.waited(0.14)
+    contention.given_up([("SET", "{foo}.a", b"")])
+
+
+async def test_a_connection_that_breaks_costs_only_the_call_that_it_was_lent_to(server, raw):
+    """Who waits behind it has a connection of his own; the server is there."""
+    async with reem_async.RedisInterface(server) as interface:
+        place = reem_async.KeyValueStore(interface)["broken"]
+        await place.write({"text": "x" * 3_000_000})
+        calls = [asyncio.ensure_future(place[f"n{number}"].write(number)) for number in range(8)]
+        while not server.json and not (busy := [each for each in raw.client_list() if int(each["watch"])]):
+            await asyncio.sleep(0)
+        if not server.json:
+            raw.client_kill_filter(_id=busy[0]["id"])
+        outcomes = await asyncio.gather(*calls, return_exceptions=True)
+    failed = [outcome for outcome in outcomes if outcome is not None]
+    assert all(isinstance(outcome, reem.ConnectionLost) for outcome in failed)
+    assert len(failed) <= 1
+
+
 def test_the_limit_of_one_call_is_its_own(server, raw, monkeypatch):
     with contextlib.closing(reem.RedisInterface(server, timeout=30)) as interface:
         kvs = reem.KeyValueStore(interface)

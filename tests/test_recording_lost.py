@@ -11,6 +11,7 @@ import reem_async
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import default_ships
 from reem_async.tools.recording import Recorder, Replayer, open_log, sink
+from reem_async.tools.recording.export import export
 from reem_async.tools.recording.roles import Kind, Role
 
 
@@ -163,3 +164,26 @@ def test_where_there_is_no_channel_any_more_it_is_said_once_and_the_file_stays_w
     assert "as many channels as MCAP can have" in said
     with open_log(file) as log:
         assert (log.indexed, log.verify()) == (True, 0)
+
+
+def test_an_export_of_arrays_has_each_value_at_its_time_beside_what_was_lost(file, tmp_path):
+    """What keyframes repeat is no news because of it, whoever has read the recording before."""
+    long = [float(number) for number in range(100)]
+    writing = Writing(file)
+    writing.put(Role.STATE, {"li": long}, kind=Kind.READ)
+    writing.put(Role.UPDATE, long, "li")
+    for number in (-1.0, -2.0):
+        writing.put(Role.UPDATE, number, "li", 0)
+        writing.put(Role.KEYFRAME, None)
+    writing.put(Role.UPDATE, Sweep(), "li")
+    for number in (-3.0, -4.0):
+        writing.put(Role.UPDATE, [number, *long[1:]], "li")
+    writing.told()
+    with open_log(file) as log:
+        times, values = log["a.li"].history()
+        assert values[:, 0].tolist() == [0, 0, -1, -2, -3, -4]
+        assert np.array_equal(log["a.li"].history()[0], times)
+        export(log, "npz", tmp_path / "a.npz", ["a.li"])
+    with np.load(tmp_path / "a.npz") as exported:
+        assert np.array_equal(exported["a.li.time"], times)
+        assert_same(exported["a.li"], values)

@@ -12,7 +12,7 @@ from conftest import PATIENCE, eventually
 import reem
 from reem_async.transport.blocking import BlockingTransport
 from reem_async.transport.options import Options
-from reem_async.transport.state import States
+from reem_async.transport.state import StateChange, States
 
 
 def ends(work):
@@ -54,6 +54,47 @@ def test_a_callback_on_the_main_thread_may_publish_too(server_url, key):
         pspace[name]["n"].write(1)
         assert threads == [threading.main_thread()]
         interface.close()
+
+
+def test_a_callback_that_is_interrupted_silences_no_later_one():
+    """Though somebody keeps what was raised, as a prompt does."""
+    states, heard, kept = States(), [], []
+
+    def told(change):
+        if change.state == "connected" and not kept:
+            raise KeyboardInterrupt
+        heard.append(change.state)
+
+    states.call(told)
+    try:
+        states.opened("there", "1")
+    except KeyboardInterrupt as error:
+        kept.append(error)
+    states.lost(OSError("cut"))
+    states.opened("there", "1")
+    states.closed()
+    assert kept
+    assert heard == ["lost", "connected", "closed"]
+
+
+def test_an_interrupt_on_the_way_to_a_callback_leaves_the_change_to_the_next():
+    class Interrupted(States):
+        """Ctrl-C comes once as the step that asks for the next change is done."""
+
+        def apart(self, step):
+            result = step()
+            if isinstance(result, StateChange) and not interrupted:
+                interrupted.append(result)
+                raise KeyboardInterrupt
+            return result
+
+    interrupted, heard = [], []
+    states = Interrupted()
+    states.call(lambda change: heard.append(change.state))
+    with pytest.raises(KeyboardInterrupt):
+        states.opened("there", "1")
+    states.closed()
+    assert heard == ["connected", "closed"]
 
 
 def test_changes_are_told_in_order_while_a_callback_waits_for_another_thread():
