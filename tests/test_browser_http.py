@@ -285,8 +285,10 @@ def test_arrays_of_the_past(ask, pspace, key):
     name = key("cam")
     frames = [np.full((200, 200), value, np.uint8) for value in (10, 20)]
     times = []
-    for frame in frames:
+    for number, frame in enumerate(frames, 1):
         pspace[name] = {"image": frame}
+        # What the page has not heard of yet is read at the server.
+        eventually(lambda number=number: sum(ask.json("activity", path=name)["counts"]) >= number)
         eventually(lambda frame=frame: kept(ask, name) == int(frame[0, 0]))
         times.append(time.time())
     for frame, at in zip(frames, times, strict=True):
