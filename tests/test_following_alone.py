@@ -56,6 +56,15 @@ async def following(interface, name):
     return subscriber
 
 
+async def cancelled(call, moment):
+    """Begin a call, and cancel it at a moment."""
+    task = asyncio.ensure_future(call)
+    await moment
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
 async def gathered(stack, stream):
     """Begin to follow; returns the list that what is told goes into."""
     await stream.listen()
@@ -137,11 +146,7 @@ async def test_a_cancelled_listen_leaves_no_other_subscriber_of_the_channel_behi
         waiting, let_go = held(manager)
         for wire in list(manager._wires.values()):
             wire.abort(reem_async.ConnectionLost("cut"))
-        task = asyncio.ensure_future(following(interface, "b"))
-        await waiting.wait()
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        await cancelled(following(interface, "b"), waiting.wait())
         let_go()
         await pub["b"].write(2)
         await aeventually(lambda: before.value() == 2)
@@ -152,11 +157,7 @@ async def test_a_cancelled_listen_leaves_no_subscription(server, other, held):
         await following(interface, "a")
         manager = manager_of(interface.session)
         waiting, let_go = held(manager)
-        task = asyncio.ensure_future(following(interface, "b"))
-        await waiting.wait()
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        await cancelled(following(interface, "b"), waiting.wait())
         let_go()
         await manager.fence()
         assert not [topic for topic in (*manager._subscribed, *manager._topics) if b"{b}" in topic.name]
@@ -336,11 +337,7 @@ async def test_a_subscriber_that_comes_while_a_cancelled_one_is_confirmed_begins
         manager = manager_of(interface.session)
         confirmed, turn_on, kept = manager._subscribing._confirmed, manager.invalidations.turn_on, []
         monkeypatch.setattr(manager._subscribing, "_confirmed", lambda *arguments: kept.append(arguments))
-        task = asyncio.ensure_future(following(interface, "k"))
-        await aeventually(lambda: kept)
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+        await cancelled(following(interface, "k"), aeventually(lambda: kept))
         monkeypatch.setattr(manager._subscribing, "_confirmed", confirmed)
 
         async def late(wire):
