@@ -378,19 +378,19 @@ def _mirror_through(end: Any, url: str, place: int, count: Count, costs: Costs) 
 
         def look() -> None:
             """Look at the memory when no frame waits for the callback: up to a thousand may, as is due."""
-            deadline = time.monotonic() + PATIENCE
-            while (data := mirror.value()) and data["id"] != last[0] and time.monotonic() < deadline:
-                del data
-                time.sleep(0.01)
+            seen = None
+            while seen != last[0]:
+                seen = last[0]
+                time.sleep(0.3)  # a callback takes a thirtieth of that at most
             kept.clear()
             costs.look()
 
-        while end.recv() != "end":
+        while (asked := end.recv()) != "end":
+            if asked == "look" and not costs.begun:
+                look()
             data = mirror.value()
             end.send((data["id"], is_whole_shot(data)) if data else (None, True))
             del data
-            if not costs.begun:
-                look()
         look()
 
 
@@ -441,6 +441,8 @@ def with_server(url: str, seed: int, rounds: int, say: Callable[[str], None]) ->
                     assert found[1], "a mirror has a torn frame"
                     assert time.monotonic() < begun + PATIENCE, "a mirror has something else than the server"
             slowest[early] = max(slowest[early], time.monotonic() - begun)
+            for party in mirrors:  # behind the time taken: this waits for slow callbacks
+                party.ask("look")
         for party in mortal:
             party.stop(signal.SIGKILL)
             party.end()
