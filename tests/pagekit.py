@@ -67,7 +67,7 @@ def visit(chromium, address, key):  # the key, since pages must be closed before
     yield visitor
     for context in visitor.contexts:
         context.close()
-    assert visitor.said == []
+    assert visitor.said == [], visitor.said
     elsewhere = [url for url in visitor.asked if not url.startswith(("http://127.0.0.1:", "blob:http://127.0.0.1:"))]
     assert elsewhere == []
 

@@ -323,4 +323,6 @@ def test_what_is_wrong_with_a_value_is_said_beside_the_field(visit, pspace, key,
     area.fill("3")
     expect(page.locator(".wrong")).to_be_hidden()
     with served(live(server_url)) as (address, _):
-        expect(visit.open("/", address).locator("#badge")).to_be_hidden()
+        page = visit.open("/", address)
+        expect(page.locator("#badge")).to_be_hidden()
+        page.close()  # before its program ends, which a page says on its console
