@@ -108,6 +108,7 @@ WITH_MODULE = {
     "test_compose_starts_the_server_with_these_files": "the same",
     "test_another_namespace": "the same",
     "test_nobody_gets_in_without_a_password": "the same",
+    "test_whole_arms_send_what_they_should": "sends commands of the module by sockets of its own",
     "test_outline_tells_what_is_there_without_fetching_arrays": "counts GET",
     "test_an_empty_server_gets_everything_bit_for_bit": "compares text that the module has made of numbers",
     "test_the_servers_own_text_would_not_do": "shows how the module reads numbers",

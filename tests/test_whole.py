@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 
 import pytest
@@ -66,13 +67,14 @@ async def test_a_count_that_goes_on_growing_is_told(cluster, fleet, key, tmp_pat
     number = iter(range(1000))
 
     async def growing(*where):
-        await reem_async.KeyValueStore(fleet)[f"new{next(number)}"].write(1)
+        for _ in range(5):  # some that other tests have left may expire meanwhile
+            await reem_async.KeyValueStore(fleet)[f"new{next(number)}"].write(1)
         return await counted(*where)
 
     monkeypatch.setattr(survey, "counted", growing)
     saved = await save(fleet, tmp_path / "all.zip")
     assert {each.name for each in saved.keys} >= ALL
-    assert saved.doubt == "the server counts 1 Redis keys more than it named: new ones, or missed"
+    assert re.fullmatch("the server counts [1-5] Redis keys more than it named: new ones, or missed", saved.doubt)
 
 
 async def test_one_node_of_several_is_not_taken_for_all(cluster, fleet, key, tmp_path):
