@@ -108,14 +108,14 @@ async def survey(session: Session, match: str) -> Survey:
         found.names.append(check_top_key(match))
         return found
     for _ in range(_LOOKS):
-        await _look(session, found, wanted)
+        named = await _look(session, found, wanted)
         held = await counted(session.transport, session.options.database)
         if held is None:
             found.doubt = "this user may not ask the server for its count (+info), so it was not compared"
             break
         # Keys that were written meanwhile are counted but not seen: another look finds them, or keys that moved
-        # between nodes.
-        more = held - len(found.seen)
+        # between nodes. Of one look only: what was deleted since the first would hide as many that were missed.
+        more = held - named
         found.doubt = f"the server counts {more} Redis keys more than it named: new ones, or missed" if more > 0 else ""
         if not found.doubt:
             break
@@ -123,14 +123,16 @@ async def survey(session: Session, match: str) -> Survey:
     return found
 
 
-async def _look(session: Session, found: Survey, wanted: Wanted) -> None:
-    """Add the keys that were not seen before."""
+async def _look(session: Session, found: Survey, wanted: Wanted) -> int:
+    """Add the keys that were not seen before; returns how many were named, seen before or not."""
     space = session.namespace.encode()
+    named: set[bytes] = set()  # SCAN may name a key twice
     async for page in scanned(session.transport):
-        # SCAN may name a key twice.
+        named.update(map(bytes, page))
         fresh = [key for key in dict.fromkeys(map(bytes, page)) if key not in found.seen]
         found.seen.update(fresh)
         # In the namespace itself, or with a tag of it.
         ours = [key for key in fresh if key.startswith((space, b"{" + space))]
         kinds: list[str] = await session.run(types(ours)) if ours else []
         found.add_page(ours, kinds, space, wanted)
+    return len(named)
