@@ -309,6 +309,8 @@ def test_arrays_of_the_past(ask, pspace, key):
 def test_what_is_only_stored_is_noticed_too(ask, kvs, key):
     kvs[key()] = {"x": 1}
     eventually(lambda: key() in ask.rows(at=time.time()))
+    # What the page has not heard of yet it asks the server for: it is the past once the series has it.
+    eventually(lambda: any(line[-1:] == [1.0] for line in ask.json("series", path=f"{key()}.x")["lines"]))
     at = ask.json("tree", open="1:0:")["end"]
     kvs[key()]["x"] = 2
     eventually(lambda: ask.json("series", path=f"{key()}.x")["lines"][0][-1] == 2.0)
