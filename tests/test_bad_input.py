@@ -5,6 +5,7 @@ The rows are those of research/reliability.md, section 4, and of issue 2, item 3
 
 from __future__ import annotations
 
+import array
 import asyncio
 import dataclasses
 import datetime
@@ -80,6 +81,7 @@ VALUES = {
     "uuid": (BadType, uuid.UUID(int=5)),
     "enum": (BadType, Colour.RED),
     "dataclass": (BadType, Pose()),
+    "array.array": (BadType, array.array("d", [1])),
     "object array": (BadType, np.array([1, "a", None], object)),
     "0-d object array": (BadType, np.array(None, object)),
     "struct with object": (BadType, np.zeros(2, [("n", "i4"), ("o", "O")])),
@@ -105,6 +107,7 @@ VALUES = {
     "circle": (TooDeep, circle()),
 }
 if np.dtype(np.longdouble) != np.dtype(np.float64):
+    VALUES["longdouble scalar"] = (BadType, np.longdouble(1))
     VALUES["longdouble"] = (BadType, np.zeros(2, np.longdouble))
     VALUES["clongdouble"] = (BadType, np.zeros(2, np.clongdouble))
     VALUES["struct with longdouble"] = (BadType, np.zeros(2, [("n", "i4"), ("x", np.longdouble)]))
@@ -155,6 +158,22 @@ def test_the_error_names_the_path_of_the_bad_value(front, key, raw, stored, row)
     where = [text.find(part) for part in (key(), "outer", "left", "1", "right")]
     assert -1 not in where, text
     assert "neighbour" not in text, "only the path is named, not the neighbours"
+
+
+@pytest.mark.parametrize("row", ["array.array", "longdouble", "longdouble scalar", "clongdouble"])
+def test_the_line_to_write_for_other_numbers_can_be_stored(front, key, row):
+    """Each message ends with it; `x` is the value."""
+    if row not in VALUES:
+        pytest.skip("long double is float64 on this machine")
+    with pytest.raises(BadType) as caught:
+        front.write([key()], VALUES[row][1])
+    remedies = {
+        "np.asarray(x)": np.asarray,
+        "float(x)": float,
+        "np.asarray(x, np.float64)": lambda x: np.asarray(x, np.float64),
+        "np.asarray(x, np.complex128)": lambda x: np.asarray(x, np.complex128),
+    }
+    front.write([key()], remedies[str(caught.value).partition("use ")[2]](VALUES[row][1]))
 
 
 @pytest.mark.parametrize("row", ["nan", "int above", "set", "object array", "key int", "circle"])

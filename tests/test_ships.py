@@ -151,6 +151,68 @@ def test_the_first_ship_that_fits_takes_the_value(open_front, key, raw):
     assert "greedy" in raw.execute_command("JSON.GET", key())
 
 
+class Fussy(np.ndarray):
+    """As astropy's Quantity: not to be made bytes without its unit."""
+
+    def tobytes(self, order="C"):
+        raise NotImplementedError("cannot write quantities to bytes")
+
+
+class Unit(np.ndarray):
+    """As unyt's arrays: the unit is an attribute, which views and copies inherit."""
+
+    def __array_finalize__(self, other):
+        self.unit = getattr(other, "unit", "km")
+
+
+class AnyArrayShip(NumpyShip):
+    """Claims each subclass of arrays, whose class it leaves out."""
+
+    def check_fit(self, value):
+        return isinstance(value, np.ndarray)
+
+    def get_label(self):
+        return "any array"
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_array_subclass_is_refused_unless_a_ship_claims_it(open_front, key, raw, seed):
+    """Of random subclasses, dtypes, shapes and strides; what the message says to write is stored exactly."""
+    print("seed", seed)
+    rng = np.random.default_rng(seed)
+    front, claiming = open_front(), open_front(ships=[NumpyShip(), AnyArrayShip()])
+    for number in range(12):
+        base = rng.choice(["f8", ">i2", "M8[ns]", "U3"])
+        items = rng.integers(0, 99, rng.choice([0, 3, 900], 2)).astype(base)[:: rng.choice([1, 2])]
+        kinds = [
+            Fussy,
+            Unit,
+            type("Random", (rng.choice([Fussy, Unit, np.recarray]),), {}),
+            np.ma.MaskedArray,
+        ]
+        value = items.view(kinds[number % 4])
+        with nothing_sent(raw), pytest.raises(BadType, match=rf"{key()}.*(np.asarray\(x\)|getmaskarray\(x\))"):
+            front.write([key()], {"pose": [value]})
+        front.write([key()], {"pose": [np.asarray(value)]})
+        assert_same(front.read([key()]), {"pose": [items]})
+        claiming.write([key()], {"pose": value.view(Unit), "plain": items})
+        assert raw.smembers("{" + key() + "}:ships") == {".pose", ".plain"}
+        assert_same(claiming.read([key()]), {"pose": items, "plain": items})
+
+
+def test_classes_that_add_nothing_to_their_items_are_stored_as_arrays(front, key, tmp_path):
+    """memmap, matrix and recarray."""
+    mapped = np.memmap(tmp_path / "image", np.uint8, "w+", shape=(50, 100))
+    for value in mapped, mapped[3:5], np.eye(2).view(np.matrix), np.rec.array([(1, 2.0)], names="a,b"):
+        front.write([key()], value)
+        assert_same(
+            front.read([key()]),
+            np.frombuffer(value.tobytes(), value.dtype.descr if value.dtype.names else value.dtype).reshape(
+                value.shape
+            ),
+        )
+
+
 def test_an_unknown_label_is_said_with_the_remedy(open_front, key):
     """A program without the ship cannot read what another wrote; the rest of the document is readable."""
     open_front(ships=[PoseShip()]).write([key()], {"at": Pose(1, 2), "n": 5})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import redis
@@ -30,6 +32,18 @@ def test_an_array_that_no_server_takes_is_refused(open_front, front, key, space)
         with pytest.raises(BadValue, match=f"{key()}.*536870940 bytes .* 536870912"):
             call()
     assert front.read([key()]) == {"keep": [1]}
+
+
+@pytest.mark.parametrize("size", [2 << 30, 10**13])
+def test_a_broadcast_array_is_refused_before_it_is_copied_out(front, key, size):
+    """It takes one byte of memory; packed, it would take all there is."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(BadValue, match=f"{key()}.*{size} bytes"):
+            front.write([key()], np.broadcast_to(np.uint8(7), (size,)))
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])

@@ -8,6 +8,7 @@ exactly, and name the path of what it refuses.
 
 from __future__ import annotations
 
+import array
 import datetime
 import enum
 import marshal
@@ -24,10 +25,24 @@ from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
-__all__ = ["DEEPEST", "Attachment", "Encoded", "Fits", "encode", "nested_over", "number_text", "plain", "walk"]
+__all__ = [
+    "DEEPEST",
+    "PLAIN_ARRAYS",
+    "Attachment",
+    "Encoded",
+    "Fits",
+    "encode",
+    "nested_over",
+    "number_text",
+    "plain",
+    "walk",
+]
 
 DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
+
+PLAIN_ARRAYS = frozenset({np.ndarray, np.memmap, np.matrix, np.recarray})
+"""Array classes that hold their items and nothing else. Others may have a unit or a mask, which would be lost."""
 
 _MANY = 32
 """Floats in a list from which converting them together pays."""
@@ -308,7 +323,13 @@ class _Walker:
 
     def _numpy_scalar(self, value: np.generic, path: Path) -> Any:
         plain = value.item()
-        # datetime64 and long doubles have no equal among Python's plain types.
+        if isinstance(value, np.longdouble | np.clongdouble):
+            use = "np.asarray(x, np.complex128)" if isinstance(value, np.clongdouble) else "float(x)"
+            raise BadType(
+                f"{show(self._place + path)}: {shorten(value)} is a long double, which differs between machines; "
+                f"use {use}"
+            )
+        # datetime64 has no equal among Python's plain types.
         if type(plain) not in (bool, int, float, str) or isinstance(value, np.datetime64 | np.timedelta64):
             raise BadType(
                 f"{show(self._place + path)}: the numpy scalar {shorten(value)} has no plain Python equal; "
@@ -317,8 +338,10 @@ class _Walker:
         return self.convert(plain, path)
 
     def _refusal(self, value: Any, path: Path) -> BadType:
+        # The repr of an array has several lines.
+        what = f"an array {value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else shorten(value)
         return BadType(
-            f"{show(self._place + path)}: {shorten(value)} ({type(value).__name__}) cannot be stored; {_remedy(value)}"
+            f"{show(self._place + path)}: {what} ({type(value).__name__}) cannot be stored; {_remedy(value)}"
         )
 
 
@@ -348,13 +371,23 @@ def _remedy(value: Any) -> str:
         (numbers.Number, "use float(value) or str(value)"),
         ((datetime.datetime, datetime.date), "use value.timestamp(), integer nanoseconds, or value.isoformat()"),
         (datetime.timedelta, "use value.total_seconds()"),
-        (np.ndarray, "add NumpyShip() to the interface's ships"),
+        (np.ma.MaskedArray, "use {'data': x.filled(0), 'mask': np.ma.getmaskarray(x)}, or a ship for its class"),
+        ((np.ndarray, array.array), _array_remedy(value)),
         ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
     )
     if (how := getattr(value, "_how_to_read", None)) is not None:
         return f"it is a handle: store the value there, with {how}"
     anything = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
     return next((text for kinds, text in remedies if isinstance(value, kinds)), anything)
+
+
+def _array_remedy(value: Any) -> str:
+    # isinstance would also take subclasses, for which NumpyShip does not fit.
+    if type(value) in PLAIN_ARRAYS:
+        return "add NumpyShip() to the interface's ships"
+    if isinstance(value, np.ndarray):
+        return "use np.asarray(x) and store beside it what its class adds (unit, mask), or a ship for its class"
+    return "use np.asarray(x)"
 
 
 def _check_int(value: int, place: Path) -> int:

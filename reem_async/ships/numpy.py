@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadData, BadType
+from ..plan.documents import PLAIN_ARRAYS
 from .base import BlobShip
 
 __all__ = ["NumpyShip", "flat", "flat_buffer"]
@@ -60,8 +61,9 @@ class NumpyShip(BlobShip):
     """Carries numpy arrays of every dtype that is data: all but object, StringDType and long double.
 
     Arrays come back C-contiguous, of the same dtype (byte order, field names and time units
-    included) and shape, bit for bit, and read-only: they share memory with the reply. Subclasses
-    (memmap, matrix, recarray) come back as plain arrays. Masked arrays are refused.
+    included) and shape, bit for bit, and read-only: they share memory with the reply. memmap, matrix and
+    recarray come back as plain arrays. Other subclasses, such as masked arrays and astropy's Quantity, may hold
+    more than their items: they are left to a ship of their own, and refused if there is none.
     """
 
     carries = np.ndarray
@@ -71,15 +73,11 @@ class NumpyShip(BlobShip):
         return "numpy"
 
     def check_fit(self, value: Any) -> bool:
-        """Return whether `value` is an array."""
-        return isinstance(value, np.ndarray)
+        """Return whether `value` is an array, and of a class that adds nothing to its items."""
+        return type(value) in PLAIN_ARRAYS
 
     def describe(self, value: np.ndarray[Any, Any]) -> tuple[int, str]:
         """Return bytes and text such as `float64[640,480,3]`; refuse what cannot be carried."""
-        if isinstance(value, np.ma.MaskedArray):
-            raise BadType(
-                "a masked array would lose its mask; store {'data': a.filled(0), 'mask': np.ma.getmaskarray(a)}"
-            )
         return value.nbytes, _summary(value.dtype, value.shape)
 
     def pack(self, value: np.ndarray[Any, Any]) -> tuple[Any, ...]:
@@ -175,8 +173,15 @@ def _descr(dtype: np.dtype[Any]) -> Any:
     except (TypeError, ValueError):
         same = False
     if not same:
-        raise BadType(f"the dtype {dtype} cannot be stored exactly (long double, overlapping fields, ...); use astype")
+        raise BadType(_inexact(dtype))
     return descr
+
+
+def _inexact(dtype: np.dtype[Any]) -> str:
+    if dtype.kind in _WIDEST and dtype.names is None:
+        narrower = f"np.{'complex128' if dtype.kind == 'c' else 'float64'}"
+        return f"the dtype {dtype} (long double) differs between machines; use np.asarray(x, {narrower})"
+    return f"the dtype {dtype} cannot be stored exactly (long double, overlapping fields, ...); use astype"
 
 
 def _header_size(start: bytes, length: int) -> int:

@@ -48,7 +48,7 @@ def _is_plain_blob(ship: BlobShip) -> bool:
 class Registered:
     """A ship with its label and the command that reads, found out once."""
 
-    __slots__ = ("_read", "blob", "carries", "label", "ship")
+    __slots__ = ("_read", "blob", "carries", "describes_exactly", "label", "ship")
 
     def __init__(self, ship: SpecialDatatypeShip, label: str, read: Command) -> None:
         if not isinstance(label, str) or not label or label in INLINE_LABELS:
@@ -60,6 +60,8 @@ class Registered:
         self._read = read
         self.carries: type | None = getattr(ship, "carries", None)
         self.blob: BlobShip | None = ship if isinstance(ship, BlobShip) and _is_plain_blob(ship) else None
+        # Ships of users may compress, or leave the size out.
+        self.describes_exactly = type(ship) in (NumpyShip, BytesShip)
 
     def describe(self, value: Any) -> tuple[int, str]:
         """Return bytes and a summary of `value`."""

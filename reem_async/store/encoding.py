@@ -78,6 +78,10 @@ class Encoder:
             return suffix(path + inner) + (f"~{tail}" if tail else "")
 
         found = walk(value, (self._keys.name, *path), fits, name, ships.claimed)
+        # Check sizes before packing: an array that takes no memory (np.broadcast_to) is then copied out in full.
+        exact = [(self._where(each.suffix), each.size) for each in found.attachments if each.ship.describes_exactly]
+        if sum([size for _, size in exact]) > HUGE:
+            await self._check_limits(exact)
         attachments = [
             self._packed(each) if each.ship.blob is not None else await self._recorded(each)
             for each in found.attachments
@@ -101,8 +105,13 @@ class Encoder:
         """Look exactly; the server is asked if it is in doubt."""
         sizes = [(show((self._keys.name, *path)), len(text)) for text in texts]
         for each in attachments:
-            where = self._keys.name + each.suffix.partition("~")[0]
-            sizes += [(where, size) for size in sizes_of(each.commands)]
+            sizes += [(self._where(each.suffix), size) for size in sizes_of(each.commands)]
+        await self._check_limits(sizes)
+
+    def _where(self, suffix: str) -> str:
+        return self._keys.name + suffix.partition("~")[0]
+
+    async def _check_limits(self, sizes: Sequence[tuple[str, int]]) -> None:
         # Most servers have the usual limits, and a value within them needs no question.
         try:
             check_sizes(sizes, USUAL)
