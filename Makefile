@@ -2,30 +2,34 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Two processes, each with a server of its own, take the test files in turns; then come, alone, the tests that measure time.
-TOGETHER := -n 2 --dist loadfile -m "not alone"
+# Two processes, each with a server of its own, take the test files in turns.
+TOGETHER := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-plain modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean
+.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
 
-test: $(VENV)/ready  ## run every test on an embedded real server
+test: $(VENV)/ready  ## the fast run, five minutes: every promise, on an embedded real server
 	$(BIN)/python -m pytest -q $(TOGETHER)
-	$(BIN)/python -m pytest -q -m alone
 
-test-plain: $(VENV)/ready  ## the tests on servers without the JSON module, but those of the module itself
+test-all: $(VENV)/ready  ## the long run: every test at full size, then those that measure time, alone, and all variants
+	$(BIN)/python -m pytest -q --long $(TOGETHER) -m "not alone"
+	$(BIN)/python -m pytest -q --long -m alone
+	$(MAKE) test-plain test-cluster modes
+
+test-plain: $(VENV)/ready  ## the fast run on servers without the JSON module
 	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q $(TOGETHER)
-	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q -m alone
 
-modes: $(VENV)/ready  ## tests once in Python's development mode, once without assert statements, and once without JSON
+test-cluster: $(VENV)/ready  ## what the fast run does on its shared server, on a cluster of three
+	REEM_TEST_SERVER=cluster $(BIN)/python -m pytest -q $(TOGETHER)
+
+modes: $(VENV)/ready  ## tests once in Python's development mode and once without assert statements
 	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_connection.py tests/test_facade_store.py
 	$(BIN)/python -O -m pytest -q -W "ignore:assertions not in test modules" \
 		tests/test_bad_input.py tests/test_store.py tests/test_pure.py tests/test_regressions.py
-	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q \
-		tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_atomic.py tests/test_missing.py tests/test_indexes.py tests/test_connection.py
 
 fuzz: $(VENV)/ready  ## random bytes against everything that decodes, for a minute each
 	$(BIN)/python -m tests.fuzz

@@ -1,5 +1,9 @@
 """Fixtures and small tools shared by all tests.
 
+The fast run (`make test`) leaves out tests that are marked `long` or `alone`, runs a test of both fronts on one of
+them (the test's name decides which), and tries fewer seeds and examples (`sized`). `--long` or REEM_TEST_LONG=1 is the
+long run.
+
 The server is `$REEM_TEST_URL` if set, else an `EmbeddedServer`, else a `redis:8` container; with
 `REEM_TEST_SERVER=cluster` it is an `EmbeddedCluster` of three primaries, with `REEM_TEST_SERVER=plain` no server
 that a test starts has the JSON module. It is not flushed: every test
@@ -20,6 +24,7 @@ import subprocess
 import sys
 import time
 import uuid
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +42,20 @@ sys.dont_write_bytecode = False
 
 ROOT = Path(__file__).resolve().parents[1]
 
-EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", "2000"))
+# Set in the environment too: the workers of pytest-xdist and the programs that tests start read it there.
+if "--long" in sys.argv:
+    os.environ["REEM_TEST_LONG"] = "1"
+
+LONG = bool(os.environ.get("REEM_TEST_LONG"))
+"""Whether this is the long run: every test, on both fronts, at full size."""
+
+
+def sized(fast, long):
+    """Return how much a test does in this run: seeds, examples, updates or seconds."""
+    return long if LONG else fast
+
+
+EXAMPLES = int(os.environ.get("REEM_TEST_EXAMPLES", sized(300, 2000)))
 """How many documents (and a fifth of it, arrays) the property tests try; the full promise is 100000."""
 
 PATIENCE = 30.0
@@ -129,14 +147,43 @@ WITH_MODULE = {
 """Tests, and files of tests, of what only a server with the JSON module does, and why."""
 
 
-def pytest_collection_modifyitems(items):
-    """On a cluster, leave out what only one server has; on a plain server, what only the module does."""
+OWN_PROGRAMS = {"test_examples.py"}
+"""Files whose two fronts are different programs: the fast run has both."""
+
+
+def pytest_addoption(parser):
+    parser.addoption("--long", action="store_true", help="every test, on both fronts, at full size")
+
+
+def _waits_for_the_long_run(item):
+    """Return whether the fast run leaves out a test: it is marked, or the same test runs on the other front."""
+    if item.get_closest_marker("long") or item.get_closest_marker("alone"):
+        return True
+    params = item.callspec.params.values() if hasattr(item, "callspec") else ()
+    fronts = {"blocking", "asyncio"}.intersection(value for value in params if isinstance(value, str))
+    if len(fronts) != 1 or item.path.name in OWN_PROGRAMS:
+        return False
+    chosen = zlib.crc32(re.sub("blocking|asyncio", "front", item.nodeid).encode()) % 2
+    return fronts != {("blocking", "asyncio")[chosen]}
+
+
+def pytest_collection_modifyitems(config, items):
+    """In the fast run, leave out long tests and one of two fronts.
+
+    On a cluster, keep the tests of the shared server, but skip what only one server has; on a plain server, skip what
+    only the module does.
+    """
+    if not LONG:
+        config.hook.pytest_deselected(items=[item for item in items if _waits_for_the_long_run(item)])
+        items[:] = [item for item in items if not _waits_for_the_long_run(item)]
     if PLAIN:
         for item in items:
             reason = WITH_MODULE.get(item.originalname) or WITH_MODULE.get(item.path.name)
             if reason:
                 item.add_marker(pytest.mark.skip(reason=reason))
     if os.environ.get("REEM_TEST_SERVER") == "cluster":
+        config.hook.pytest_deselected(items=[item for item in items if "server_url" not in item.fixturenames])
+        items[:] = [item for item in items if "server_url" in item.fixturenames]
         for item in items:
             if item.originalname in ONE_SERVER:
                 item.add_marker(pytest.mark.skip(reason=ONE_SERVER[item.originalname]))

@@ -8,7 +8,7 @@ import json
 
 import pytest
 import redis
-from conftest import AsyncFront, BlockingFront
+from conftest import FRONTS, BlockingFront
 
 import reem
 import reem_async
@@ -101,9 +101,9 @@ async def test_no_path_of_a_page_or_a_notice_ends_the_server(server):
 
 
 @pytest.mark.parametrize("element", UNADDRESSABLE, ids=repr)
-@pytest.mark.parametrize("front", [BlockingFront, AsyncFront])
+@pytest.mark.parametrize("front", FRONTS)
 def test_what_cannot_be_addressed_is_refused_everywhere(server, element, front):
-    opened = front(server.url)
+    opened = FRONTS[front](server.url)
     opened.write(["foo"], {"x": "important", "": "too"})
     for call in CALLS.values():
         with pytest.raises(BadKey, match="foo"):

@@ -2,7 +2,7 @@
 
     python -m tests.chaos                         # every row at full size, under 25 minutes on two cores
     python -m tests.chaos --rows 1,2 --seed 7     # some rows, replayed
-    python -m tests.chaos --scale quick           # what `make test` runs
+    python -m tests.chaos --scale quick           # what `make test-all` runs
 
 Each row runs in a process of its own, with its own server; see `scoreboard.py`.
 """

@@ -63,7 +63,7 @@ class Run:
     """One run of a row: how much to do, with which seed, and what came out.
 
     Attributes:
-        full: At full size; else a small part, for every `make test`.
+        full: At full size; else a small part, for every `make test-all`.
         seed: What all chance in the row comes from.
         rng: A generator with that seed.
         figures: What was measured, in words.
