@@ -198,6 +198,14 @@ class Accessor(Handle):
         """Append several to the list here."""
         self._interface._run(self._core.extend(values))
 
+    def expire(self, seconds: float) -> None:
+        """Have this top-level key expire."""
+        self._interface._run(self._core.expire(seconds))
+
+    def persist(self) -> None:
+        """End the expiry of this top-level key."""
+        self._interface._run(self._core.persist())
+
     def edit(self) -> Edit:
         """Return a context manager that reads, lets you change, and writes back; also `with accessor:`."""
         return Edit(self._interface, self._core.edit())

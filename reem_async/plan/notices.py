@@ -75,6 +75,9 @@ class Notice(NamedTuple):
     early: bool = False
 
 
+NOTE_KEPT = 60
+"""Seconds for which the note of a last update is kept."""
+
 View = Callable[[Slot, int], "memoryview | None"]
 """Returns the first bytes of a slot, so many, read-only; None if they are not to be had."""
 
@@ -86,7 +89,7 @@ def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, ever
     expires, since it only matters while a snapshot is on its way. In a cluster a notice goes to those who
     know the key; `everywhere` it goes to all nodes besides, for those who look for keys.
     """
-    noted: Command = ("SET", keys.last, note_of(publisher, sequence), "EX", "60")
+    noted: Command = ("SET", keys.last, note_of(publisher, sequence), "EX", str(NOTE_KEPT))
     told: Command = (keys.publish, keys.channel, payload)
     return [noted, ("PUBLISH", keys.channel, payload), told] if everywhere else [noted, told]
 

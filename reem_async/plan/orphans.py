@@ -11,11 +11,24 @@ from .keys import Keys
 from .paths import Path, below, parse_suffix
 from .placeholders import find
 from .reads import get_command
-from .replies import explained, loads, registered
+from .replies import checked, explained, loads, registered
 from .shapes import ShapeCache
 from .staging import Staged
 
-__all__ = ["clean", "left_behind", "permitted", "place_of", "survey", "unreferred", "watch"]
+__all__ = [
+    "clean",
+    "left_behind",
+    "orphans",
+    "permitted",
+    "place_of",
+    "remove_orphans",
+    "survey",
+    "unreferred",
+    "watch",
+]
+
+# What an array begins with (the .npy format): so one is recognised that no registry names any more.
+_ARRAY = b"\x93NUMPY"
 
 
 def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
@@ -103,3 +116,62 @@ def place_of(member: bytes) -> Path:
 def left_behind(known: Iterable[bytes], path: Path, written: Collection[bytes]) -> list[bytes]:
     """Return the known keys that belong at `path`, which leads through no list, and are not written there again."""
     return [member for member in known if member not in written and below(place_of(member), path)]
+
+
+def orphans(keys: Keys, found: Sequence[bytes]) -> Plan:
+    """Plan to find the ships' keys of one top-level key that its document does not refer to; the result is suffixes.
+
+    One transaction. They are left behind where a document expires, or is deleted or renamed by a program without REEM.
+    Only keys that the registry names, or that hold an array, are taken for ships' keys.
+
+    Args:
+        keys: The top-level key.
+        found: The suffixes of the Redis keys that carry its tag, as a look through all keys has found them.
+
+    Raises (in decode):
+        BadData, RedisError: Document or registry cannot be read, so it is not known what belongs to the key.
+    """
+    return Plan(_look_for_orphans(keys, found), lambda replies: _orphans(replies, keys, found), atomic=True)
+
+
+def remove_orphans(keys: Keys, found: Sequence[bytes], cache: ShapeCache) -> Plan:
+    """Plan to remove what `orphans` finds; the result is what was removed.
+
+    Two round trips under WATCH, again if another client writes to the key in between: what a document refers to is
+    never removed.
+    """
+
+    def look(replies: Sequence[Reply]) -> Any:
+        permitted(replies[0], keys.document, keys.registry)
+        gone = _orphans(replies[1:], keys, found)
+        if not gone:
+            return Plan([("UNWATCH",)], lambda _: gone, held=True)
+        tag = keys.tag.encode()
+        removal = [("UNLINK", *(tag + suffix for suffix in gone)), ("SREM", keys.registry, *gone)]
+        return Plan(removal, lambda replies: done(replies, gone), atomic=True, held=True)
+
+    def done(replies: Sequence[Reply] | None, gone: list[bytes]) -> Any:
+        if replies is None:
+            return remove_orphans(keys, found, cache)
+        for reply in replies:
+            checked(reply, keys, ())
+        cache.saw_members(keys.document, cache.members(keys.document) - frozenset(gone))
+        return gone
+
+    return Plan([watch(keys), *_look_for_orphans(keys, found)], look, held=True)
+
+
+def _look_for_orphans(keys: Keys, found: Sequence[bytes]) -> list[Command]:
+    tag = keys.tag.encode()
+    begins = [("GETRANGE", tag + suffix, "0", str(len(_ARRAY) - 1)) for suffix in found]
+    return [get_command(keys, ()), ("SMEMBERS", keys.registry), *begins]
+
+
+def _orphans(replies: Sequence[Reply], keys: Keys, found: Sequence[bytes]) -> list[bytes]:
+    text, members = replies[0], registered(replies[1], keys)
+    if isinstance(text, Exception):
+        if not isinstance(explained(text, keys, ()), WrongKind):
+            raise text
+        text = None  # a foreign type refers to nothing
+    arrays = {suffix for suffix, begin in zip(found, replies[2:], strict=True) if begin == _ARRAY}
+    return sorted((members | arrays) - _referred(text, keys))

@@ -18,10 +18,11 @@ from . import Command, Plan, Reply
 from .changes import REFUSED, SILENT, Change, EncodedAttachment, Telling
 from .indexes import from_front, lengths
 from .keys import Keys
+from .notices import NOTE_KEPT
 from .orphans import left_behind, permitted, place_of, survey, unreferred, watch
 from .outcome import Outcome
 from .paths import Path, counts_from_end, has_index, may_hold, show, to_jsonpath
-from .replies import checked, full, settable, type_name
+from .replies import checked, full, missing, registered, settable, type_name
 from .shapes import ShapeCache
 from .staging import Staged, are_missing, looks_at, stage
 
@@ -31,6 +32,7 @@ __all__ = [
     "change",
     "delete_change",
     "exchange",
+    "expiry",
     "into_new",
     "is_watched",
     "make_parents",
@@ -327,3 +329,39 @@ def exchange(
     looks = [*survey(it.keys, it.path), *reads, *looks_at(coming), *lengths(it.keys, it.path)]
     commands = [watch(it.keys, coming), *looks]
     return Plan(commands, compare, held=True)
+
+
+def expiry(keys: Keys, milliseconds: int | None) -> Plan:
+    """Plan to have a top-level key expire: document, ships' keys, registry and note, in one transaction.
+
+    Args:
+        keys: The top-level key.
+        milliseconds: How long it lives from now on; None to end its expiry.
+
+    Two round trips under WATCH, again if another client writes to the key in between.
+
+    Raises (in decode):
+        MissingKey: Nothing is stored there.
+    """
+
+    def look(replies: Sequence[Reply]) -> Plan:
+        permitted(replies[0], keys.document, keys.registry)
+        if type_name(checked(replies[1], keys, ())) is None:
+            raise missing(keys, (), None)
+        tag = keys.tag.encode()
+        names = [keys.document, keys.registry, *(tag + member for member in sorted(registered(replies[2], keys)))]
+        if milliseconds is None:
+            return Plan([("PERSIST", name) for name in names], done, atomic=True, held=True)
+        # The note expires by itself, and so it keeps its time if that is shorter.
+        names += [keys.last] if milliseconds < NOTE_KEPT * 1000 else []
+        return Plan([("PEXPIRE", name, str(milliseconds)) for name in names], done, atomic=True, held=True)
+
+    def done(replies: Sequence[Reply] | None) -> Any:
+        if replies is None:
+            return expiry(keys, milliseconds)
+        for reply in replies:
+            checked(reply, keys, ())
+        return None
+
+    commands = [watch(keys), ("JSON.TYPE", keys.document, to_jsonpath(())), ("SMEMBERS", keys.registry)]
+    return Plan(commands, look, held=True)

@@ -363,6 +363,35 @@ class Accessor(Handle):
         """Append each of `values` to the list here, all or none. Raises and costs as `append`."""
         await self._writer.extend(self._path, list(values))
 
+    async def expire(self, seconds: float) -> None:
+        """Have this top-level key expire: document, arrays and what belongs to it go after `seconds`, at once.
+
+        Followers are told of it as of a deletion. Only for a whole top-level key, `kvs["foo"]`.
+
+        A later write keeps the time that is left. Arrays that it stores have none: they stay behind when the document
+        expires, until `reem doctor --clean`. So call it again after each write with arrays:
+        `kvs["seen"] = {...}; kvs["seen"].expire(2)`. A key that is deleted and written again does not expire.
+
+        One transaction, two round trips, again if somebody else writes to the key in between. Needs the right +pexpire.
+
+        Args:
+            seconds: How long from now, to the millisecond, by the server's clock; an earlier expiry is replaced.
+
+        Raises:
+            BadKey: It is not a top-level key.
+            BadType, BadValue: Not a number of seconds over 0, up to 1e10.
+            MissingKey: Nothing is here.
+            Conflict: As `write`.
+        """
+        await self._writer.expire(self._path, seconds)
+
+    async def persist(self) -> None:
+        """End the expiry of this top-level key, arrays included; nothing changes if it has none.
+
+        Costs and raises as `expire`; the right is +persist.
+        """
+        await self._writer.expire(self._path, None)
+
     def edit(self) -> Edit:
         """Return a context manager that reads the value, lets you change it, and writes it back.
 

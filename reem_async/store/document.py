@@ -9,15 +9,25 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 import numpy as np
 
 from ..concurrency.aside import ensure_imported
-from ..errors import SELF_EXPLANATORY, ConnectionLost, MissingKey, MissingTop, ReemError
+from ..errors import SELF_EXPLANATORY, BadKey, BadType, BadValue, ConnectionLost, MissingKey, MissingTop, ReemError
 from ..plan import Plan
 from ..plan.changes import SILENT, Change, EncodedAttachment, Telling
 from ..plan.documents import number_text
-from ..plan.paths import Path, check_name, has_index, suffix
+from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
 from ..plan.reads import RawRead, nothing
 from ..plan.sizes import has_large
 from ..plan.together import together
-from ..plan.writes import append_change, appendable, change, delete_change, exchange, into_new, set_change, takes
+from ..plan.writes import (
+    append_change,
+    appendable,
+    change,
+    delete_change,
+    exchange,
+    expiry,
+    into_new,
+    set_change,
+    takes,
+)
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail
 from .tracking import ALWAYS_TRACKED, saw_shape
@@ -134,6 +144,18 @@ class _Silent:
 
     def settle(self) -> None:
         return
+
+
+# Seconds, 300 years: servers refuse what leaves 64 bits of milliseconds.
+_LONGEST_EXPIRY = 1e10
+
+
+def _milliseconds(seconds: float, name: str) -> int:
+    if isinstance(seconds, bool) or not isinstance(seconds, int | float | np.integer | np.floating):
+        raise BadType(f"{name}: expire() takes seconds, got {shorten(seconds)}")
+    if not 0 < seconds <= _LONGEST_EXPIRY:
+        raise BadValue(f"{name}: seconds must be positive and at most {_LONGEST_EXPIRY:g}, got {seconds!r}")
+    return max(round(seconds * 1000), 1)
 
 
 class DocumentWriter:
@@ -271,6 +293,15 @@ class DocumentWriter:
         """Store `value` at `path` if still nothing is there, which a read has found by raising `why`; or Conflict."""
         await self.exchange(path, value, nothing(self.keys, path, why))
 
+    async def expire(self, path: Path, seconds: float | None) -> None:
+        """Have the whole top-level key expire; None: end its expiry."""
+        if path:
+            raise BadKey(
+                f"{show((self.name, *path))}: only a whole top-level key can expire; use kvs[{self.name!r}], or store "
+                "this part under a top-level key of its own"
+            )
+        await self._demand(self._expire, None if seconds is None else _milliseconds(seconds, self.name))
+
     async def take(self, path: Path, before: RawRead) -> None:
         """Remove what is at `path` if it is still `before`; raises Conflict."""
         await self._demand(self._take, path, before)
@@ -348,6 +379,9 @@ class DocumentWriter:
         if attachments and not before.holder:  # it is put where nothing is
             await self._check_place(path, attachments)
         await self._if_still(before, set_change(self.keys, path, text, attachments, notices=turn.without_value()))
+
+    async def _expire(self, turn: Turn, milliseconds: int | None) -> None:
+        await self.session.run(expiry(self.keys, milliseconds))
 
     async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
         await self._if_still(before, delete_change(self.keys, path, notices=turn.without_value(deleted=True)))

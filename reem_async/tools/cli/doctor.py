@@ -52,6 +52,9 @@ def doctor(
     no_write: Annotated[
         bool, typer.Option("--no-write", help="Store nothing: leaves out how long an array of 1 MB takes.")
     ] = False,
+    clean: Annotated[
+        bool, typer.Option("--clean", help="Remove arrays that no document refers to, of expired keys for example.")
+    ] = False,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -62,10 +65,14 @@ def doctor(
     for a moment, under a name of its own, to see how long it takes. Of a cluster, all primaries are
     examined, one after the other, and each line names its node, the worst first.
 
+    `--clean` removes the arrays that documents which have expired, or were deleted or renamed by a program without
+    REEM, have left behind. What a document refers to is never removed.
+
     Exit code 1 if something fails.
 
     Examples:
         reem doctor
+        reem doctor --clean
         reem doctor --url redis://robot.local:6379
         reem doctor --json | jq -r 'select(.status != "ok") | .message'
     """
@@ -73,7 +80,7 @@ def doctor(
 
     async def examine() -> None:
         nonlocal failed
-        async for node, finding in _findings(url, namespace, write=not no_write):
+        async for node, finding in _findings(url, namespace, write=not no_write, clean=clean):
             failed |= finding.status == FAIL
             _show(node, finding, as_json)
 
@@ -102,7 +109,7 @@ def _show(node: str, finding: Finding, as_json: bool) -> None:
     sys.stdout.flush()
 
 
-async def _findings(url: str, namespace: str, *, write: bool) -> AsyncIterator[tuple[str, Finding]]:
+async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> AsyncIterator[tuple[str, Finding]]:
     """Yield what is found at the servers, with the node of a cluster that it is about, and of the installation."""
     from reem_async.errors import RedisError
 
@@ -120,6 +127,7 @@ async def _findings(url: str, namespace: str, *, write: bool) -> AsyncIterator[t
             async for finding in _of_server(interface, nodes[0], write=write):
                 yield "", finding
         yield "", await _old_data(interface)
+        yield "", await _orphans(interface, clean=clean)
         yield "", await _publishers(interface)
         yield "", await local(interface)
     except RedisError as error:
@@ -221,6 +229,18 @@ async def _old_data(interface: RedisInterface) -> Finding:
         return checks.old_data([key.name for key in await find(interface.session, stale=False) if key.misread])
     except RedisError as error:
         return Finding("old data", UNKNOWN, f"not all keys can be looked at: {for_users(error)}")
+
+
+async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
+    """Count the arrays that no document refers to, on all servers, and `clean` removes them."""
+    from reem_async.errors import RedisError
+    from reem_async.tools.cli.orphans import find_orphans
+
+    try:
+        found = await find_orphans(interface.session, remove=clean)
+    except RedisError as error:
+        return Finding("arrays", UNKNOWN, f"not all keys can be looked at: {for_users(error)}")
+    return checks.orphans(found.counts, {name: for_users(why) for name, why in found.unknown.items()}, removed=clean)
 
 
 async def _keys_at(session: Session, server: Transport) -> Keys:
