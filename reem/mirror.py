@@ -25,7 +25,7 @@ __all__ = ["Mirror"]
 class Mirror(Following):
     """A local copy of a place in the store that follows every change, published or only stored, by whomever.
 
-    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is at most
+    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
     Use it with `with`, or `listen()` and `close()`.
@@ -33,8 +33,8 @@ class Mirror(Following):
     Args:
         interface: The server.
         path: The path, top-level key first.
-        max_age: Seconds that an answer may be old, 0.005 at least; None for any, as long as the connection stands. The
-            server is asked for a sign of life three times in that time.
+        max_age: Largest `age` of an answer in seconds, 0.005 at least; None for any, as long as the connection stands.
+            The server is probed three times in that time. Use at least three times the round trip.
         largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
     """
@@ -49,7 +49,7 @@ class Mirror(Following):
 
     @property
     def age(self) -> float:
-        """Seconds for which the server may have had something else than the copy; infinite before `listen`."""
+        """Seconds since the server was last asked whether it has what is in the copy, and has answered that it has."""
         return self._core.age
 
     def listen(self) -> None:

@@ -37,6 +37,8 @@ __all__ = ["Follower", "Origin", "Update"]
 
 logger = logging.getLogger("reem.subscribe")
 
+_PROBE_PERIOD = 1.0
+"""Seconds between probes of a document for a listener that needs no more of them."""
 _QUICKEST, _SLOWEST = 0.001, 0.02
 """Seconds between looks at what was changed: a key that is stored at any rate is read 1,000 times a second at most."""
 
@@ -55,7 +57,7 @@ class Follower:
         patience: Seconds that updates may wait for each other: none.
         stored: It is told of what is only stored, too.
         local: It takes large values from the memory of publishers of the same host.
-        heartbeat: Seconds between signs of life of the server, if it needs more of them than others.
+        heartbeat: Seconds between probes of the document, if it needs more of them than others.
         born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
         down: There is no connection, or it is new and what is there was not read yet.
         told: Called after each step that may have changed the copy.
@@ -89,9 +91,12 @@ class Follower:
         self._loop = asyncio.get_running_loop()
         self._looks = Looks(self, Follower._look, _QUICKEST, _SLOWEST)
         self._asked = 0.0  # when a read was sent last
+        self._valid_at = -math.inf  # the server had what is in the copy then, or later
+        self._probe_due = 0.0
+        self._was_gone = True  # what the last probe of the document has shown
+        self._probe_refusal: Exception | None = None
         self.born: list[Notice] | None = None
         self.down = True
-        self._since: float | None = 0.0  # from when on the copy may lack something; None if it is not known to
         self.told: Callable[[], None] = unheard
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
@@ -112,8 +117,6 @@ class Follower:
 
     def lost(self, reason: Exception) -> None:
         """Stop applying: the connection is gone. Whoever waits for the first snapshot gets `reason`."""
-        if self._wire is not None and self._since is None:
-            self._since = self._wire.heard
         self._wire, self.down = None, True
         self._replica.lost()
         self._looks.cancel()
@@ -149,6 +152,27 @@ class Follower:
         self._replica.on_note(note)
         self._perform()
 
+    def probe(self, now: float) -> str | None:
+        """Return the document, if its type is to be asked for now."""
+        if self._wire is None or not self.stored or not self._wire.tracked or now < self._probe_due:
+            return None
+        self._probe_due = now + min(self.heartbeat, _PROBE_PERIOD)
+        return self.keys.document
+
+    def on_probe(self, kind: Reply, sent: float) -> None:
+        """Compare with the document's type, asked for at `sent` and answered in order with notices."""
+        self._probe_refusal = kind if isinstance(kind, Exception) else None
+        if self._probe_refusal is not None or not self._replica.is_current:
+            return
+        gone, has_value = kind == b"none", self._replica.tree is not MISSING
+        # No server reports SWAPDB, and none reports an expiry before something accesses the key.
+        unreported = has_value if gone else self._was_gone and not has_value
+        self._was_gone = gone
+        if unreported:
+            self.changed(None)
+        else:
+            self._valid_at = max(self._valid_at, sent)
+
     def value(self) -> Any:
         """Return a copy of what is followed, None if nothing is there. Any thread may."""
         return _own(self._replica.at())
@@ -156,10 +180,24 @@ class Follower:
     def age(self) -> float:
         """Return the seconds for which the server may have had something else than the copy. Any thread may.
 
-        Whatever was received says that the copy was the server's when that was sent, unless it says that it is not.
+        Counts from when the last question was sent whose answer confirmed the copy: replies are in order with notices
+        and invalidation messages, so all that was changed before the question has been applied. Infinite if this is
+        not known, since the server does not report what is only stored.
         """
-        since, wire = self._since, self._wire
-        return time.monotonic() - (since if since is not None or wire is None else wire.heard)  # type: ignore[operator]
+        wire = self._wire
+        if wire is not None and not wire.tracked:
+            return math.inf
+        return time.monotonic() - self._valid_at
+
+    @property
+    def untrusted(self) -> str:
+        """Return why the age of the copy is unknown or does not stay small; nothing if there is no such reason."""
+        wire = self._wire
+        if wire is not None and not wire.tracked:
+            return "the server does not report what is only stored; the user needs the right +client|tracking"
+        if self._probe_refusal is not None:
+            return f"the server refused TYPE: {self._probe_refusal}"
+        return ""
 
     @property
     def gone(self) -> bool:
@@ -186,9 +224,7 @@ class Follower:
 
     def _note_age(self) -> None:
         if self._replica.is_current:
-            self._since = None
-        elif self._since is None:
-            self._since = time.monotonic()
+            self._valid_at = max(self._valid_at, self._asked)  # it is from the last read, or newer
         self.told()
 
     def _do(self, output: Output) -> None:

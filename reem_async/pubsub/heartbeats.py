@@ -1,8 +1,10 @@
-"""Looks at subscription connections: shows one that is dead, and an update that was lost as the last one."""
+"""Probes of subscription connections: show one that is dead, an update that was lost as the last one, and a document
+that is gone without an invalidation message."""
 
 from __future__ import annotations
 
 import asyncio
+import weakref
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,7 +23,8 @@ _PERIOD = 1.0
 class Heartbeats:
     """Asks over each connection for the notes of the last updates, every second.
 
-    In between it asks only for a sign of life, as often as listeners need it. Belongs to an event loop.
+    Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
+    time to live has passed. Belongs to an event loop.
 
     Args:
         tasks: Where the looks run.
@@ -70,12 +73,13 @@ class Heartbeats:
             await asyncio.sleep(self._period)
             if not wire.alive:
                 return
-            notes, answered = [], loop.create_future()
-            if loop.time() - looked > _PERIOD - self._period / 2:
-                looked = loop.time()
+            notes, answered, now = [], loop.create_future(), loop.time()
+            if now - looked > _PERIOD - self._period / 2:
+                looked = now
                 self._period = self._needed()
                 notes = self._notes(wire)
             asked: list[Command] = [("GET", note) for note in notes] or [("PING",)]
+            self._probe(wire, now)
             wire.send(asked, partial(self._on_notes, wire, notes, answered))
             await answered  # a connection breaks only if nothing newer waits on it
 
@@ -88,6 +92,24 @@ class Heartbeats:
     def _notes(self, wire: Wire) -> list[str]:
         """Return the notes to ask for."""
         return sorted({listener.note for listener in self._listeners(wire) if listener.note is not None})
+
+    def _probe(self, wire: Wire, now: float) -> None:
+        """Ask for the types of the documents that are due by the middle of this period."""
+        documents: dict[str, list[weakref.ref[Listener]]] = {}
+        for listener in self._listeners(wire):
+            if (document := listener.probe(now + self._period / 2)) is not None:
+                documents.setdefault(document, []).append(weakref.ref(listener))
+        if documents:
+            asked: list[Command] = [("TYPE", document) for document in documents]
+            wire.send(asked, partial(self._on_probes, list(documents.values()), now))
+
+    def _on_probes(self, asked: list[list[weakref.ref[Listener]]], sent: float, kinds: list[Reply] | Exception) -> None:
+        if isinstance(kinds, Exception):
+            return
+        for group, kind in zip(asked, kinds, strict=True):
+            for reference in group:
+                if (listener := reference()) is not None:
+                    listener.on_probe(kind, sent)
 
     def _on_notes(
         self, wire: Wire, names: list[str], answered: asyncio.Future[None], notes: list[Reply] | Exception

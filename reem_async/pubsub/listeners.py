@@ -10,6 +10,7 @@ from enum import Enum, auto
 from typing import Any, NamedTuple, Protocol
 
 from ..concurrency.queues import BoundedQueue
+from ..plan import Reply
 from ..plan.notices import Notice
 from ..transport.wire import Wire
 
@@ -57,7 +58,7 @@ class Listener(Protocol):
         queues: Where each update goes.
         patience: Seconds that updates may wait for each other before it is told.
         stored: It wants to know of keys that were changed, not only of what is published.
-        heartbeat: Seconds between signs of life that it needs of the server; infinite if those that all get will do.
+        heartbeat: Seconds between probes that it needs; infinite if those that all get will do.
         local: It takes large values from the memory of publishers of the same host.
     """
 
@@ -90,6 +91,12 @@ class Listener(Protocol):
 
     def on_note(self, note: bytes | None) -> None:
         """Compare with the server's note of the last update; all before it has been handed over."""
+
+    def probe(self, now: float) -> str | None:
+        """Return the document whose type the server is to be asked for now, None if it is not."""
+
+    def on_probe(self, kind: Reply, sent: float) -> None:
+        """Compare with the type of the document, asked for at `sent`; all before it has been handed over."""
 
 
 class ForwardingListener:
@@ -128,6 +135,12 @@ class ForwardingListener:
         """Nothing is asked for."""
 
     def on_note(self, note: bytes | None) -> None:
+        """Nothing to compare."""
+
+    def probe(self, now: float) -> str | None:
+        """No document is followed."""
+
+    def on_probe(self, kind: Reply, sent: float) -> None:
         """Nothing to compare."""
 
 

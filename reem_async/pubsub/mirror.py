@@ -18,10 +18,10 @@ from .subscribers import Link, LocalAccessor
 
 __all__ = ["Mirror", "MirrorAccessor", "Tried"]
 
-_LOOKS = 3
-"""Heartbeats in the time of `max_age`."""
+_PROBES = 3
+"""Probes in the time of `max_age`."""
 _SHORTEST = 0.005
-"""Seconds that `max_age` has at least: heartbeats are a load too."""
+"""Seconds that `max_age` has at least: probes are a load too."""
 _RETRY = 0.02
 """Seconds after which a waiting caller looks again at a copy that was too old."""
 
@@ -45,7 +45,7 @@ class Tried(NamedTuple):
 class Mirror(Following):
     """A local copy of a place in the store that follows every change, published or only stored, by whomever.
 
-    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is at most
+    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
     Use it with `async with`, or `listen()` and `close()`.
@@ -54,8 +54,8 @@ class Mirror(Following):
         session: The server.
         keys: The top-level key's names.
         path: The path below it.
-        max_age: Seconds that an answer may be old, 0.005 at least; None for any, as long as the connection stands. The
-            server is asked for a sign of life three times in that time.
+        max_age: Largest `age` of an answer in seconds, 0.005 at least; None for any, as long as the connection stands.
+            The server is probed three times in that time. Use at least three times the round trip.
         largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
     """
@@ -76,7 +76,7 @@ class Mirror(Following):
             [],
             stored=True,
             largest=math.inf if largest is None else largest,
-            heartbeat=math.inf if max_age is None else max_age / _LOOKS,
+            heartbeat=math.inf if max_age is None else max_age / _PROBES,
         )
         self._link.told = _waking(self)
         self._waiting: set[asyncio.Future[None]] = set()
@@ -96,10 +96,13 @@ class Mirror(Following):
 
     @property
     def age(self) -> float:
-        """Seconds for which the server may have had something else than the copy; infinite before `listen`.
+        """Seconds since the server was last asked whether it has what is in the copy, and has answered that it has.
 
-        So it is in a forked child, and once its event loop was closed, until `listen` is called there. While nothing
-        changes it goes up to the time between two signs of life: a second, or a third of `max_age`.
+        An upper bound on how long the server may have had something else. It measures the link to the server, not when
+        the value was written: a value that nobody changes for an hour has a small age. Probes are sent each second, or
+        three times in `max_age`, so the age goes up to the time between two of them and two round trips. Infinite before
+        `listen`, in a forked child, after its event loop was closed, and where the server does not report what is only
+        stored (the user needs the right to CLIENT TRACKING).
         """
         follower = self._link.follower
         return follower.age() if follower is not None and self._link.follows else math.inf
@@ -132,13 +135,20 @@ class Mirror(Following):
             raise Stale(f"{self.channel}: this mirror is closed; make a new one")
         if self._link.interface_closed:
             raise Stale(f"{self.channel}: the RedisInterface of this mirror is closed; make new ones")
-        follower = self._check_begun()
+        if reason := self._stale(self._check_begun()):
+            raise Stale(f"{self.channel}: {reason}")
+
+    def _stale(self, follower: Follower) -> str:
+        """Return why the copy must not be relied on; nothing if it may be."""
         age = follower.age()
         # Before the age: it says more than that the copy is old.
         if follower.down:
-            raise Stale(f"{self.channel}: the connection is down, and the copy {age:.3f} s old; it is being made again")
-        if self.max_age is not None and age > self.max_age:
-            raise Stale(f"{self.channel}: the copy is {age:.3f} s old, and max_age={self.max_age:g}")
+            return f"the connection is down, and the copy {age:.3f} s old; it is being made again"
+        if self.max_age is None or age <= self.max_age:
+            return ""
+        reason = follower.untrusted
+        what = f"the copy is {age:.3f} s old" if age < math.inf else "the age of the copy is unknown"
+        return f"{what}, and max_age={self.max_age:g}" + (f"; {reason}" if reason else "")
 
     async def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:  # noqa: ASYNC109
         """Wait until the value is as wanted; returns it. No round trip.
@@ -194,7 +204,8 @@ class Mirror(Following):
     def _give_up(self, timeout: float | None) -> NoReturn:
         """Raise TimeoutError."""
         follower = self._link.follower
-        why = "; its connection is down" if follower is None or follower.down else ""
+        reason = self._stale(follower) if follower is not None else "this mirror does not follow"
+        why = f"; {reason}" if reason else ""
         raise TimeoutError(f"{self.channel}: did not come true within {timeout:g} s{why}") from None
 
     def _wake(self) -> None:

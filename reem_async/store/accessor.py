@@ -430,7 +430,7 @@ class Accessor(Handle):
         `await arm.wait_until(predicate, timeout)` waits for a change.
 
         Args:
-            max_age: Seconds that an answer may be old; an older one is an error (Stale), as it is without a connection.
+            max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale.
             largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
                 is told in its place. `kvs["arm"]["image"].read()` fetches it.
         """

@@ -162,11 +162,6 @@ class Wire(asyncio.BufferedProtocol):
         return self._loop.time() - self._last_byte
 
     @property
-    def heard(self) -> float:
-        """When a byte was received last, on the clock of time.monotonic(). Any thread may ask."""
-        return self._last_byte
-
-    @property
     def leisurely(self) -> bool:
         """Whether nobody waits for what comes, so that others are given way after each message."""
         return self.pace >= _LEISURELY
