@@ -19,7 +19,7 @@ from reem_async.errors import Stale
 from reem_async.server import EmbeddedServer
 
 BOUND = 0.01
-"""Seconds by which an age may be too small: the clocks of the server and of this process are read at different steps."""
+"""Seconds by which an age may be too small: the clocks of server and process are read at different steps."""
 KEY = "stop"
 MAX_AGE = 0.3
 
@@ -126,7 +126,7 @@ async def test_no_age_is_smaller_than_the_true_one(seed):
             while time.monotonic() < end:
                 await asyncio.sleep(0.002)
                 if slow.random() < 0.02:
-                    time.sleep(slow.uniform(0.05, 0.5))  # noqa: ASYNC251 - a loop that is slower than its updates
+                    time.sleep(slow.uniform(0.05, 0.5))  # a loop that is slower than its updates
                 with pytest.raises(Stale, match=r"age of the copy is unknown.*client\|tracking"):
                     blind.value()
                 assert blind.age == math.inf

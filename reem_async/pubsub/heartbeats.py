@@ -1,5 +1,4 @@
-"""Probes of subscription connections: show one that is dead, an update that was lost as the last one, and a document
-that is gone without an invalidation message."""
+"""Probes of subscription connections: they show a dead one, a lost last update, a document that is gone."""
 
 from __future__ import annotations
 

@@ -100,9 +100,9 @@ class Mirror(Following):
 
         An upper bound on how long the server may have had something else. It measures the link to the server, not when
         the value was written: a value that nobody changes for an hour has a small age. Probes are sent each second, or
-        three times in `max_age`, so the age goes up to the time between two of them and two round trips. Infinite before
-        `listen`, in a forked child, after its event loop was closed, and where the server does not report what is only
-        stored (the user needs the right to CLIENT TRACKING).
+        three times in `max_age`, so the age goes up to the time between two of them and two round trips. Infinite
+        before `listen`, in a forked child, after its event loop was closed, and where the server does not report what
+        is only stored (the user needs the right to CLIENT TRACKING).
         """
         follower = self._link.follower
         return follower.age() if follower is not None and self._link.follows else math.inf
