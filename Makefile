@@ -7,7 +7,7 @@ TOGETHER := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean
+.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean docs
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -42,6 +42,10 @@ check: $(VENV)/ready  ## format, lint and type checks
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/python tests/words.py
+
+docs: $(VENV)/ready  ## the documentation site, into out/docs; warnings are errors
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/docs
 
 $(VENV)/ready: pyproject.toml
 	@echo "Setting up $(VENV), about a minute, this once:"
@@ -74,7 +78,7 @@ bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick f
 bench-recorder: .venv-bench/ready  ## what a recorder costs the writers beside it, 14 to 40 minutes
 	.venv-bench/bin/python -m benchmarks.recorder
 
-scale: .venv-bench/ready  ## cost per operation, and docs/scale.md from it, under four minutes; SCALE=--quick
+scale: .venv-bench/ready  ## cost per operation, and docs/lab/scale.md from it, under four minutes; SCALE=--quick
 	.venv-bench/bin/python -m benchmarks.scale $(SCALE)
 
 .venv-bench/ready: pyproject.toml

@@ -17,7 +17,7 @@ from .results import Results
 from .server import private_server
 from .suite import beside_before, every_case
 
-FIGURES = environment.FOLDER.parent / "docs" / "images" / "performance"
+FIGURES = environment.FOLDER.parent / "docs" / "lab" / "images" / "performance"
 
 
 def arguments() -> argparse.Namespace:

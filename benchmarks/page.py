@@ -1,4 +1,4 @@
-"""The table of goals on the page docs/performance.md, written from the figures of a whole run."""
+"""The table of goals on the page docs/lab/performance.md, written from the figures of a whole run."""
 
 import pathlib
 import re
@@ -9,7 +9,7 @@ from .report import label
 from .results import Results
 from .targets import Row, bare, floor, nearby, rows
 
-PAGE = FOLDER.parent / "docs" / "performance.md"
+PAGE = FOLDER.parent / "docs" / "lab" / "performance.md"
 _TABLE = re.compile(r"<!-- goals -->\n.*?<!-- end of goals -->\n", re.DOTALL)
 
 

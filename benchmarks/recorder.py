@@ -27,7 +27,7 @@ from .results import SCRATCH
 from .server import Server, private_server
 
 KEPT = environment.FOLDER / "results" / "recorder.json"
-PAGE = environment.FOLDER.parent / "docs" / "performance.md"
+PAGE = environment.FOLDER.parent / "docs" / "lab" / "performance.md"
 WHOLE = 30
 """Quiet pairs from which a run replaces what is kept."""
 MUCH = 0.03

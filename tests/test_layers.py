@@ -154,7 +154,7 @@ ORDER = [
     {"tools.partfile", "tools.snapshots", "tools.recording", "tools.migration"},
     {"server"},
     {"tools.browser"},
-    {"tools.cli", "tools.notebook"},
+    {"tools.cli", "tools.notebook", "tools.pytest_plugin"},
 ]
 """What may import what: only what stands before it, and its own line. TYPE_CHECKING and functions count too."""
 DOORS = {"", "datatypes", "migration", "monitor", "recording", "snapshots", "tools"}

@@ -1,4 +1,4 @@
-"""The plots of docs/scale.md."""
+"""The plots of docs/lab/scale.md."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from . import kinds, spread
 from .model import Figures, robot_load
 from .results import ROOT, Results, figures
 
-FOLDER = ROOT / "docs" / "images"
+FOLDER = ROOT / "docs" / "lab" / "images"
 PLAIN, SHARED, ARM = "#1f6fb4", "#c8452e", "#3c8d40"
 
 

@@ -1,4 +1,4 @@
-"""Who is counted: the robots, the servers and the budgets that docs/scale.md works with."""
+"""Who is counted: the robots, the servers and the budgets that docs/lab/scale.md works with."""
 
 from __future__ import annotations
 

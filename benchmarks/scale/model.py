@@ -137,7 +137,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Node:
-    """What one server may be asked for, in the units of `Load`: less than all of it, see docs/scale.md."""
+    """What one server may be asked for, in the units of `Load`: less than all of it, see docs/lab/scale.md."""
 
     core: float
     line_in: float

@@ -1,4 +1,4 @@
-"""The tables of docs/scale.md, computed from the kept results and put between their markers."""
+"""The tables of docs/lab/scale.md, computed from the kept results and put between their markers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .results import ROOT, Results, cost, figures
 from .servers import SETTINGS
 from .text import bits, number, size, table, times
 
-PAGE = ROOT / "docs" / "scale.md"
+PAGE = ROOT / "docs" / "lab" / "scale.md"
 
 NAMES = {"point": "set point", "packed": "60 kB frame", "frame": "0.92 MB frame"}
 BUDGETS = {

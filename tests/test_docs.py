@@ -1,0 +1,246 @@
+"""What the documentation shows is what happens: each page is followed word for word, and prints what it says.
+
+How a page is written, so that it can be followed:
+
+- `python` runs at once; `print(x)  # y` prints y. With `# name.py` as its first line it is saved under that name.
+- `console` holds commands behind `$`, and below each what it prints. `...` stands for what differs between runs.
+- `sh` holds commands that succeed, whatever they print.
+- A command with the comment `until Ctrl-C` runs beside all that follows; what is printed below it is how its output
+  begins.
+- `bash` is for commands of other programs that cannot run here, such as docker. All other languages are shown only.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import redis
+from conftest import ROOT, SLOW_MACHINE, eventually, python
+from test_cli import REEM
+
+import reem
+from reem_async.server import EmbeddedServer
+
+DOCS = ROOT / "docs"
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "CHANGELOG.md",
+    *(path for path in sorted(DOCS.rglob("*.md")) if "generated" not in path.parts),
+]
+RUN = {"python", "console", "sh"}
+SHOWN = {"text", "ini", "json", "toml", "yaml", "{toctree}", "{image}"}
+ELSEWHERE = {
+    "docker",
+    "git",
+    "cd",
+    "sudo",
+    "systemctl",
+    "openssl",
+    "deploy/prepare.sh",
+    "export",
+    "REEM_PASSWORD=...",
+    "ros2",
+}
+"""What a block of `bash` may call: programs that do not run in a test."""
+STARTS_NOTHING = {"pip", "uv", "uvx", "make"}
+"""Commands whose effect is there already; the targets of make have to exist."""
+LIVE = {"echo", "top", "hz", "bw", "delay", "record", "browse"}
+"""Commands of reem that go on until Ctrl-C, unless an option says how long."""
+NEEDS = {"zmq": "pyzmq"}
+
+
+def title(path):
+    return str(path.relative_to(ROOT))
+
+
+def fenced(path):
+    """The blocks of a document, in order: language and text."""
+    return re.findall(r"^```(\S+)[^\n]*\n(.*?)^```$", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def shaped(expected):
+    """A pattern for text in which `...` stands for anything within a line, or alone for any lines."""
+    lines = [
+        r"(?:.*\n)*?" if line.strip() == "..." else re.escape(line).replace(re.escape("..."), r"[^\n]*") + "\n"
+        for line in expected.splitlines()
+    ]
+    return re.compile("".join(lines))
+
+
+class Reader:
+    """Follows a page in an empty folder, beside a server that was started as the page says."""
+
+    def __init__(self, folder, port):
+        self.folder, self.port = folder, port
+        self.redis = redis.Redis(port=port, protocol=3)
+        self.live = []
+        left_out = ("REEM_PASSWORD", "FORCE_COLOR", "COLUMNS", "LINES")
+        clean = {name: value for name, value in os.environ.items() if name not in left_out}
+        self.environment = {**clean, "REEM_URL": f"redis://localhost:{port}", "PYTHONUNBUFFERED": "1"}
+        if not any(point.name == "reem" for point in importlib.metadata.entry_points(group="pytest11")):
+            self.environment["PYTEST_PLUGINS"] = "reem_async.tools.pytest_plugin"  # installed before there was one
+
+    def follow(self, blocks):
+        try:
+            for language, text in blocks:
+                if language in RUN:
+                    getattr(self, language)(text)
+        finally:
+            self.end()
+
+    def python(self, code):
+        """Save a program, or run it: its lines are those that its comments promise, in their order."""
+        code = code.replace('"localhost"', f'"localhost:{self.port}"').replace(
+            "redis.Redis()", f"redis.Redis(port={self.port})"
+        )
+        if name := re.match(r"# (\w+\.py)\n", code):
+            (self.folder / name[1]).write_text(code, encoding="utf-8")
+            return
+        done = self.run([sys.executable, "-X", "dev", "-W", "error", "-c", code])
+        assert (done.returncode, SLOW_MACHINE.sub("", done.stderr)) == (0, ""), done.stderr
+        expected = "\n".join(re.findall(r"^ *print\(.*\)  # (.*)$", code, re.MULTILINE))
+        assert shaped(expected).fullmatch(done.stdout), f"{done.stdout}\nis not\n{expected}"
+
+    def console(self, text):
+        for line, expected in re.findall(r"^\$ (.*)\n((?:(?!\$ ).*\n)*)", text, re.MULTILINE):
+            self.command(line, expected)
+
+    def sh(self, text):
+        for line in text.splitlines():
+            if line.strip() and not line.startswith("#"):
+                self.command(line, None)
+
+    def command(self, line, expected):
+        """Run one command, to its end or, if it goes on until Ctrl-C, to the end of the page."""
+        program, *words = shlex.split(line, comments=True)
+        if program in STARTS_NOTHING:
+            if program == "make":
+                done = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+                assert done.returncode == 0, done.stderr
+            return
+        if program == "reem" and words[0] in ("up", "demo"):
+            return  # the server is up
+        if program == "redis-cli":
+            said = self.redis.execute_command(*words)
+            assert expected is None or shaped(expected).fullmatch(f"{said.decode()}\n"), said
+            return
+        flags = ["-X", "dev", "-W", "error"]
+        start = {
+            "reem": [REEM],
+            "python": [sys.executable, *flags],
+            "pytest": [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"],
+        }
+        bounded = any(word in words for word in ("--duration", "--count", "--timeout", "-n"))
+        if "until Ctrl-C" in line or (program == "reem" and words[0] in LIVE and not bounded):
+            self.begin([*start[program], *words], expected or "", program == "reem")
+            return
+        done = self.run([*start[program], *words])
+        assert done.returncode == 0, (line, done.stdout, done.stderr)
+        assert expected is None or shaped(expected).fullmatch(done.stdout), f"{line}: {done.stdout}\nis not\n{expected}"
+
+    def begin(self, words, expected, says_something):
+        """Start a program that goes on until Ctrl-C, and wait until it is connected or has printed something."""
+        output = self.folder / f"output-{len(self.live)}.txt"
+        before = len(self.redis.client_list())
+        with output.open("w") as file:
+            process = subprocess.Popen(
+                words, cwd=self.folder, env=self.environment, stdout=file, stderr=subprocess.STDOUT
+            )
+        self.live.append((words, process, output, expected, says_something))
+        eventually(
+            lambda: process.poll() is not None or output.stat().st_size or len(self.redis.client_list()) > before
+        )
+        time.sleep(0.2)  # what it does first: subscribe, read what is there
+        assert process.poll() is None, output.read_text()
+
+    def end(self):
+        """Press Ctrl-C in each terminal, the last one first, once it shows what the page says."""
+        failed = sys.exception()
+        for program in reversed(self.live):
+            self.interrupt(*program, failed=failed is not None)
+
+    def interrupt(self, words, process, output, expected, says_something, *, failed):
+        try:
+            if not failed:
+                eventually(lambda: shaped(expected).match(output.read_text()), 20)
+                eventually(lambda: output.stat().st_size or not says_something, 20)
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) in (0, 130, -signal.SIGINT)
+        except AssertionError as wrong:
+            raise AssertionError(f"{words}: {output.read_text()}\nis not\n{expected}") from wrong
+        finally:
+            process.kill()
+            process.wait()
+
+    def run(self, words):
+        return subprocess.run(
+            words, cwd=self.folder, env=self.environment, capture_output=True, text=True, timeout=60, check=False
+        )
+
+
+@pytest.fixture(scope="module")
+def port():
+    """A server of its own, as `reem up` starts one."""
+    try:
+        with EmbeddedServer() as server:
+            yield int(server.url.rpartition(":")[2].partition("/")[0])
+    except reem.ServerMissing as missing:
+        pytest.skip(f"there is no embedded server here: {missing}")
+
+
+@pytest.mark.parametrize(
+    "path", [page for page in PAGES if RUN & {language for language, _ in fenced(page)}], ids=title
+)
+def test_a_page_is_followed_word_for_word(path, port, tmp_path):
+    """By a newcomer: every block in its order, in an empty folder."""
+    blocks = fenced(path)
+    for module, package in NEEDS.items():
+        if any(f"import {module}" in text for _, text in blocks) and importlib.util.find_spec(module) is None:
+            pytest.skip(f"needs {package}")
+    reader = Reader(tmp_path, port)
+    if names := list(reader.redis.scan_iter(count=1000)):
+        reader.redis.unlink(*names)  # of the page before
+    reader.follow(blocks)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=title)
+def test_every_block_is_run_or_only_shown(path):
+    """A block of another language would be left out without a word; `bash` holds nothing that could run here."""
+    for language, text in fenced(path):
+        assert language in RUN | SHOWN | {"bash"}, language
+        if language == "bash":
+            whole = text.replace("\\\n", " ")
+            assert {line.split()[0] for line in whole.splitlines() if line.strip()} <= ELSEWHERE, text
+
+
+@pytest.mark.parametrize("path", PAGES, ids=title)
+def test_links_lead_somewhere(path):
+    """Those to files of this repository."""
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text(encoding="utf-8")):
+        if "generated" not in target:
+            assert (path.parent / target).exists(), target
+
+
+def test_every_page_is_in_the_table_of_contents():
+    listed = set(re.findall(r"^[\w/-]+$", (DOCS / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
+    assert {str(path.relative_to(DOCS).with_suffix("")) for path in PAGES if DOCS in path.parents} - listed <= {
+        "index",
+        "skills/reem/SKILL",
+    }
+
+
+def test_recordings_say_what_to_install():
+    """Where the extra is missing."""
+    for module in ("reem.recording", "reem_async.recording"):
+        done = python(f"import sys; sys.modules['mcap'] = None; import {module}")
+        assert "ModuleNotFoundError: recordings need mcap: pip install " in done.stderr
