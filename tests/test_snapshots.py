@@ -143,6 +143,52 @@ async def test_a_type_that_cannot_be_saved_is_refused_by_name(servers, raws, tmp
     assert left_in(tmp_path) == []
 
 
+async def test_what_cannot_be_saved_is_named_and_all_else_is_saved(servers, there, raws, tmp_path):
+    """An overwritten registry, an array that is gone, a type that cannot be saved, a right that lacks."""
+    admin = raws[0]
+    async with reem_async.RedisInterface(servers[0], ships=[reem.NumpyShip(), KindShip()]) as here:
+        kvs = reem_async.KeyValueStore(here)
+        for name in ("gone", "overwritten", "private", "right"):
+            await kvs[name].write({"image": np.arange(9), "list": [np.arange(2)]})
+        await kvs["odd"].write({"x": Stored("stream")})
+    admin.delete("{gone}.list[0]")
+    admin.set("{overwritten}:ships", "x")
+    admin.execute_command("ACL", "SETUSER", "u", "reset", "on", ">pw", "&*", "+@all", "~[^p{]*", "~{[^p]*")
+    async with reem_async.RedisInterface(servers[0].url.replace("//", "//u:pw@")) as here:
+        saved = await save(here, tmp_path / "a.zip")
+        assert set(saved.unsaved) == {"gone.list[0]", "odd", "private"}
+        assert "stream" in saved.unsaved["odd"]
+        assert "not read" in saved.unsaved["private"]
+        assert (await describe(tmp_path / "a.zip")).unsaved == saved.unsaved
+        with pytest.raises(BadData, match="stream"):
+            await save(here, tmp_path / "b.zip", "odd")
+        admin.delete("{overwritten}:ships")
+        await restore(here, tmp_path / "a.zip", replace=True)
+    admin.execute_command("ACL", "DELUSER", "u")
+    assert admin.smembers("{overwritten}:ships") == {b".image", b".list[0]"}
+    await restore(there, tmp_path / "a.zip")
+    got = reem_async.KeyValueStore(there)
+    assert await got.keys() == ["gone", "overwritten", "right"]
+    for name in ("overwritten", "right"):
+        assert_same(await got[name].read(), {"image": np.arange(9), "list": [np.arange(2)]})
+
+
+async def test_a_key_that_expires_is_restored_with_the_time_it_had_left(here, there, raws, tmp_path):
+    """Arrays and registry too; one that does not expire replaces one that does."""
+    store, other = reem_async.KeyValueStore(here), reem_async.KeyValueStore(there)
+    for name in ("fades", "stays"):
+        await store[name].write({"a": np.arange(3)})
+        await other[name].write({"a": np.arange(4)})
+    await store["fades"].expire(100)
+    await other["stays"].expire(100)
+    await save(here, tmp_path / "a.zip")
+    await restore(there, tmp_path / "a.zip", replace=True)
+    for name in ("fades", "{fades}.a", "{fades}:ships"):
+        assert 80_000 < raws[1].pttl(name) <= 100_000
+    for name in ("stays", "{stays}.a", "{stays}:ships"):
+        assert raws[1].pttl(name) == -1
+
+
 async def test_a_custom_ship_reads_what_was_restored(servers, raws, tmp_path):
     ships = [reem.NumpyShip(), PoseShip()]
     async with reem_async.RedisInterface(servers[0], ships=ships) as here:

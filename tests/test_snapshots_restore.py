@@ -160,7 +160,7 @@ async def test_a_program_with_few_rights_can_save_and_restore(servers, raws, tmp
     async with reem_async.RedisInterface(url) as interface:  # it sees the names of keys that it may not look at
         saved = await save(interface, tmp_path / "b.zip")
         assert [key.name for key in saved.keys] == ["reem:foo"]
-        assert saved.foreign_names == ("elsewhere (not allowed)",)
+        assert saved.unsaved == {"elsewhere": "this user may not read it"}
     admin.execute_command("ACL", "SETUSER", "robot", "-scan")
     async with reem_async.RedisInterface(url, namespace="reem:") as interface:
         with pytest.raises(redis.exceptions.NoPermissionError, match="scan"):

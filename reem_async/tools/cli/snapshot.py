@@ -91,6 +91,7 @@ def save(
 
     A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant, and any
     user who may read the keys can take it. Redis keys that are not REEM's are counted and left alone.
+    Keys and arrays that cannot be read are left out and named, and the exit code is 1.
 
     Examples:
       reem snapshot save before.zip
@@ -144,12 +145,12 @@ class _Saver:
         """Take one, delete what is too old, print a line; return the exit code."""
         started = time.monotonic()
         it = await self._saved(interface, bar)
-        # Only when the new one is complete and on the disk are old ones deleted.
-        gone, failed = await asyncio.to_thread(self._pruned, it.path)
+        # Only when the new one is complete and on the disk are old ones deleted: they may have what it lacks.
+        gone, failed = ([], []) if it.unsaved else await asyncio.to_thread(self._pruned, it.path)
         self._tell(it, gone, time.monotonic() - started)
         for error in failed:
             note(f"reem snapshot save: saved, but an older one could not be deleted: {for_users(error)}")
-        return FAILED if failed else 0
+        return FAILED if failed or it.unsaved else 0
 
     def _tell(self, it: Snapshot, gone: Sequence[Path], seconds: float) -> None:
         if self._as_json:
@@ -160,8 +161,10 @@ class _Saver:
         emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {seconds:.2f} s{clean(deleted)}")
         sys.stdout.flush()
         self._note_foreign(it)
+        for place, why in it.unsaved.items():
+            self._note_once(f"Not saved: {place}: {why}")
         if it.doubt:
-            self._note_once(f"Keys may be missing: {it.doubt}.")
+            self._note_once(f"The snapshot may not be complete: {it.doubt}.")
 
     async def by_period(self, interface: RedisInterface, every: float) -> NoReturn:
         """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""

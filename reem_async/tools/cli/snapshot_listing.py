@@ -92,6 +92,8 @@ def _show_keys(it: Snapshot, as_json: bool) -> None:
     emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, taken {_when(it)} at {clean(it.server) or 'unknown'}")
     rows = [[clean(key.name), size_text(key.size), _arrays(len(key.values))] for key in it.keys]
     columns(rows, ["cyan", "", "dim"], frozenset({1}))
+    for place, why in it.unsaved.items():
+        note(clean(f"not saved: {place}: {why}"))
 
 
 def _arrays(count: int) -> str:
@@ -110,6 +112,7 @@ def facts(it: Snapshot) -> dict[str, Any]:
         "namespace": it.namespace,
         "foreign": it.foreign,
         "foreign_names": it.foreign_names,
+        "unsaved": dict(it.unsaved),
     }
 
 

@@ -19,7 +19,7 @@ import hashlib
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -69,6 +69,8 @@ class _Hashed:
 _LARGEST_INDEX = 1 << 29
 _LATEST = 1 << 37
 """A time in seconds since 1970 that no snapshot has been taken at."""
+_LONGEST_EXPIRY = 1 << 53
+"""Milliseconds until a key expires that no server takes."""
 
 
 class ArchiveWriter:
@@ -106,11 +108,17 @@ class ArchiveWriter:
             self._put(member, blob)
             values.append({"suffix": value.suffix, "type": value.kind, "size": value.size, "file": member})
         row = {"name": entry.name, "size": len(entry.text), "file": f"{folder}/document.json"}
+        row |= {} if entry.expires is None else {"expires": entry.expires}
         self._keys.append({**row, "registry": entry.registry, "values": values})
 
-    def finish(self, foreign: list[str]) -> None:
+    def finish(self, foreign: list[str], unsaved: Mapping[str, str] | None = None) -> None:
         """Write the index and the digest, see to it that all is on the disk, and give the file its name."""
-        index = {"keys": self._keys, "foreign": len(foreign), "foreign_names": foreign[:_SHOWN]}
+        index = {
+            "keys": self._keys,
+            "foreign": len(foreign),
+            "foreign_names": foreign[:_SHOWN],
+            "unsaved": dict(unsaved or {}),
+        }
         self._put(_INDEX, orjson.dumps(index), zipfile.ZIP_DEFLATED)
         # The comment is the end of the file. It is written with zeros, which the digest covers, and then the digest
         # takes
@@ -191,7 +199,8 @@ class Archive:
         with _believed(self._path):
             row = self._rows[name]
             values = tuple([self._value(each) for each in row["values"]])
-            return Entry(name, self._member(row["file"], row["size"]), tuple(row["registry"]), values)
+            text = self._member(row["file"], row["size"])
+            return Entry(name, text, tuple(row["registry"]), values, row.get("expires"))
 
     def __enter__(self) -> Self:
         return self
@@ -222,6 +231,7 @@ class Archive:
             namespace=str(header["namespace"]),
             foreign=int(index["foreign"]),
             foreign_names=tuple(map(str, index["foreign_names"])),
+            unsaved={str(place): str(why) for place, why in index.get("unsaved", {}).items()},
         )
 
     def _json(self, member: str) -> dict[str, Any]:
@@ -260,6 +270,9 @@ def _saved_key(row: dict[str, Any]) -> SavedKey:
     unknown = [value["type"] for value in row["values"] if value["type"] not in KINDS]
     if unknown:
         raise ValueError(f"a value of {name} has the unknown type {unknown[0]!r}")
+    expires = row.get("expires")
+    if expires is not None and (type(expires) is not int or not 0 < expires < _LONGEST_EXPIRY):
+        raise ValueError(f"{name} cannot expire in {expires!r} ms")
     values = tuple([(it["suffix"], it["type"], int(_within(it["size"], 2**63))) for it in row["values"]])
     return SavedKey(name, int(_within(row["size"], 2**63)), values)
 

@@ -8,7 +8,7 @@ import re
 import time
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,6 +80,7 @@ class Snapshot:
         namespace: The namespace it was taken of.
         foreign: How many Redis keys were left out since they are not REEM's.
         foreign_names: The first of them, with their types.
+        unsaved: What could not be saved, top-level keys and arrays, and why; all else is in the file.
         doubt: Of one that was just saved, why keys may be missing; empty if all that the server counts were found.
     """
 
@@ -93,6 +94,7 @@ class Snapshot:
     namespace: str = ""
     foreign: int = 0
     foreign_names: tuple[str, ...] = ()
+    unsaved: Mapping[str, str] = field(default_factory=dict)
     doubt: str = ""
 
 

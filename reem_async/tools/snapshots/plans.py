@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from ...errors import BadData, Conflict, PartialWrite, WrongKind
+from ...errors import BadData, Conflict, NotAllowed, PartialWrite, Refused, WrongKind
 from ...plan import Command, Plan, Reply
 from ...plan.keys import Keys
 from ...plan.orphans import permitted
@@ -17,7 +17,7 @@ from ...plan.scan import DOCUMENT
 from ...plan.shapes import ShapeCache
 from .values import Entry, Value, kind_of, settable
 
-__all__ = ["dump", "put", "shown", "strangers", "types"]
+__all__ = ["NOT_ALLOWED", "dump", "lifetimes", "put", "shown", "strangers", "types"]
 
 # Attempts at a key whose shape others change: each takes a round trip, so it is some seconds at worst.
 _TRIES = 50
@@ -26,7 +26,7 @@ _TRIES = 50
 def types(names: Sequence[Any]) -> Plan:
     """Plan to find the Redis types of some keys; the result is their names, "none" for what is not there.
 
-    A key that the user may not look at has the type "not allowed".
+    A key that the user may not look at has the type `NOT_ALLOWED`.
     """
 
     def decode(replies: Sequence[Reply]) -> list[str]:
@@ -39,8 +39,26 @@ def _type(reply: Reply) -> str:
     if isinstance(reply, Exception):
         if "permissions to access" not in str(reply):
             raise reply  # it is not this key alone that is out of bounds
-        return "not allowed"
+        return NOT_ALLOWED
     return str(reply.decode())
+
+
+NOT_ALLOWED = "not allowed"
+
+
+def lifetimes(names: Sequence[str]) -> Plan:
+    """Plan to ask in how many milliseconds keys expire; the result has None for those that do not.
+
+    It is None as a whole if the user may not ask.
+    """
+
+    def decode(replies: Sequence[Reply]) -> list[int | None] | None:
+        if any(isinstance(reply, NotAllowed) for reply in replies):
+            return None
+        return [int(reply) if int(reply) > 0 else None for reply in replies]
+
+    # By itself: a user without the right to PTTL would have a whole transaction refused.
+    return Plan([("PTTL", name) for name in names], decode)
 
 
 def shown(key: bytes, kind: str) -> str:
@@ -108,11 +126,14 @@ class _Dump:
         # nil: no such key. An empty list: nothing at the path.
         if text is None or text == b"[]":
             return None
-        registry = self._registry(replies[1])
+        placed = self._placed(text)
+        # A program without REEM has overwritten the registry: the document still says what belongs to it.
+        overwritten = isinstance(replies[1], Exception) and not isinstance(replies[1], Refused)
+        registry = tuple(sorted(placed)) if overwritten else self._registry(replies[1])
         # Replies: document, registry, then type and content for each that was asked for.
         found = {suffix: kind for suffix, kind in zip(asked, map(_type, replies[2::2]), strict=True) if kind != "none"}
         # What the document refers to counts even if the registry has lost it.
-        belongs = {*registry, *self._placed(text)}
+        belongs = {*registry, *placed}
         if belongs - set(asked) or any(asked[suffix] != kind for suffix, kind in found.items()):
             # "string" is the guess for what is new: arrays and bytes, nearly everything.
             return self._again({suffix: found.get(suffix, "string") for suffix in sorted(belongs)})
@@ -121,11 +142,11 @@ class _Dump:
             for suffix, reply in zip(asked, replies[3::2], strict=True)
             if suffix in found and suffix in belongs
         ]
-        return Entry(self.keys.name, bytes(text[1:-1]), registry, tuple(values))
+        missing = tuple(sorted(placed - set(found)))
+        return Entry(self.keys.name, bytes(text[1:-1]), registry, tuple(values), missing=missing)
 
     def _registry(self, reply: Reply) -> tuple[str, ...]:
-        if isinstance(reply, Exception):
-            raise BadData(f"{self.keys.name}: {self.keys.registry} is not the set of names it should be: {reply}")
+        checked(reply, self.keys, ())
         try:
             return tuple(sorted(bytes(member).decode() for member in reply))
         except UnicodeDecodeError:
@@ -197,6 +218,9 @@ class _Put:
         self._writes.append(("JSON.SET", keys.document, "$", settable(entry.text)))
         if entry.registry:
             self._writes.append(("SADD", keys.registry, *entry.registry))
+        if entry.expires is not None:
+            names = [keys.document, keys.registry, *(keys.tag + suffix for suffix in self._suffixes)]
+            self._writes += [("PEXPIRE", name, str(entry.expires)) for name in names]
 
     def _filling(self, value: Value) -> list[Command]:
         kind = kind_of(value.kind, self._keys.name + value.suffix)
@@ -217,11 +241,13 @@ class _Put:
             raise Conflict(f"{keys.name!r} is there already; nothing of it was changed")
         if isinstance(members, Exception):
             raise BadData(f"{keys.name}: {keys.registry} is not the set of names it should be: {members}")
+        # JSON.SET keeps the expiry of what it replaces.
+        lasting = [("PERSIST", keys.document)] if kind == DOCUMENT else []
         # Only now is it known that something will be written: a number that is used up for nothing would look like a
         # loss.
         self._told = self._told or self._notices()
         # Old attachments go, new ones are filled, then the document, the registry and the notice: one transaction.
-        commands = [self._clearing(members), *self._writes, *self._told]
+        commands = [self._clearing(members), *lasting, *self._writes, *self._told]
         return Plan(commands, partial(self._done, [command[:2] for command in commands]), atomic=True, held=True)
 
     def _clearing(self, members: Reply) -> Command:

@@ -14,7 +14,7 @@ import anyio.to_thread
 
 from ... import __version__
 from ...connection import RedisInterface
-from ...errors import BadData, Conflict, MissingKey, PartialWrite, RedisError, ReemError, WrongKind
+from ...errors import BadData, Conflict, MissingKey, NotAllowed, PartialWrite, RedisError, ReemError, WrongKind
 from ...plan import Command, Plan
 from ...plan.keys import Keys
 from ...plan.notices import announce, published
@@ -23,7 +23,7 @@ from ...plan.scan import DOCUMENT
 from ...session import Session
 from .archive import Archive, ArchiveWriter, header, verify
 from .files import Snapshot, check_target, sniff
-from .plans import dump, put, types
+from .plans import dump, lifetimes, put, types
 from .survey import Survey, matcher, survey
 from .values import Entry
 
@@ -79,7 +79,9 @@ async def save(
     REEM's is left out and counted. One round trip for a key without arrays, two for others, after one for
     about 1000 keys of the server to find them (none if `match` has no `*` or `?`); in a cluster all primaries
     are asked. What was found is compared with the number of keys that the servers count; if they
-    count more, the result's `doubt` says so. In memory there are one top-level key, up to 1 MB of others and
+    count more, the result's `doubt` says so. What cannot be read is left out and named in the result's `unsaved`:
+    where a right is missing, an array is gone, or a ship's value has a Redis type that cannot be saved. A key that
+    expires is saved with the time it has left. In memory there are one top-level key, up to 1 MB of others and
     the names of all Redis keys. Cancelling leaves no file behind.
 
     Args:
@@ -94,7 +96,7 @@ async def save(
 
     Raises:
         MissingKey: `match` is not "*" and names nothing. No file was made.
-        BadData: A ship keeps its value in a Redis type that cannot be saved.
+        BadData, NotAllowed, Conflict: No key at all could be saved; this is why for the first. No file was made.
         ClusterNode: The server is one node of several. No file was made.
         NotConnected: A node does not answer, or slots of the cluster have none. No file was made.
         FileExistsError: The file is there, or was made by somebody else meanwhile.
@@ -107,11 +109,13 @@ async def save(
     facts = header(interface.hostname, session.namespace, match, __version__)
     writer = ArchiveWriter(target, facts, overwrite=overwrite)
     try:
-        count = await _fill(session, writer, found, progress)
+        count, failure = await _fill(session, writer, found, progress)
+        if not count and failure is not None:
+            raise failure
         if not count and match != "*":
             raise MissingKey(f"no key matches {shorten(match)}; nothing was saved")
         foreign = await found.foreign(session)
-        await anyio.to_thread.run_sync(writer.finish, foreign)
+        await anyio.to_thread.run_sync(writer.finish, foreign, found.unsaved)
     # Cancelling included: there is a file with this name only if it is complete.
     except BaseException:
         writer.abandon()
@@ -125,25 +129,42 @@ def _describe(path: Path) -> Snapshot:
         return archive.summary
 
 
-async def _fill(session: Session, writer: ArchiveWriter, found: Survey, progress: Told | None) -> int:
-    """Fetch and write the keys found; return how many were still there."""
-    count, batch = 0, _Batch()
+async def _fill(
+    session: Session, writer: ArchiveWriter, found: Survey, progress: Told | None
+) -> tuple[int, Exception | None]:
+    """Fetch and write the keys found; return how many were still there, and why the first that failed did."""
+    count, batch, failure = 0, _Batch(), None
+    lifetimes_left: list[int | None] = []
     for number, name in enumerate(found.names):
         _tell(progress, "save", number, len(found.names))
+        if number % _PAGE == 0:
+            lifetimes_left = await _lifetimes(session, found, found.names[number : number + _PAGE])
         keys = session.keys(name)
         try:
             entry: Entry | None = await session.run(dump(keys))
         except WrongKind:  # replaced by a program without REEM since it was found
             continue
+        except (BadData, Conflict, NotAllowed) as error:
+            failure = failure or error
+            found.failed(name, str(error))
+            continue
         if entry is None:
             continue
+        entry = entry._replace(expires=lifetimes_left[number % _PAGE])
         count += 1
         found.owns(entry)
         if batch.takes(entry):
             await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
     await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
     _tell(progress, "save", len(found.names), len(found.names))
-    return count
+    return count, failure
+
+
+async def _lifetimes(session: Session, found: Survey, names: Sequence[str]) -> list[int | None]:
+    left: list[int | None] | None = await session.run(lifetimes([session.keys(name).document for name in names]))
+    if left is None:
+        found.doubt = found.doubt or "this user may not ask when keys expire (+pttl), so they are saved without expiry"
+    return left or [None] * len(names)
 
 
 def _write(writer: ArchiveWriter, entries: Sequence[Entry]) -> None:
@@ -184,8 +205,9 @@ async def restore(
 
     The whole file is checked first, and whether keys are in the way: a damaged file, or a key that is
     there, changes nothing. Then each top-level key is one transaction of all that belongs to it and its
-    notice; the keys together are not. Two round trips for each, after one for 500 of them. Cancelling, or
-    an error on the way, leaves some keys written and the others as they were, none half.
+    notice; the keys together are not. A key that was saved with an expiry has as long to live as it had left
+    then. Two round trips for each, after one for 500 of them. Cancelling, or an error on the way, leaves some keys
+    written and the others as they were, none half.
 
     Args:
         interface: The server; the keys go to its namespace, whatever the one was they were saved of.

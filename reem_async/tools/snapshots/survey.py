@@ -13,7 +13,7 @@ from ...plan.scan import DOCUMENT
 from ...plan.staging import STAGED
 from ...session import Session
 from ...transport.scan import counted, scanned
-from .plans import shown, strangers, types
+from .plans import NOT_ALLOWED, shown, strangers, types
 from .values import Entry
 
 __all__ = ["Survey", "matcher", "survey"]
@@ -37,12 +37,14 @@ class Survey:
     Attributes:
         names: The top-level keys, sorted.
         seen: All keys that the servers named, whoever they belong to.
+        unsaved: The top-level keys, and arrays, that could not be saved, and why.
         doubt: Why keys may be missing, for people; empty if the servers hold no more keys than they named.
     """
 
     def __init__(self) -> None:
         self.names: list[str] = []
         self.seen: set[bytes] = set()
+        self.unsaved: dict[str, str] = {}
         self.doubt = ""
         self._tagged: dict[str, set[bytes]] = {}  # what carries a key's tag: suffixes by name, until it is known whose
         self._foreign: list[str] = []
@@ -52,6 +54,13 @@ class Survey:
         tagged = self._tagged.get(entry.name, set())
         tagged -= {suffix.encode() for suffix in entry.registry}
         tagged -= {value.suffix.encode() for value in entry.values}
+        for suffix in entry.missing:
+            self.unsaved[entry.name + suffix.partition("~")[0]] = "the server does not have it any more, only its name"
+
+    def failed(self, name: str, why: str) -> None:
+        """Take note of a key that could not be fetched; what belongs to it is not foreign."""
+        self.unsaved[name] = why
+        self._tagged.pop(name, None)
 
     async def foreign(self, session: Session) -> list[str]:
         """Return the keys that are not REEM's, each with its type. One round trip for each tag in question."""
@@ -72,6 +81,10 @@ class Survey:
                 self._foreign.append(shown(key, kind))
             elif not wanted(name):
                 continue
+            elif kind == NOT_ALLOWED:
+                # Of what belongs to a document, the document is named. Its rights may be other ones.
+                if tagged is None:
+                    self.failed(name, "this user may not read it")
             elif tagged:
                 self._tagged.setdefault(name, set()).add(tagged[2])
             elif kind == DOCUMENT:

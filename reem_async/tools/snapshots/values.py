@@ -52,12 +52,16 @@ class Entry(NamedTuple):
         text: The document's JSON, as the server sent it.
         registry: The suffixes the registry names, sorted.
         values: What the ships hold.
+        expires: Milliseconds until the key expires; None if it does not.
+        missing: The suffixes of ships' keys that the document refers to and that are not there.
     """
 
     name: str
     text: bytes
     registry: tuple[str, ...]
     values: tuple[Value, ...]
+    expires: int | None = None
+    missing: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
