@@ -147,10 +147,6 @@ WITH_MODULE = {
 """Tests, and files of tests, of what only a server with the JSON module does, and why."""
 
 
-OWN_PROGRAMS = {"test_examples.py"}
-"""Files whose two fronts are different programs: the fast run has both."""
-
-
 def pytest_addoption(parser):
     parser.addoption("--long", action="store_true", help="every test, on both fronts, at full size")
 
@@ -161,7 +157,7 @@ def _waits_for_the_long_run(item):
         return True
     params = item.callspec.params.values() if hasattr(item, "callspec") else ()
     fronts = {"blocking", "asyncio"}.intersection(value for value in params if isinstance(value, str))
-    if len(fronts) != 1 or item.path.name in OWN_PROGRAMS:
+    if len(fronts) != 1:
         return False
     chosen = zlib.crc32(re.sub("blocking|asyncio", "front", item.nodeid).encode()) % 2
     return fronts != {("blocking", "asyncio")[chosen]}

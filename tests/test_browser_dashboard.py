@@ -96,6 +96,7 @@ def test_the_rate_at_the_beginning_of_what_is_known_is_right():
 # --- what the page says -------------------------------
 
 
+@pytest.mark.long
 def test_a_server_that_died_greys_the_page_and_is_told_in_plain_words(chromium, tmp_path):
     visitor = Visitor(chromium, None)
     with EmbeddedServer(directory=tmp_path / "data") as server, served(live(server.url)) as (address, _):
@@ -160,6 +161,7 @@ def test_the_labels_of_a_nearly_constant_plot_differ(visit, values):
     assert len(set(labels)) == len(labels), labels
 
 
+@pytest.mark.long
 def test_numbers_are_short_and_all_their_digits_are_there_on_hover(visit, kvs, key):
     kvs[key()] = {
         "pi": 3.141592653589793,
@@ -206,6 +208,7 @@ def keep_publishing(page, work, until):
     raise AssertionError("it did not appear")
 
 
+@pytest.mark.long
 def test_small_vectors_are_drawn_over_time_and_lines_can_be_hidden(visit, pspace, key):
     pspace[key()] = {"v": np.array([1.0, 2.0, 30.0])}
     page = visit.open(f"/view/{key()}.v")
@@ -224,6 +227,7 @@ def test_small_vectors_are_drawn_over_time_and_lines_can_be_hidden(visit, pspace
     expect(entries.nth(2)).to_have_attribute("aria-pressed", "false")
 
 
+@pytest.mark.long
 def test_the_page_of_a_dict_has_its_pictures_and_plots_together_and_rows_for_the_rest(visit, pspace, key):
     rows = np.add.outer(np.arange(40), np.arange(60)).astype(np.uint8)
     pspace[key()] = {"image": rows, "x": 1.0, "q": [1.0, 2.0], "name": "arm", "deep": {"a": 1}}
@@ -242,6 +246,7 @@ def test_the_page_of_a_dict_has_its_pictures_and_plots_together_and_rows_for_the
     ]
 
 
+@pytest.mark.long
 def test_a_depth_image_with_holes_and_a_path_of_points(visit, pspace, key):
     """NaN is counted below the picture; rows of two numbers are lines in a pane, not a picture two pixels wide."""
     depth = np.full((480, 640), 1.5, np.float32)
@@ -256,6 +261,7 @@ def test_a_depth_image_with_holes_and_a_path_of_points(visit, pspace, key):
     expect(page.locator(".pane .legend")).to_contain_text("[1]")
 
 
+@pytest.mark.long
 def test_the_first_page_shows_busy_keys_and_what_is_pinned_instead(visit, pspace, key):
     pspace[key("busy")] = {"x": 0.0}
     pspace[key("quiet")] = {"y": 5.0}
@@ -272,6 +278,7 @@ def test_the_first_page_shows_busy_keys_and_what_is_pinned_instead(visit, pspace
     expect(page.locator("#view h2")).not_to_have_text("Pinned")
 
 
+@pytest.mark.long
 def test_panes_are_moved_by_dragging_and_the_edge_as_well(visit, kvs, key):
     kvs[key()] = {"a": np.zeros((20, 20)), "b": np.zeros((20, 20))}
     page = visit.open(f"/view/{key()}")
@@ -292,6 +299,7 @@ def test_panes_are_moved_by_dragging_and_the_edge_as_well(visit, kvs, key):
     assert page.locator("#tree-panel").bounding_box()["width"] == pytest.approx(wide, abs=2)
 
 
+@pytest.mark.long
 def test_the_value_under_the_pointer_is_told(visit, kvs, key):
     image = np.zeros((40, 60, 3), np.uint8)
     image[20, 30] = 7, 8, 9
@@ -309,6 +317,7 @@ def test_the_value_under_the_pointer_is_told(visit, kvs, key):
         expect(page.locator(".pixel")).to_have_text(told)
 
 
+@pytest.mark.long
 def test_what_is_wrong_with_a_value_is_said_beside_the_field(visit, pspace, key, server_url):
     pspace[key()] = {"kp": 2.0}
     page = visit.open(f"/view/{key()}.kp")

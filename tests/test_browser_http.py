@@ -365,6 +365,7 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
     assert items == [str(item) for item in kvs[key()]["items"].read()]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make",
     [

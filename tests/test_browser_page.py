@@ -18,6 +18,7 @@ from reem.server import EmbeddedServer
 expect = playwright.expect
 
 
+@pytest.mark.long
 def test_the_tree_opens_closes_and_remembers(visit, kvs, key):
     name = key("robot")
     kvs[name] = {"arm": {"q": [1.5, 2.5], "on": True}, "image": np.zeros((20, 30), np.uint8)}
@@ -83,6 +84,7 @@ SLOW = """([what, pause]) => {
 }"""
 
 
+@pytest.mark.long
 def test_what_a_search_finds_has_its_whole_path_though_the_tree_comes_late(visit, pspace, key):
     """Rows of a tree that was on its way were taken for what was found: `image`, `image`, of which robot?"""
     name = key("robot")
@@ -110,6 +112,7 @@ BROKEN = """([what, times]) => {
 }"""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["/api/tree", "/api/node", "/api/image"])
 def test_after_an_answer_that_breaks_off_the_page_goes_on(visit, pspace, key, what):
     """It took itself for busy from then on, and showed nothing new for ever."""
@@ -148,6 +151,7 @@ def test_a_ship_may_be_called_as_what_every_object_has(visit, server_url, key, l
         expect(row(page, f"{name}.n")).to_contain_text("2")
 
 
+@pytest.mark.long
 def test_a_key_may_be_called_as_what_turns_the_pages_of_another(visit, kvs, key):
     """Both were kept under `more:` and the key: the tree was not drawn any more."""
     name = key("long")
@@ -162,6 +166,7 @@ def test_a_key_may_be_called_as_what_turns_the_pages_of_another(visit, kvs, key)
         del kvs[f"more:{name}"]
 
 
+@pytest.mark.long
 def test_a_picture_that_is_on_its_way_is_not_drawn_as_a_broken_one(visit, kvs, key):
     kvs[key()] = np.zeros((20, 30), np.uint8)
     page = visit.open()
@@ -209,6 +214,7 @@ def when(page, name):
     return page.evaluate("async (path) => (await (await fetch('/api/node?path=' + path)).json()).time", f"{name}.mode")
 
 
+@pytest.mark.long
 def test_stepping_and_playing_with_the_keyboard(visit, pspace, key):
     name = key("n")
     pspace[name] = 0
@@ -241,6 +247,7 @@ def test_stepping_and_playing_with_the_keyboard(visit, pspace, key):
     expect(page.locator("#help")).to_be_hidden()
 
 
+@pytest.mark.long
 def test_arrays_have_tabs(visit, kvs, key):
     name = key("cam")
     image = np.zeros((60, 80, 3), np.uint8)
@@ -328,6 +335,7 @@ def test_writing_asks_first_and_tells_subscribers(visit, pspace, kvs, key):
     expect(page.locator("#confirm")).to_be_hidden()
 
 
+@pytest.mark.long
 def test_what_is_gone_is_said_and_comes_back(visit, pspace, kvs, key):
     name = key("here")
     page = visit.open(f"/view/{name}")
@@ -338,6 +346,7 @@ def test_what_is_gone_is_said_and_comes_back(visit, pspace, kvs, key):
     expect(page.locator(".note")).to_contain_text("nothing is stored")
 
 
+@pytest.mark.long
 def test_what_is_typed_is_not_lost_when_the_type_changes(visit, pspace, key):
     pspace[key("mode")] = 1
     page = visit.open(f"/view/{key('mode')}")
@@ -365,6 +374,7 @@ def test_the_keyboards_place_in_the_tree_is_kept_when_rows_above_vanish(visit, p
     expect(row(page, key("b_second"))).to_be_focused()
 
 
+@pytest.mark.long
 def test_numbers_have_a_line_in_the_tree(visit, pspace, key):
     page = visit.open("/")
     for number in (1.0, 3.0, -2.0):
@@ -417,6 +427,7 @@ def test_a_stray_percent_in_the_address_is_said(visit):
     expect(page.locator("#dot")).to_have_class("dot ok")
 
 
+@pytest.mark.long
 def test_search_on_a_phone_covers_the_value(visit, kvs, key):
     kvs[key("arm")] = {"joint": 1}
     page = visit.open(f"/view/{key('arm')}.joint")
@@ -431,6 +442,7 @@ def test_search_on_a_phone_covers_the_value(visit, kvs, key):
     expect(page.locator("h1")).to_have_text(key("arm"))
 
 
+@pytest.mark.long
 def test_downloads_are_whole_and_say_why_there_is_none(visit, kvs, key, tmp_path):
     image = np.arange(60 * 40 * 3, dtype=np.uint8).reshape(60, 40, 3)
     kvs[key()] = {"image": image, "z": np.array([1j]), "mixed": [1, "a"]}
@@ -461,6 +473,7 @@ def test_the_scale_of_colours_is_there_again_after_other_tabs(visit, kvs, key):
     eventually(lambda: page.locator(".scale canvas").evaluate(drawn))
 
 
+@pytest.mark.long
 def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, key):
     kvs[key("a_rather_long_name_of_a_key")] = {"x": list(range(40)), "text": "word " * 200}
     name = key("a_rather_long_name_of_a_key")
@@ -481,6 +494,7 @@ def test_on_a_phone_the_tree_and_the_value_take_turns(visit, kvs, key):
     expect(page.locator("#live")).to_be_in_viewport()
 
 
+@pytest.mark.long
 def test_lost_connections_are_seen_and_mended(chromium, tmp_path):
     visitor = Visitor(chromium, None)
     with EmbeddedServer(directory=tmp_path / "data") as server:
@@ -508,6 +522,7 @@ HIDE = """hidden => {
 }"""
 
 
+@pytest.mark.long
 def test_pages_in_other_tabs_take_no_connection_and_come_back_up_to_date(visit, pspace, key):
     """A browser has six for all pages of one host: a seventh page would wait for ever."""
     pspace[key()] = 1

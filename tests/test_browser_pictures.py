@@ -24,6 +24,7 @@ from reem_async.tools.browser.trees import Frame, Leaf, framed, leaf_of
 DEFAULT_BUDGET, DEFAULT_SECONDS = 128 << 20, 60
 
 
+@pytest.mark.long
 def test_the_slider_of_a_robot_with_two_cameras_has_a_picture_for_each_instant(server_url, key):
     """640x480x3 at 30 Hz and depth at 10 Hz: it had 7 pictures at 155 instants, and none of depth.
 

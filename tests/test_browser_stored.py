@@ -67,6 +67,7 @@ def nobody_looks(monkeypatch):
     monkeypatch.setattr(follower, "_FIND_SECONDS", 600.0)
 
 
+@pytest.mark.long
 async def test_at_rest_only_the_names_of_keys_are_asked_for(server_url, key, akvs, apspace, raw):
     await akvs[key("a")].write({"x": {"y": 1}, "image": np.zeros((30, 30))})
     await akvs[key("b")].write(np.zeros(5))
@@ -177,6 +178,7 @@ async def test_what_is_published_all_the_time_is_read_now_and_then(server_url, k
         assert read < 250
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("right", ["client|tracking", "type"])
 async def test_who_may_not_track_looks_once_a_second_and_says_so(caplog, right):
     async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
@@ -250,6 +252,7 @@ async def test_all_nodes_of_a_cluster_tell(cluster, key, nobody_looks):
                 await seen(source, MISSING, name)
 
 
+@pytest.mark.long
 async def test_what_is_stored_while_the_connection_is_broken_is_seen(server_url, key, akvs, raw):
     """An array leaves no trace in its document's text."""
     names = [key("a"), key("b")]
@@ -288,6 +291,7 @@ async def test_nothing_is_kept_of_keys_that_are_gone(server_url, key, akvs):
         await seen(source, {"n": 1}, names[0])
 
 
+@pytest.mark.long
 async def test_a_clock_that_is_set_back_costs_nothing_of_the_past(server_url, key, apspace, monkeypatch):
     """For an hour there was no past, no plot and no rate, and each look took what was published for stored."""
     real, back = time.time, [0.0]

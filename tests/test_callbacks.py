@@ -213,6 +213,7 @@ print(*taken)
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="this system has no such signals")
 def test_a_signal_with_a_handler_does_not_end_the_wait_at_a_queue():
     """Ctrl-C does, since its handler raises; then the next one to wait takes what comes."""

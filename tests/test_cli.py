@@ -202,6 +202,7 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
     assert "hidden" not in said
 
 
+@pytest.mark.long
 def test_the_password_may_be_in_a_variable_of_its_own():
     """For every command; one in the URL goes before it."""
     with EmbeddedServer(password="known-4711") as server:
@@ -226,6 +227,7 @@ def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
     assert cli.process("ls", PYTHONWARNINGS=silent.partition("=")[2]).stderr.splitlines() == [error]
 
 
+@pytest.mark.long
 def test_completion_of_paths(cli, kvs):
     def completed(*words, **changes):
         typed = ["reem", "get", "--namespace", cli.namespace, *words]
@@ -455,6 +457,7 @@ def test_publishing_until_ctrl_c(cli, kvs):
 # --- the terminal and the pipe -------------------------------------------------
 
 
+@pytest.mark.long
 def test_colours_and_widths_are_those_of_the_terminal(cli, kvs):
     wide, code = cli.in_terminal("ls")
     assert code == 0

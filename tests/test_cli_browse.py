@@ -124,6 +124,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(server_url):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_a_file_that_is_no_recording_is_refused(tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"no recording at all")

@@ -66,6 +66,7 @@ def test_it_tells_the_way(own, host, way):
     assert findings(CommandLine(url, "")("doctor", "--json", "--no-write"))["access"]["message"].endswith(way)
 
 
+@pytest.mark.long
 def test_the_installed_command_in_a_pipe_and_in_a_terminal(own):
     cli = CommandLine(own[0], "robot:")
     run = cli.process("doctor", "--no-write")
@@ -134,6 +135,7 @@ def test_a_server_that_throws_keys_away(own):
     assert "of 209.7 MB (maxmemory)" in report["memory"]["message"]
 
 
+@pytest.mark.long
 def test_every_node_of_a_cluster_is_examined_and_named(cluster):
     """The worst first of each check; nothing of it is a matter of which node is asked."""
     bad = cluster.nodes[1]
@@ -158,6 +160,7 @@ def test_every_node_of_a_cluster_is_examined_and_named(cluster):
     assert [line for line in lines if line.startswith(f"warn\teviction\t127.0.0.1:{bad.port}: allkeys-lru")]
 
 
+@pytest.mark.long
 def test_a_node_that_does_not_answer_is_a_finding_and_the_others_are_examined():
     with EmbeddedCluster(replicas=0) as cluster:
         gone = f"127.0.0.1:{cluster.nodes[1].port}"
@@ -176,6 +179,7 @@ def answers(port):
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
+@pytest.mark.long
 def test_a_server_without_json(tmp_path):
     try:
         program = find_program()

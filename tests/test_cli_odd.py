@@ -155,6 +155,7 @@ def test_a_restore_that_fails_says_how_far_it_came(servers, tmp_path):  # noqa: 
         admin.close()
 
 
+@pytest.mark.long
 def test_saving_by_period_ends_with_its_reader(reem, kvs, tmp_path):
     kvs["a"] = 1
     words = shlex.join(

@@ -201,6 +201,7 @@ def test_samples_for_some_time(key, kvs, reem, tmp_path):
         assert set(log[key("a.joint")].history()[1].tolist()) == {1.5}
 
 
+@pytest.mark.long
 def test_samples_that_are_late_or_fail_are_told(key, kvs, raw, reem, tmp_path):
     """They were counted in the file alone; where all had failed it was said that nothing was there."""
     kvs[key("a")] = 1
@@ -217,6 +218,7 @@ def test_samples_that_are_late_or_fail_are_told(key, kvs, raw, reem, tmp_path):
     assert f"none of the paths of the samples could be read: {last['failed']} readings failed" in run.stderr
 
 
+@pytest.mark.long
 def test_what_cannot_be(key, reem, tmp_path):
     (tmp_path / "there.mcap").write_bytes(b"precious")
     for arguments, code, text in (

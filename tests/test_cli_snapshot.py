@@ -244,6 +244,7 @@ def periodic(*arguments, **changes):
             process.kill()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     """A line for each; the oldest that it saved itself go, and nothing else."""
@@ -335,6 +336,7 @@ def test_a_listing_ends_with_its_reader(tmp_path):
     assert (run.returncode, run.stdout.count("\n"), run.stderr) == (0, 1, "")
 
 
+@pytest.mark.long
 def test_by_period_it_outlives_the_server(tmp_path):
     """What went wrong is said, and the next one is tried."""
     server = EmbeddedServer()

@@ -231,6 +231,7 @@ def snapshots(tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "what"), [("a.zip", "1 key"), ("b.rdb", "3 Redis keys")])
 def test_from_a_snapshot(snapshots, name, what):
     """A past state beside the live one: on a free port, under the namespace it was taken of."""
@@ -249,6 +250,7 @@ def test_from_a_snapshot(snapshots, name, what):
     assert file.read_bytes() == before
 
 
+@pytest.mark.long
 def test_from_a_snapshot_into_a_directory(snapshots):
     """Once; from then on the directory has the data."""
     data = str(snapshots / "data")
@@ -265,6 +267,7 @@ def test_from_a_snapshot_into_a_directory(snapshots):
         assert reem.KeyValueStore(interface)["foo"]["n"].read() == 1.5
 
 
+@pytest.mark.long
 def test_from_what_is_no_snapshot(snapshots):
     """Said, with an exit code, and no server is left."""
     whole = (snapshots / "a.zip").read_bytes()
@@ -283,6 +286,7 @@ def test_from_what_is_no_snapshot(snapshots):
         assert "Traceback" not in run.stderr
 
 
+@pytest.mark.long
 def test_version_and_help():
     run = reem_command("--version")
     assert (run.returncode, run.stderr) == (0, "")
@@ -308,6 +312,7 @@ def test_without_the_extra(missing):
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.long
 def test_a_plain_server_is_started_when_told():
     """It has no module, is said to have none, and takes the same documents."""
     import reem
@@ -328,6 +333,7 @@ def test_a_plain_server_is_started_when_told():
         assert "Stopped." in rest
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [["--cluster"], ["--cluster", "--plain"]], ids=" ".join)
 def test_a_cluster_until_told_to_stop(options):
     import reem
@@ -346,6 +352,7 @@ def test_a_cluster_until_told_to_stop(options):
         assert "Stopped." in rest
 
 
+@pytest.mark.long
 def test_a_cluster_takes_no_other_option():
     run = reem_command("up", "--cluster", "--port", "0")
     assert run.returncode == 1

@@ -76,6 +76,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     eventually(lambda: not [pid for pid in pids if os.path.exists(f"/proc/{pid}")])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("then", ["", "cluster.stop()", "fork(cluster.stop)", "fork(lambda: cluster.start())"])
 def test_no_noise_on_any_way_out(then):
     """Not at the interpreter's end either, when no thread can be had any more; a forked child leaves it alone."""

@@ -1,4 +1,4 @@
-"""What people do with the command line says and does the same on one server, on a cluster, and behind sentinels."""
+"""What people do with the command line says and does the same on a cluster and behind sentinels."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ from typer.testing import CliRunner
 import reem
 from reem_async.errors import ServerMissing
 from reem_async.plan import Plan
-from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
 from reem_async.tools.cli import build
+
+pytestmark = pytest.mark.long
 
 SPACE = "fleet:"
 NAMES = [f"k{number:02}" for number in range(36)]
@@ -38,28 +39,22 @@ def value_of(number):
     return {"n": number, "array": np.arange(number * 1000.0), "list": [1, "two", None]}
 
 
-WITH_JSON = ["one server", "cluster", "sentinels"]
-WITHOUT = ["one plain server", "plain cluster", "plain sentinels"]
-
-
-@pytest.fixture(scope="module", params=WITH_JSON if PLAIN else WITH_JSON + WITHOUT)
+@pytest.fixture(scope="module", params=["cluster", "sentinels"] if PLAIN else ["cluster", "sentinels", "plain cluster"])
 def kind(request):
-    """What servers these are; where a run has plain ones only, once is enough."""
+    """Several servers of some kind: what there is on one of them is tested in the files of each command."""
     return request.param
 
 
 @pytest.fixture(scope="module")
 def is_plain(kind):
-    return PLAIN or kind in WITHOUT
+    return PLAIN or kind == "plain cluster"
 
 
 @pytest.fixture(scope="module")
 def url(kind, is_plain, request, tmp_path_factory):
     with contextlib.ExitStack() as stack:
         try:
-            if "server" in kind:
-                yield stack.enter_context(EmbeddedServer(json=not is_plain)).url
-            elif "sentinels" in kind:
+            if kind == "sentinels":
                 yield Watched(tmp_path_factory.mktemp("sentinels"), stack, json=not is_plain).url
             elif is_plain:
                 yield stack.enter_context(EmbeddedCluster(replicas=0, json=False)).url

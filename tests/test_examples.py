@@ -96,6 +96,7 @@ def test_the_image_system_runs_as_three_processes(front, url, tmp_path):
     assert (picture == (255, 210, 0)).all(2).sum() > 400, "the box"
 
 
+@pytest.mark.long
 def test_the_demo_needs_no_server(tmp_path):
     """`make demo`, but shorter: it starts one of its own."""
     try:
@@ -107,6 +108,7 @@ def test_the_demo_needs_no_server(tmp_path):
     assert (tmp_path / "last.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_the_demo_fails_if_a_program_does(url, tmp_path):
     """The exit code says so, and the message says which and why."""
     (tmp_path / "PIL.py").write_text("raise ImportError")
@@ -130,6 +132,7 @@ def test_an_example_without_its_server_says_so(module, front):
 # --- the others ---
 
 
+@pytest.mark.long
 @FRONTS
 def test_the_arm_actuator_runs_both_ways(front, url):
     """Over the store and over publish/subscribe: set points are fresh, at about the rates wanted."""

@@ -12,7 +12,7 @@ import threading
 import time
 
 import pytest
-from conftest import ROOT
+from conftest import ROOT, sized
 from interruptkit import at_step
 
 import reem
@@ -27,6 +27,7 @@ from reem_async.transport.packing import Packer
 
 SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**6))
 PATIENCE = 30.0
+EVERY = sized(29, 7)
 
 
 def elsewhere(work):
@@ -47,7 +48,8 @@ def run(code, *words):
 @pytest.mark.parametrize("mode", ["raise", "call", "close"])
 def test_signals_at_random_instants_in_every_blocking_call(server_url, key, mode):
     """Every call ends, other threads go on, and nothing crashes; `tests/interruptkit.py` does the same for longer."""
-    words = ("--mode", mode, "--seconds", "5", "--seed", str(SEED), "--url", server_url, "--prefix", f"{key.prefix}:")
+    words = ("--mode", mode, "--seconds", sized("1.5", "5"), "--seed", str(SEED))
+    words += ("--url", server_url, "--prefix", f"{key.prefix}:")
     done = subprocess.run(
         [sys.executable, str(ROOT / "tests/interruptkit.py"), *words],
         capture_output=True, text=True, timeout=60, check=False,
@@ -83,12 +85,12 @@ CALLS = {
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
 def test_a_handler_that_closes_the_interface_works_at_each_step(server_url, key, name):
-    """The call that it came into ends: with what it is for, or with InterfaceClosed. Every 7th step of Python."""
-    name_of_key, place, reached = key(), random.randrange(7), True
+    """The call that it came into ends: with what it is for, or with InterfaceClosed."""
+    name_of_key, place, reached = key(), random.randrange(EVERY), True
     with reem.RedisInterface(server_url) as other:
         reem.KeyValueStore(other)[name_of_key] = 1
     while reached:
-        place += 7
+        place += EVERY
         interface = reem.RedisInterface(server_url)
         kvs = reem.KeyValueStore(interface)
         if place % 2:
@@ -107,7 +109,7 @@ def test_a_handler_that_closes_the_interface_works_at_each_step(server_url, key,
 @pytest.mark.filterwarnings("ignore:coroutine .* was never awaited")
 def test_a_handler_that_raises_keeps_no_other_thread_waiting_at_any_step(server_url, key, name):
     """Ctrl-C comes into every 7th step of Python; then another thread follows, publishes and closes."""
-    name_of_key, place, reached = key(), random.randrange(7), True
+    name_of_key, place, reached = key(), random.randrange(EVERY), True
     with reem.RedisInterface(server_url) as other:
         reem.KeyValueStore(other)[name_of_key] = 1
 
@@ -117,7 +119,7 @@ def test_a_handler_that_raises_keeps_no_other_thread_waiting_at_any_step(server_
         interface.close()
 
     while reached:
-        place += 7
+        place += EVERY
         interface = reem.RedisInterface(server_url)
         kvs = reem.KeyValueStore(interface)
         try:

@@ -92,6 +92,7 @@ async def test_of_keys_that_were_published_and_deleted_nothing_is_kept_and_no_la
         assert [event.value for event in events if event.name == name] == [0, None, 1, 2, 3, 4, 5]
 
 
+@pytest.mark.long
 async def test_a_watch_of_all_keys_keeps_none_that_are_gone_and_finds_them_again(cluster, pair, key):
     """Published or only stored, as they were before or the other way round."""
     one, two = pair

@@ -176,6 +176,7 @@ def test_an_interrupt_in_the_middle_of_reading_leaves_no_lock_and_no_descriptor(
     check_all_slots(segment)
 
 
+@pytest.mark.long
 def test_views_may_go_in_any_thread_and_in_the_garbage_collector():
     segment, before = Segment(1000), descriptors()
     for _ in range(20):
@@ -340,6 +341,7 @@ def test_what_somebody_else_makes_as_a_publisher_does_is_a_segment():
         os.close(descriptor)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", OPENED)
 def test_what_is_no_segment_is_not_looked_into(what, tmp_path):
     before, descriptor = descriptors(), OPENED[what](tmp_path)

@@ -79,6 +79,7 @@ def test_a_child_of_a_publisher_has_memory_of_its_own(server_url, key):
 # --- the end of the interpreter ---------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EXITS)
 def test_an_interpreter_that_ends_while_frames_are_looked_at_says_nothing(name, server_url, key):
     with started(name, server_url, key("cam")) as process:
@@ -92,6 +93,7 @@ AMPLE = {"descriptors": 20, "memory": 200 << 20}
 CASES = [(kind, left, False) for kind in TIGHT for left in TIGHT[kind]] + [(kind, AMPLE[kind], True) for kind in AMPLE]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "left", "shared"), CASES)
 def test_a_publisher_that_has_no_descriptors_or_memory_left_goes_through_the_server(
     kind, left, shared, server_url, key, mirror
@@ -108,6 +110,7 @@ def test_a_publisher_that_has_no_descriptors_or_memory_left_goes_through_the_ser
         order(process, "end")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("kind", "left", "shared"), CASES)
 def test_a_reader_that_has_no_descriptors_or_memory_left_has_the_server_s(kind, left, shared, server_url, key, pspace):
     pspace[key("cam")] = frame(0, localkit.MANY)
@@ -143,7 +146,7 @@ def test_another_user_of_this_host_gets_the_frame_from_the_server(server_url, ke
 # --- kill -9 ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mode", ["auto", "early"])
+@pytest.mark.parametrize("mode", ["auto", pytest.param("early", marks=pytest.mark.long)])
 def test_a_publisher_that_is_killed_at_any_step_leaves_nothing_and_spoils_nothing(
     mode, server_url, key, pspace, kvs, mirror, following, monkeypatch
 ):

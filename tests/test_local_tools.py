@@ -49,6 +49,7 @@ def local_finding(url, *words, namespace=""):
 # --- reem doctor ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @only_where_there_is
 def test_doctor_has_another_process_look_into_memory(server_url):
     row = local_finding(server_url)
@@ -75,6 +76,7 @@ def test_doctor_says_why_there_is_none(monkeypatch):
     assert sharing.found("only Linux has what it takes").status == OK
 
 
+@pytest.mark.long
 @only_where_there_is
 @pytest.mark.parametrize(
     ("channels", "status"),

@@ -209,6 +209,7 @@ async def test_a_cut_connection_is_an_error_until_the_copy_is_there_again(ainter
         assert await mirror.wait_until(lambda value: True, 10) == 2
 
 
+@pytest.mark.long
 async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_the_mirror(
     ainterface, akvs, key, raw, monkeypatch
 ):

@@ -155,6 +155,7 @@ def addressable(key):
         return False
 
 
+@pytest.mark.long
 def test_each_short_key_of_odd_characters_is_addressed_exactly_or_refused(server):
     odd = [*" \t\n\r\v\f\0\x85\xa0\u200b\u3000\ufeff'\"\\[]()*$@?.,:-~{}0a一😀"]
     keys = {"".join(each) for length in (1, 2, 3) for each in itertools.product(odd, repeat=length)}
@@ -166,6 +167,7 @@ def test_each_short_key_of_odd_characters_is_addressed_exactly_or_refused(server
     assert all(key[0] == " " or "\\" in key or {*"\"'"} <= {*key} for key in refused)
 
 
+@pytest.mark.long
 def test_each_character_first_last_or_alone_is_addressed_exactly_or_refused(server):
     with redis.Redis(unix_socket_path=server.socket_path) as raw:
         for start in range(0, 0x10000, 0x1000):

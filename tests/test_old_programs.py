@@ -253,6 +253,7 @@ def test_socket_timeout_is_the_time_limit(package):
             limit("localhost", socket_timeout=wrong)
 
 
+@pytest.mark.long
 def test_a_slow_server_is_waited_for_as_socket_timeout_says():
     """Longer than the default of 1 s."""
     with EmbeddedServer() as server, reem.RedisInterface(server, socket_timeout=20) as interface:

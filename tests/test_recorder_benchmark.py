@@ -42,6 +42,7 @@ def test_a_run_without_a_quiet_pair_says_so():
     assert found["quiet"] == {"pairs": 0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("whom", ["recorder", *LEAST])
 def test_a_short_run_measures_both_writers_and_is_written_into_the_page(tmp_path, whom):
     kept = run(whom, pairs=1, minutes=0.01, seconds=1.0, console=Console(quiet=True))

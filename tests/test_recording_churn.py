@@ -7,7 +7,7 @@ import random
 import time
 
 import pytest
-from conftest import RawCluster, aeventually
+from conftest import RawCluster, aeventually, sized
 from test_recording_stored import news
 
 from reem_async.tools.recording import Recorder, open_log
@@ -35,7 +35,7 @@ async def test_nothing_is_kept_of_keys_that_came_and_went(key, apspace, akvs, bi
     assert news(file, key("job4"))[-2:] == [(key("job4"), "stored", {"n": -4}), (key("job4.m"), "stored", 2)]
 
 
-@pytest.mark.parametrize("pause", [0.0, 0.02, 0.15])
+@pytest.mark.parametrize("pause", sized([0.02], [0.0, 0.02, 0.15]))
 async def test_a_key_that_comes_again_loses_nothing_at_whatever_instant(raw, key, apspace, binterface, file, pause):
     """What was kept of it is let go of at keyframes, here all the time."""
     if isinstance(raw, RawCluster):

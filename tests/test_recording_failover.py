@@ -139,7 +139,11 @@ async def check(url, patterns, file, disturb):
                 await kvs[name].delete()
 
 
-PATTERNS = pytest.mark.parametrize("patterns", [["*"], NAMES, ["k0", "k?"]], ids=["all", "names", "a name and a glob"])
+PATTERNS = pytest.mark.parametrize(
+    "patterns",
+    [pytest.param(["*"], marks=pytest.mark.long), NAMES, pytest.param(["k0", "k?"], marks=pytest.mark.long)],
+    ids=["all", "names", "a name and a glob"],
+)
 
 
 @PATTERNS
@@ -169,6 +173,8 @@ async def test_a_primary_of_a_cluster_that_is_killed(file, patterns):
         await check(cluster, patterns, file, killed)
 
 
+@pytest.mark.long
+@pytest.mark.long
 @pytest.mark.parametrize("kill", [False, True], ids=["switched", "killed"])
 async def test_a_primary_that_sentinels_replace(watched, file, kill):
     """By an administrator's word, and when it is killed."""

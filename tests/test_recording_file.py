@@ -17,7 +17,7 @@ import mcap.writer
 import numpy as np
 import orjson
 import pytest
-from conftest import aeventually, assert_same, eventually, python
+from conftest import aeventually, assert_same, eventually, python, sized
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from test_recording import FRAME, IMAGE
 
@@ -99,6 +99,7 @@ def test_what_is_written_is_what_the_library_reads(compression, tmp_path):
     assert compression == "none" or file.stat().st_size < sum(sizes) * 0.7 < whole_before_the_end * 2
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path, monkeypatch):
     """The index of chunks grows by ten bytes for each channel and chunk; it waits in a file, and is complete."""
     monkeypatch.setattr(recording_writer, "_INDEX_BYTES", 1 << 14)
@@ -141,6 +142,7 @@ def test_arrivals_do_not_tell_that_updates_were_taken_together():
         assert arrivals.of("q", 200.0, 103.0) == 103.0
 
 
+@pytest.mark.long
 def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values):
     file, seen = file_and_values
     with file.open("rb") as stream:
@@ -314,7 +316,7 @@ def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp
     """What is missing is counted: no update is lost but at the end, and none is another one."""
     file, seen = file_and_values
     data, rng, broken = file.read_bytes(), random.Random(11), tmp_path / "broken.mcap"
-    for number in range(150):
+    for number in range(sized(40, 150)):
         broken.write_bytes(mutated(data, rng))
         try:
             found, damaged = check(broken, names, seen)
@@ -326,6 +328,7 @@ def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp
             log.verify()
 
 
+@pytest.mark.long
 def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_values, tmp_path):
     """Any bit of a log time: either what is told is right, or `verify` says that something is damaged."""
     file, seen = file_and_values

@@ -273,6 +273,7 @@ async def test_what_replaces_a_recording_has_something_in_it(key, apspace, binte
             assert log[key("arm.joint")].at(log.end) == 1
 
 
+@pytest.mark.long
 def test_what_a_full_disk_cannot_replace_stays(key, pspace, server_url, file):
     file.write_bytes(b"old")
     pspace[key("image")] = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8)

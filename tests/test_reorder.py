@@ -99,6 +99,7 @@ def test_however_the_two_ways_interleave_each_update_is_told_once_and_in_order(d
     assert "doubt" not in listener.told
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(data=st.data())
 def test_what_neither_way_brings_is_a_hole_in_the_numbers_and_all_else_is_told_once(data):

@@ -15,7 +15,7 @@ import pytest
 import redis
 from callkit import CALLS
 from clusterkit import assert_tidy, clients_of
-from conftest import PLAIN, assert_same
+from conftest import PLAIN, assert_same, sized
 
 import reem_async
 from reem_async.errors import MissingKey, NotAllowed, PartialWrite, PathRefused, RedisError
@@ -179,15 +179,15 @@ def kinds_for(space):
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 async def test_a_call_without_a_right_is_not_applied_or_says_what_was(single, space, late):
     """On one server."""
-    counts = await tried(single, space, kinds_for(space), late=late)
+    counts = await tried(single, space, kinds_for(space)[:: sized(3, 1)], late=late)
     print(space, late, counts)
-    assert counts["NotAllowed"] > 50
+    assert counts["NotAllowed"] > sized(15, 50)
 
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 async def test_a_call_without_a_right_in_a_cluster_is_not_applied_or_says_what_was(several, space):
     """The error names command and key."""
     kinds = kinds_for(space)
-    counts = await tried(several, space, kinds if ALL else random.Random(SEED).sample(kinds, 6), late=False)
+    counts = await tried(several, space, kinds if ALL else random.Random(SEED).sample(kinds, sized(3, 6)), late=False)
     print(space, counts)
-    assert counts["NotAllowed"] > 30
+    assert counts["NotAllowed"] > sized(10, 30)

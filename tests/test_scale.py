@@ -284,6 +284,7 @@ def measured():
         yield measure({"one": servers}, EFFORT)["one"], full.run_arms(servers, 1, 1.0)
 
 
+@pytest.mark.long
 def test_what_is_measured_is_what_was_done(measured):
     found, _ = measured
     frame = 480 * 640 * 3

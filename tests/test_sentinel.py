@@ -111,6 +111,7 @@ def test_a_primary_that_takes_no_writes_for_want_of_replicas_is_no_replica(front
     assert states == []
 
 
+@pytest.mark.long
 def test_a_switch_leaves_no_connection_to_the_primary_of_before(front, watched):
     """Nothing is due on them."""
     watched.settle()
@@ -132,6 +133,7 @@ def test_a_switch_leaves_no_connection_to_the_primary_of_before(front, watched):
     assert not [wire for wire in getattr(before, "_open", ()) if wire.alive]
 
 
+@pytest.mark.long
 async def test_a_switch_by_an_administrator_is_told_to_followers_and_to_who_only_calls(watched):
     """And what becomes of connections to the old primary afterwards is nobody's loss."""
     watched.settle()
@@ -154,6 +156,7 @@ async def test_a_switch_by_an_administrator_is_told_to_followers_and_to_who_only
     await asyncio.to_thread(watched.settle)
 
 
+@pytest.mark.long
 async def test_what_is_stored_after_a_switch_is_told_by_the_new_primary(watched):
     """Behind a gap with what is there; a mirror has it too."""
     watched.settle()

@@ -670,6 +670,7 @@ class TestPrograms:
     def test_extra(self, tmp_path):
         assert self.run(self.SHOW, PATH=str(tmp_path)) == "up\n"
 
+    @pytest.mark.long
     def test_reem_server_with_json(self, wrapped, tmp_path):
         marker = tmp_path / "ran"
         modules = "".join(f"loadmodule {m}\\n" for m in _server_programs.find_program().modules)

@@ -96,7 +96,12 @@ class Case:
         assert self.due is None, (self.space, self.kind, self.told)
 
 
-@pytest.mark.parametrize("phase", PHASES)
+FIRST = ["nothing has left", "only arrays have left", "the target has been told"]
+
+
+@pytest.mark.parametrize(
+    "phase", [*FIRST, *(pytest.param(p, marks=pytest.mark.long) for p in PHASES if p not in FIRST)]
+)
 async def test_a_call_to_a_slot_on_its_way_is_whole_or_refused(cluster, key, phase):
     """Nothing is on both nodes, the rest can be moved, and then there is what the call said, and nothing else."""
     kinds = [(space, kind) for kind in CALLS for space in ("KeyValueStore", "PublishSpace")]

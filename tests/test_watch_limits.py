@@ -34,6 +34,7 @@ with reem.RedisInterface(url) as interface:
 """
 
 
+@pytest.mark.long
 def test_a_stopped_watcher_of_many_keys_owes_one_message_for_each(server_url, kvs, raw, key):
     """However often they are written; when it goes on, it has the last state of each."""
     if isinstance(raw, RawCluster):

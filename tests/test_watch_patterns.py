@@ -249,6 +249,7 @@ async def test_a_look_for_keys_that_the_server_refuses_is_made_again(akvs, key, 
         assert (await asyncio.wait_for(anext(watch), 10)).path == key("a")
 
 
+@pytest.mark.long
 async def test_of_a_key_that_is_gone_nothing_is_kept_where_only_places_in_it_are_watched(ainterface, akvs, key):
     """If it comes to be again, it is found like any other."""
     name = key("job")

@@ -1,4 +1,4 @@
-"""What breaks calls off: interrupts, cancels, forks, and handlers of signals that call REEM or close it."""
+"""What breaks calls off: interrupts, cancels, cut connections, forks, and signal handlers that call or close REEM."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import os
 import random
 import select
 import signal
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
+from chaos.proxy import Proxy
 from interruptkit import at_step
 
 from .clients import LIMIT, Asyncio, Blocking
@@ -56,6 +58,21 @@ def _handled(rng: random.Random, call: Callable[[], Any], handler: Callable[...,
             signal.setitimer(signal.ITIMER_REAL, 0)
     finally:
         signal.signal(signal.SIGALRM, before)
+
+
+def cut(rng: random.Random, proxy: Proxy, call: Callable[[], Any]) -> Any:
+    """Make a call whose reply is lost, or whose connection is cut a moment after it began."""
+    breaks = rng.choice([proxy.reset, proxy.half_close, None])
+    timer = threading.Timer(10 ** rng.uniform(-5, -2.5), breaks or (lambda: None))
+    if breaks is None:
+        proxy.drop_reply(b"\r\n")
+    timer.start()
+    try:
+        return call()
+    finally:
+        timer.join()
+        proxy.heal()
+        proxy.settled()
 
 
 def cancelled(rng: random.Random, client: Asyncio, op: Op, published: bool) -> bool:

@@ -14,8 +14,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from chaos.proxy import Proxy
 
-from reem_async.errors import BadType, InterfaceClosed, PathRefused
+from reem_async.errors import BadType, ConnectionLost, InterfaceClosed, NotConnected, PathRefused
 from reem_async.server import EmbeddedServer
 
 from . import faults
@@ -86,7 +87,10 @@ class Hunter:
         self.asyncio = [Asyncio("asyncio", at, ""), Asyncio("asyncio r:", at, NAMESPACES[1])]
         self.clients: list[Client] = [*self.blocking, Elsewhere(main), Elsewhere(spaced), *self.asyncio]
         self.ears = Blocking("ears", at, ""), Asyncio("ears of asyncio", at, "")
-        for client in (*self.ears, self.static, *self.clients):
+        self.proxy = stack.enter_context(Proxy(int(self.here.url.rpartition(":")[2])))
+        far = (self.proxy.url, {})
+        self.far: list[Client] = [Blocking("far", far, ""), Asyncio("far asyncio", far, "")]
+        for client in (*self.ears, self.static, *self.clients, *self.far):
             stack.callback(client.close)
 
     # --- steps ---
@@ -261,7 +265,8 @@ class Hunter:
     # --- calls that are broken off ---
 
     def _fault(self) -> None:
-        fault = self.rng.choice([self._interrupt, self._interrupt, self._cancel, self._cancel, self._call, self._close])
+        usual = [self._interrupt, self._cancel, self._cut]
+        fault = self.rng.choice([*usual, *usual, self._call, self._close])
         if self.rng.random() < 0.03:
             fault = self._fork
         self.counts[fault.__name__[1:]] += 1
@@ -282,11 +287,22 @@ class Hunter:
             document = self.documents.get(full, ABSENT)
             self._take(client, Op("write", (op.path[0],), copy.deepcopy({} if document is ABSENT else document)), full)
 
+    def _cut(self) -> None:
+        client = self.rng.choice(self.far)
+        op, full = self._choose(client)
+        lost = (ConnectionLost, NotConnected)
+        self._broken_off(client, op, full, lambda make: faults.cut(self.rng, self.proxy, make), lost)
+
     def _broken_off(
-        self, client: Blocking, op: Op, full: str, run: Callable[[Callable[[], None]], Any], error: type[BaseException]
+        self,
+        client: Client,
+        op: Op,
+        full: str,
+        run: Callable[[Callable[[], None]], Any],
+        error: type[BaseException] | tuple[type[BaseException], ...],
     ) -> None:
         due = self._expect(client, op, full)
-        self._note(full, f"{client.label}, {error.__name__}: {op!r}")
+        self._note(full, f"{client.label}, {error}: {op!r}")
         try:
             run(lambda: self._perform(client, op, full, due))
         except error:
