@@ -1,6 +1,6 @@
 """The reliability scoreboard: faults made on purpose, on private servers, with what REEM makes of them in figures.
 
-    python -m tests.chaos                         # every row at full size, under 25 minutes on two cores
+    python -m tests.chaos                         # every row at full size
     python -m tests.chaos --rows 1,2 --seed 7     # some rows, replayed
     python -m tests.chaos --scale quick           # what `make test-all` runs
 

@@ -6,25 +6,19 @@ They say what they found as lines of JSON on stdout.
 from __future__ import annotations
 
 import asyncio
-import atexit
-import contextlib
 import gc
 import os
 import resource
 import sys
-import threading
 import time
-from typing import Any
 
 import numpy as np
 from redis.exceptions import RedisError
-from slotkit import shared_in
 
-import reem
 import reem_async
 from reem_async.concurrency.queues import Last
 
-from .tools import Log, background, became, descriptors, frame, heard, rss, say
+from .tools import Log, background, became, descriptors, heard, rss, say
 
 # --- row 10 ----------------------------------------------------------------------------------------
 
@@ -57,112 +51,6 @@ async def _stalled(url: str) -> None:
                 silent=log.silent,
                 disordered=log.repeated + log.backward,
             )
-
-
-# --- row 16 ----------------------------------------------------------------------------------------
-
-KEPT: list[Any] = []
-"""What is alive until the interpreter clears its modules."""
-
-
-def _following(url: str) -> tuple[reem.RedisInterface, reem.KeyValueStore]:
-    """A program in the middle of its work: connections, a mirror, a callback."""
-    interface = reem.RedisInterface(url)
-    space = reem.PublishSpace(interface)
-    space["exit"] = {"n": 0}
-    heard: list[Any] = []
-    mirror = reem.SilentSubscriber("exit", interface)
-    calls = reem.CallbackSubscriber("exit", interface, lambda data, _: heard.extend([data] * bool(shared_in(data))))
-    mirror.listen()
-    calls.listen()
-    while not heard:  # the end meets frames that are looked at
-        space["exit"]["frame"] = frame(1)
-        time.sleep(0.001)
-    KEPT.extend([interface, mirror, calls])
-    return interface, reem.KeyValueStore(interface)
-
-
-def exit_at_the_end(url: str) -> None:
-    """Nothing is closed."""
-    _following(url)
-    say(bye=True)
-
-
-def exit_by_sys_exit(url: str) -> None:
-    """Out of a loop over updates."""
-    _, kvs = _following(url)
-    for _ in kvs["exit"].watch():
-        say(bye=True)
-        sys.exit(0)
-
-
-def exit_with_waiting_thread(url: str) -> None:
-    """A daemon thread waits for an update that never comes."""
-    _, kvs = _following(url)
-    begun = threading.Event()
-
-    def wait() -> None:
-        for _ in kvs["exit"].watch():
-            begun.set()
-
-    threading.Thread(target=wait, daemon=True).start()
-    begun.wait(5)
-    say(bye=True)
-
-
-def exit_with_calls_at_exit(url: str) -> None:
-    """`atexit` still reads and writes: over what is connected, and over something new."""
-    _, kvs = _following(url)
-
-    def last_words() -> None:
-        kvs["last"] = {"words": [1]}
-        assert kvs["last"]["words"].read() == [1]
-        with reem.RedisInterface(url) as fresh:
-            assert reem.KeyValueStore(fresh)["last"]["words"][0].read() == 1
-
-    atexit.register(last_words)
-    say(bye=True)
-
-
-class _Writes:
-    """Writes when it is collected, which for this one is when there is hardly an interpreter any more."""
-
-    def __init__(self, kvs: reem.KeyValueStore) -> None:
-        self._kvs = kvs
-
-    def __del__(self, suppress: Any = contextlib.suppress, error: Any = reem.ReemError) -> None:
-        with suppress(error):
-            self._kvs["collected"] = 1
-
-
-def exit_with_finalizers(url: str) -> None:
-    """`__del__` calls REEM at the very end: it may be refused, but it must not wait."""
-    _, kvs = _following(url)
-    KEPT.append(_Writes(kvs))
-    say(bye=True)
-
-
-def exit_from_asyncio(url: str) -> None:
-    """asyncio.run ends around an interface that nobody closed, with a task that waits for updates."""
-
-    async def main() -> None:
-        interface = reem_async.RedisInterface(url)
-        space = reem_async.PublishSpace(interface)
-        await space["exit"].write({"n": 0, "frame": frame(0)})
-        mirror = reem_async.SilentSubscriber("exit", interface)
-        await mirror.listen()
-        log = Log(mirror.watch(Last(10)))
-        await log.updates.listen()
-        KEPT.extend([interface, mirror, log, asyncio.ensure_future(log.follow())])
-        await became(lambda: log.told, 5)
-        await space["exit"].write({"n": 1, "frame": frame(1)})
-        await became(lambda: shared_in(mirror.value()), 5)
-        say(bye=bool(shared_in(mirror.value())))
-
-    asyncio.run(main())
-
-
-EXITS = [name for name in dict(globals()) if name.startswith("exit_")]
 
 
 # --- row 17 ----------------------------------------------------------------------------------------
