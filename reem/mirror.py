@@ -67,6 +67,7 @@ class Mirror(Following):
 
     def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
         """Wait until the value is as wanted; returns it. No round trip."""
+        core._check_wait(predicate, timeout)
         end = math.inf if timeout is None else time.monotonic() + timeout
         while not (tried := self._core._tried(predicate)).fits:
             # States: tried on the copy as it is -> waits for the next change, at most what is left -> tried again.

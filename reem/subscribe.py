@@ -12,7 +12,7 @@ from typing import Any, Self
 from reem_async.concurrency.aside import aside
 from reem_async.concurrency.queues import EMPTY, Ended, Policy
 from reem_async.concurrency.scheduling import take_short_turns
-from reem_async.errors import BadType, InterfaceClosed, QueueFull
+from reem_async.errors import BadType, InterfaceClosed
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
@@ -240,7 +240,7 @@ class CallbackSubscriber(SilentSubscriber):
         try:
             while True:
                 caller.call(queue.take_waiting(), queue.dropped)
-        except (Ended, QueueFull) as reason:
+        except Exception as reason:
             caller.ended(reason)
 
     def close(self) -> None:

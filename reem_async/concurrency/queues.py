@@ -9,28 +9,31 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import BadValue, QueueFull
+from ..errors import QueueFull
+from ..plan.arguments import check_instance, whole
 from .wakeup import Wakeups, wakeups
 
-__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "Places", "Policy", "unheard"]
+__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "Places", "Policy", "chosen", "unheard"]
 
 
 class Policy:
     """How many updates wait at most, and what happens to the next one. Use one of the subclasses.
 
     Args:
-        bound: How many updates may wait.
+        bound: How many updates may wait: an int of at least 1.
 
     Attributes:
         fails: One more ends the iterator with QueueFull; else the oldest is dropped.
+
+    Raises:
+        BadType: `bound` is not a whole number.
+        BadValue: It is below 1.
     """
 
     fails = False
 
     def __init__(self, bound: int) -> None:
-        if bound < 1:
-            raise BadValue(f"{type(self).__name__}({bound}) keeps nothing; use at least 1")
-        self.bound = bound
+        self.bound = whole("bound", bound, f"use {type(self).__name__}(n), n an int of at least 1")
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self.bound})"
@@ -54,6 +57,14 @@ class Every(Policy):
     """Keep every update, up to `bound`; one more raises QueueFull in the loop that should take them."""
 
     fails = True
+
+
+def chosen(policy: Policy | None, otherwise: Policy) -> Policy:
+    """Return a policy that a user has given, or the other one for None; raise BadType for anything else."""
+    if policy is None:
+        return otherwise
+    check_instance("policy", policy, Policy, "use Newest(), Last(n) or Every(n)")
+    return policy
 
 
 class Ended(Exception):
@@ -149,7 +160,7 @@ class BoundedQueue:
         return self._wakeups.get(os.getpid()) or self._wakeups.setdefault(os.getpid(), wakeups())
 
     def take(self) -> Any:
-        """Return the oldest update that waits, or EMPTY; raises Ended after the last, or QueueFull."""
+        """Return the oldest update that waits, or EMPTY; raises Ended after the last, or what else ended it."""
         end = self._end  # looked at first: what was put in before it is there
         try:
             number, update = self._items.popitem(last=False)
@@ -175,10 +186,10 @@ class BoundedQueue:
             # Whoever leaves otherwise, also by Ctrl-C, leaves a wakeup that wakes somebody in vain.
         return item
 
-    def close(self) -> None:
-        """End the queue after what waits."""
+    def close(self, end: Exception | None = None) -> None:
+        """End the queue after what waits: the loop over it ends, or gets an error if one is given."""
         if self._end is None:
-            self._end = Ended()
+            self._end = end or Ended()
         self._tell()
 
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from typing import NamedTuple
 
-from ..errors import BadKey
+from ..errors import BadKey, BadType
 from .keys import keys_of
-from .paths import LONGEST_TOP_KEY, Path, check_top_key, parse
+from .paths import LONGEST_TOP_KEY, Path, check_top_key, parse, shorten
 
-__all__ = ["Pattern", "channel_pattern", "escaped", "fits", "name_of", "names_key", "parse_pattern", "spelled_out"]
+__all__ = [
+    "Pattern", "channel_pattern", "escaped", "fits", "name_of", "names_key", "parse_pattern", "parse_patterns",
+    "spelled_out",
+]  # fmt: skip
 
 # The server's globs know sets, [abc], and escapes. What users type has neither: brackets are list indexes there.
 _SPECIAL = re.compile(r"([*?\[\]\\^])")
@@ -64,6 +68,13 @@ def parse_pattern(text: str) -> Pattern:
     while rest and rest[-1] == "**":
         rest.pop()
     return Pattern(check_top_key(top), tuple(rest))
+
+
+def parse_patterns(texts: Sequence[str]) -> list[Pattern]:
+    """Return several patterns; raises BadKey, and BadType for what is no list of them."""
+    if isinstance(texts, str | bytes) or not isinstance(texts, Iterable):
+        raise BadType(f"patterns={shorten(texts)} is not a list of patterns; use [{shorten(texts)}]")
+    return [parse_pattern(text) for text in texts]
 
 
 def spelled_out(rest: Path) -> Path:

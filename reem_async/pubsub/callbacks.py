@@ -14,7 +14,7 @@ from ..concurrency.queues import EMPTY, Ended
 from ..concurrency.streams import Stream
 from ..concurrency.tasks import is_being_cancelled, started
 from ..concurrency.timeouts import forget
-from ..errors import BadType, QueueFull
+from ..errors import BadType
 
 if TYPE_CHECKING:
     from .updates import Update
@@ -121,9 +121,9 @@ class Caller:
         elif count in _TOLD:
             logger.error("the callback for %s has raised %s %d times by now", self._channel, kind[0].__name__, count)
 
-    def ended(self, reason: Ended | QueueFull) -> None:
-        """Log the end of the calls if it is not by closing: the policy allowed no skipped update."""
-        if isinstance(reason, QueueFull):
+    def ended(self, reason: Exception) -> None:
+        """Log the end of the calls if it is not by closing: the policy allowed no skipped update, for example."""
+        if not isinstance(reason, Ended):
             logger.error("the callback for %s is not called any more: %s", self._channel, reason)
 
 
@@ -173,7 +173,7 @@ class Calls:
                     self._awaited = started(self._wait(update, result), "reem callback")
                     return
             self._busy = False
-        except (Ended, QueueFull) as reason:
+        except Exception as reason:
             self._caller.ended(reason)
             self._end()
         except BaseException:

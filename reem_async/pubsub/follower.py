@@ -16,8 +16,9 @@ from typing import Any
 
 from ..concurrency.queues import BoundedQueue, unheard
 from ..concurrency.tasks import is_being_cancelled
-from ..errors import BadData, ClusterNode, is_of_command
+from ..errors import BadData, ClusterNode, Stale, is_of_command
 from ..plan import Reply, wire_commands
+from ..plan.arguments import check_number
 from ..plan.keys import Keys
 from ..plan.notices import Notice
 from ..plan.paths import Path, show
@@ -27,13 +28,13 @@ from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
 from ..transport.redirects import is_unapplied
 from ..transport.wire import Wire
-from .listeners import Beginning
+from .listeners import Beginning, contained, give_error
 from .looks import Looks
 from .manager import SubscriptionManager, Topic
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
 from .updates import Origin, Update
 
-__all__ = ["Follower", "Origin", "Update"]
+__all__ = ["Follower", "Origin", "Update", "checked_largest"]
 
 logger = logging.getLogger("reem.subscribe")
 
@@ -59,6 +60,7 @@ class Follower:
         local: It takes large values from the memory of publishers of the same host.
         heartbeat: Seconds between probes of the document, if it needs more of them than others.
         born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
+        failure: The exception that has ended it, None while it follows.
         down: There is no connection, or it is new and what is there was not read yet.
         told: Called after each step that may have changed the copy.
     """
@@ -96,9 +98,11 @@ class Follower:
         self._was_gone = True  # what the last probe of the document has shown
         self._probe_refusal: Exception | None = None
         self.born: list[Notice] | None = None
+        self.failure: Exception | None = None
         self.down = True
         self.told: Callable[[], None] = unheard
 
+    @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Take a snapshot over `wire`."""
         self._wire = wire
@@ -111,10 +115,12 @@ class Follower:
         # In order behind it, so what it names has been heard of by then, or was there before.
         wire.send([("GET", self.keys.last)], self._begin_with)
 
+    @contained
     def _begin_with(self, outcome: list[Reply] | Exception) -> None:
         if isinstance(outcome, list) and isinstance(outcome[0], bytes | None):
             self._replica.begin_with(outcome[0])
 
+    @contained
     def lost(self, reason: Exception) -> None:
         """Stop applying: the connection is gone. Whoever waits for the first snapshot gets `reason`."""
         self._wire, self.down = None, True
@@ -124,6 +130,7 @@ class Follower:
             self.ready.set_exception(reason)
         self.told()
 
+    @contained
     def doubt(self, channel: bytes) -> None:
         """Take a snapshot: something was published that could not be read."""
         self._replica.unreadable()
@@ -136,17 +143,20 @@ class Follower:
         if self._replica.outputs:
             self._perform()
 
+    @contained
     def on_early(self, notice: Notice) -> None:
         """Take one update that the server may not have yet."""
         if not self.stored:  # who follows the store is never ahead of it, whether or not its server tells of changes
             self._replica.on_early(notice)
             self._perform()
 
+    @contained
     def changed(self, key: str | None) -> None:
         """Take the server's word that a key was changed."""
         self._replica.changed(key)
         self._perform()
 
+    @contained
     def on_note(self, note: bytes | None) -> None:
         """Compare with the server's note of the last update, asked for in order with notices."""
         self._replica.on_note(note)
@@ -159,6 +169,7 @@ class Follower:
         self._probe_due = now + min(self.heartbeat, _PROBE_PERIOD)
         return self.keys.document
 
+    @contained
     def on_probe(self, kind: Reply, sent: float) -> None:
         """Compare with the document's type, asked for at `sent` and answered in order with notices."""
         self._probe_refusal = kind if isinstance(kind, Exception) else None
@@ -173,9 +184,16 @@ class Follower:
         else:
             self._valid_at = max(self._valid_at, sent)
 
+    def fail(self, error: Exception) -> None:
+        """End for an exception in this follower: those who take updates from it, or read its copy, get the error."""
+        if self.failure is None:
+            self.failure = error
+            give_error(self, error)
+            self._tasks.start(self._manager.unfollow_here(self), f"reem unfollow {self.keys.name}")
+
     def value(self) -> Any:
         """Return a copy of what is followed, None if nothing is there. Any thread may."""
-        return _own(self._replica.at())
+        return _own(self.at())
 
     def age(self) -> float:
         """Return the seconds for which the server may have had something else than the copy. Any thread may.
@@ -205,7 +223,14 @@ class Follower:
         return self._replica.is_current and self._replica.at() is MISSING
 
     def at(self, inner: Path = ()) -> Any:
-        """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
+        """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may.
+
+        Raises:
+            Stale: An exception has ended this follower.
+        """
+        if self.failure is not None:
+            where = show((self.keys.name, *self._replica.path))
+            raise Stale(f"{where}: following has ended over an error: {self.failure!r}; begin anew") from self.failure
         return self._replica.at(inner)
 
     # --- what the replica asks for
@@ -252,6 +277,7 @@ class Follower:
         elif isinstance(output, Failed):
             self._report(output)
 
+    @contained
     def _look(self) -> None:
         self._replica.look()
         self._perform()
@@ -260,6 +286,7 @@ class Follower:
         if self._wire is not None:
             self._wire.send([("TYPE", key) for key in command.keys], partial(self._armed, command.number))
 
+    @contained
     def _armed(self, number: int, outcome: list[Reply] | Exception) -> None:
         refusals = [outcome] if isinstance(outcome, Exception) else [it for it in outcome if isinstance(it, Exception)]
         # Of a slot that moves, its new node is asked: what is followed begins anew there.
@@ -290,6 +317,7 @@ class Follower:
             outcome = error
         self._bring(command.number, outcome)
 
+    @contained
     def _bring(self, number: int, outcome: list[Reply] | Exception) -> None:
         now = self._loop.time()
         self._looks.earliest = now + max(_QUICKEST, now - self._asked)  # large values leave time for others
@@ -297,12 +325,13 @@ class Follower:
         self._perform()
 
     def _fence(self, number: int) -> None:
-        def fenced(outcome: list[Reply] | Exception) -> None:
-            self._replica.fenced(number, outcome if isinstance(outcome, Exception) else None)
-            self._perform()
-
         if self._wire is not None:
-            self._wire.send([("PING",)], fenced)
+            self._wire.send([("PING",)], partial(self._fenced, number))
+
+    @contained
+    def _fenced(self, number: int, outcome: list[Reply] | Exception) -> None:
+        self._replica.fenced(number, outcome if isinstance(outcome, Exception) else None)
+        self._perform()
 
     def _open(self, command: Open) -> None:
         """Have the ships make values of their replies; those that must be awaited get a task."""
@@ -394,6 +423,14 @@ class Follower:
             where = show((self.keys.name, *self._replica.path))
             fact = error.fact if isinstance(error, ClusterNode) and self._transport.sharded else error
             logger.warning("%s: an update could not be read and is skipped: %s", where, fact)
+
+
+def checked_largest(largest: float | None) -> float:
+    """Return the bytes of an array up to which it is fetched; raises BadType or BadValue for what cannot be."""
+    if largest is None:
+        return math.inf
+    check_number("largest", largest, "use a number of bytes, or None for no limit")
+    return largest
 
 
 def _own(tree: Any) -> Any:

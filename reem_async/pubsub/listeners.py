@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import functools
+import logging
 import math
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import Enum, auto
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol
 
 from ..concurrency.queues import BoundedQueue
 from ..plan import Reply
@@ -21,9 +23,15 @@ __all__ = [
     "Listener",
     "ListenerGroup",
     "Topic",
+    "contained",
+    "give_error",
     "is_invalidation",
     "is_message",
 ]
+
+logger = logging.getLogger("reem.subscribe")
+
+Arguments = ParamSpec("Arguments")
 
 
 class Topic(NamedTuple):
@@ -46,6 +54,19 @@ class Beginning(Enum):
 
     AFTER_LOSS = auto()
     """After a connection was lost, or a slot moved: nobody knows what was published meanwhile."""
+
+
+def contained(method: Callable[Concatenate[Any, Arguments], None]) -> Callable[Concatenate[Any, Arguments], None]:
+    """Have an exception in a listener's method end that listener: others share the connection that it came over."""
+
+    @functools.wraps(method)
+    def call(listener: Any, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
+        try:
+            method(listener, *args, **kwargs)
+        except Exception as error:
+            listener.fail(error)
+
+    return call
 
 
 class Listener(Protocol):
@@ -98,6 +119,18 @@ class Listener(Protocol):
     def on_probe(self, kind: Reply, sent: float) -> None:
         """Compare with the type of the document, asked for at `sent`; all before it has been handed over."""
 
+    def fail(self, error: Exception) -> None:
+        """End for an exception in this listener: those who take updates from it get the error."""
+
+
+def give_error(listener: Listener | ForwardingListener, error: Exception) -> None:
+    """Report the exception that has ended a listener, and give it to those who wait for its updates."""
+    logger.error("a subscription of %s has ended over an error of its own", listener.topic.name, exc_info=error)
+    if listener.ready is not None and not listener.ready.done():
+        listener.ready.set_exception(error)
+    for queue in listener.queues:
+        queue.close(error)
+
 
 class ForwardingListener:
     """What listeners have in common that keep no copy of a key and only hand on what they hear.
@@ -117,6 +150,10 @@ class ForwardingListener:
         self.stored = False
         self.heartbeat = math.inf
         self.local = False
+
+    def fail(self, error: Exception) -> None:
+        """End for an exception in this listener: those who take updates from it get the error."""
+        give_error(self, error)
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Begin: there is nothing to fetch."""

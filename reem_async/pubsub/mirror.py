@@ -9,11 +9,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, NoReturn
 
 from ..concurrency.streams import Following
-from ..errors import BadValue, InterfaceClosed, Stale
+from ..errors import BadType, InterfaceClosed, Stale
+from ..plan.arguments import check_number
 from ..plan.keys import Keys
-from ..plan.paths import Path, check_element, show
+from ..plan.paths import Path, check_element, shorten, show
 from ..session import Session
-from .follower import Follower
+from .follower import Follower, checked_largest
 from .subscribers import Link, LocalAccessor
 
 __all__ = ["Mirror", "MirrorAccessor", "Tried"]
@@ -63,8 +64,8 @@ class Mirror(Following):
     def __init__(
         self, session: Session, keys: Keys, path: Path, *, max_age: float | None = None, largest: int | None = None
     ) -> None:
-        if max_age is not None and not max_age >= _SHORTEST:
-            raise BadValue(f"max_age={max_age!r}: use {_SHORTEST} seconds or more, or None")
+        if max_age is not None:
+            check_number("max_age", max_age, f"use {_SHORTEST} seconds or more, or None", least=_SHORTEST)
         self.channel = show((keys.name, *path))
         self.max_age = max_age
         self._seen = 0
@@ -75,7 +76,7 @@ class Mirror(Following):
             path,
             [],
             stored=True,
-            largest=math.inf if largest is None else largest,
+            largest=checked_largest(largest),
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
         )
         self._link.told = _waking(self)
@@ -141,7 +142,9 @@ class Mirror(Following):
     def _stale(self, follower: Follower) -> str:
         """Return why the copy must not be relied on; nothing if it may be."""
         age = follower.age()
-        # Before the age: it says more than that the copy is old.
+        # Before the age: these say more than that the copy is old.
+        if follower.failure is not None:
+            return f"following has ended over an error: {follower.failure!r}; make a new mirror"
         if follower.down:
             return f"the connection is down, and the copy {age:.3f} s old; it is being made again"
         if self.max_age is None or age <= self.max_age:
@@ -162,6 +165,7 @@ class Mirror(Following):
             Stale: The mirror does not follow yet.
             InterfaceClosed: The mirror was closed, or the interface.
         """
+        _check_wait(predicate, timeout)
         # Kept, to tell its end from a TimeoutError that the predicate raises.
         limit = asyncio.timeout(timeout)
         try:
@@ -225,6 +229,14 @@ class Mirror(Following):
 
     def __repr__(self) -> str:
         return f"<reem_async.Mirror {self.channel}>"
+
+
+def _check_wait(predicate: Any, timeout: Any) -> None:
+    """Raise BadType or BadValue for arguments of `wait_until` that cannot be."""
+    if not callable(predicate):
+        raise BadType(f"predicate={shorten(predicate)} is not a function; use one that is called with the value")
+    if timeout is not None:
+        check_number("timeout", timeout, "use seconds, 0 or more, or None for no limit")
 
 
 def _waking(mirror: Mirror) -> Callable[[], None]:

@@ -8,16 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..concurrency.queues import Every, Policy, unheard
+from ..concurrency.queues import Every, Policy, chosen, unheard
 from ..concurrency.streams import Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed
+from ..plan.arguments import check_number
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, is_namespace, show
-from ..plan.patterns import Pattern, channel_pattern, fits, name_of, parse_pattern
+from ..plan.patterns import Pattern, channel_pattern, fits, name_of, parse_patterns
 from ..transport.wire import Wire
 from .gaps import Numbers
-from .listeners import Beginning, ForwardingListener
+from .listeners import Beginning, ForwardingListener, contained
 from .manager import SubscriptionManager, Topic, manager_of
 
 __all__ = ["ANNOUNCED", "Event", "Monitor"]
@@ -115,13 +116,14 @@ class Monitor(Stream[Event]):
         namespaces: str | None = None,
         patience: float = 0.0,
     ) -> None:
-        super().__init__(policy or Every(10_000))
+        super().__init__(chosen(policy, Every(10_000)))
         self._session = interface.session
         if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
             raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
         self._namespaces = None if namespaces is None else Pattern(namespaces)
+        check_number("patience", patience, "use seconds, 0 or more")
         self.patience = patience
-        self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
+        self.patterns = parse_patterns(patterns) or [Pattern("*")]
         self._listeners: list[_PatternListener] = []
         self._manager: SubscriptionManager | None = None
         self._numbers = Numbers()
@@ -281,6 +283,7 @@ class _PatternListener(ForwardingListener):
         self._monitor = monitor
         self.wire: Wire | None = None
 
+    @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Take the connection; after a broken one, say so."""
         self.wire = wire
@@ -288,21 +291,25 @@ class _PatternListener(ForwardingListener):
             self._monitor._begun_anew()
         super().start(wire, beginning)
 
+    @contained
     def lost(self, reason: Exception) -> None:
         """Remember that updates may be lost. Whoever waits for the beginning gets `reason`."""
         self.wire = None
         self._monitor._lost()
         super().lost(reason)
 
+    @contained
     def changed(self, key: str | None) -> None:
         """Hand it on."""
         self._monitor.changed(key)
 
+    @contained
     def doubt(self, channel: bytes) -> None:
         """Remember that an update of a key was lost."""
         if not self._is_others(channel):
             self._monitor._doubt(channel)
 
+    @contained
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Hand the update on, if it is not another subscription's, which brings it too."""
         if not self._is_others(channel):

@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import math
 import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
-from ..concurrency.queues import BoundedQueue, Last, Policy
+from ..concurrency.queues import BoundedQueue, Last, Policy, chosen
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan.notices import Notice
 from ..plan.paths import Path, parse_shown, show
 from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
 from ..session import Session
-from .follower import Follower
+from .follower import Follower, checked_largest
 from .listeners import ForwardingListener, Listener
 from .manager import SubscriptionManager, Topic, manager_of
 from .updates import Update
@@ -61,10 +60,10 @@ class PatternWatch(Stream[Update]):
     def __init__(
         self, session: Session, patterns: Sequence[str], policy: Policy | None = None, *, largest: int | None = None
     ) -> None:
-        super().__init__(policy or Last(_MOST_WAITING))
+        super().__init__(chosen(policy, Last(_MOST_WAITING)))
         self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
         self._session = session
-        self._largest = math.inf if largest is None else largest
+        self._largest = checked_largest(largest)
         self._listeners: list[_Publishers] = []
         self._manager: SubscriptionManager | None = None
         self._followed: dict[str, list[Follower]] = {}
@@ -316,8 +315,10 @@ class _Fitting(BoundedQueue):
         if (watch := self._watch()) is not None:
             watch.queue.skip()
 
-    def close(self) -> None:
-        """Do nothing: the watch's queue goes on."""
+    def close(self, end: Exception | None = None) -> None:
+        """End the watch for an error; else do nothing: the watch's queue goes on."""
+        if end is not None and (watch := self._watch()) is not None:
+            watch.queue.close(end)
 
 
 class _Publishers(ForwardingListener):

@@ -8,10 +8,11 @@ import weakref
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
-from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, unheard
+from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, chosen, unheard
 from ..concurrency.streams import Following, Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed, MissingKey, ReadOnly
+from ..plan.arguments import check_instance
 from ..plan.handles import Handle
 from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, parse, show
@@ -178,7 +179,7 @@ class SilentSubscriber(Following):
         self.channel = channel
         self._keys, self._path = self.interface.session.keys(key), tuple(rest)
         self.full_path: Path = (self._keys.name, *rest)
-        self.policy = policy or Newest()
+        self.policy = chosen(policy, Newest())
         self.stored = stored
         self._link = Link(self.interface.session, self._keys, self._path, [], stored=stored)
         # By identity, held weakly: a loop that was left by `break` drops its own. Any thread may add one meanwhile.
@@ -216,7 +217,7 @@ class SilentSubscriber(Following):
 
     def watch(self, policy: Policy | None = None) -> Watch:
         """Return an async iterator over the updates, beginning with the value that is there."""
-        watch = Watch(self.interface.session, self._keys, self._path, policy or self.policy, stored=self.stored)
+        watch = Watch(self.interface.session, self._keys, self._path, chosen(policy, self.policy), stored=self.stored)
         self._watches[id(watch)] = watch
         return watch
 
@@ -326,10 +327,12 @@ class CallbackSubscriber(SilentSubscriber):
         *,
         stored: bool = False,
     ) -> None:
-        super().__init__(channel, interface, policy or Last(1000), stored=stored)
+        super().__init__(channel, interface, chosen(policy, Last(1000)), stored=stored)
         if not callable(callback_function):
             raise BadType(f"callback_function is a function, not {type(callback_function).__name__}")
         self.callback_function = callback_function
+        if kwargs is not None:
+            check_instance("kwargs", kwargs, Mapping, "use a dict of keyword arguments, or None")
         self.kwargs = dict(kwargs or {})
         self._call = arranged(callback_function, self.kwargs)
         self._begin()

@@ -418,10 +418,10 @@ class Accessor(Handle):
             stored: Yield what is only stored, too. It needs the right to use CLIENT TRACKING; without, a warning is
                 logged, and what is published is told.
         """
-        from ..concurrency.queues import Newest
+        from ..concurrency.queues import Newest, chosen
         from ..pubsub.subscribers import Watch
 
-        return Watch(self._reader.session, self._reader.keys, self._path, policy or Newest(), stored=stored)
+        return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
         """Return a local copy of what is here that follows every change: `async with kvs["arm"].mirror() as arm:`.

@@ -15,9 +15,10 @@ from ...concurrency.queues import Last
 from ...concurrency.scheduling import give_way
 from ...concurrency.streams import arrived
 from ...connection import RedisInterface
-from ...errors import BadType, BadValue, InterfaceClosed, RedisError
+from ...errors import BadValue, InterfaceClosed, RedisError
+from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path
-from ...plan.patterns import Pattern, parse_pattern
+from ...plan.patterns import parse_patterns
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from .description import description
@@ -127,12 +128,11 @@ class Recorder:
         compression: str = "zstd",
         queue_bytes: int = 256 << 20,
     ) -> None:
-        if isinstance(patterns, str):
-            raise BadType(f"patterns is a list of patterns; use [{patterns!r}]")
-        if not keyframe > 0:
-            raise BadValue(f"keyframe={keyframe!r} cannot be; give seconds over 0")
+        check_number("keyframe", keyframe, "use seconds, over 0", above=0)
+        check_number("queue_bytes", queue_bytes, "use a number of bytes, 1 or more", least=1)
+        check_instance("path", path, (str, FilePath), "use the name of a file")
         self.path = FilePath(path)
-        self.patterns: list[Pattern] = [parse_pattern(text) for text in patterns]
+        self.patterns = parse_patterns(patterns)
         self.session = interface.session
         self.clock = Clock()
         self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes nobody at the very moment
@@ -241,6 +241,8 @@ class Recorder:
 
     async def wait(self, seconds: float | None = None) -> None:
         """Return after so many seconds, or never; raises RecordingFailed as soon as it cannot go on."""
+        if seconds is not None:
+            check_number("seconds", seconds, "use a number of seconds, or None for no limit")
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await self._done.wait()

@@ -10,6 +10,7 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from ...errors import BadInput, BadValue, RedisError
+from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
 from ...session import Session
 from .fetch import fetch
@@ -33,6 +34,7 @@ def samples_of(given: dict[str, float] | str | FilePath | None) -> list[Sample]:
         return []
     if isinstance(given, dict):
         return [sample(path, period) for path, period in given.items()]
+    check_instance("sample", given, (str, FilePath), 'use a dict such as {"arm": 0.1}, or the name of a key file')
     return read_key_file(given)
 
 
@@ -76,8 +78,9 @@ def sample(path: str, period: float) -> Sample:
     check_top_key(place[0] if place else "")
     if counts_from_end(place):
         raise BadValue(f"{path}: an index from the end names another item from one time to the next; count from 0")
-    if not math.isfinite(period) or period <= 0:
-        raise BadValue(f"{path}: a period of {period} s cannot be; give seconds over 0")
+    check_number(f"the period of {path}", period, "use seconds, over 0", above=0)
+    if period == math.inf:
+        raise BadValue(f"the period of {path}={period} is out of range; use seconds, over 0")
     return Sample(place, period)
 
 

@@ -74,8 +74,8 @@ class Sink:
     """
 
     def __init__(self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool) -> None:
-        if compression not in COMPRESSIONS:
-            raise BadValue(f"compression {compression!r} is none of {', '.join(COMPRESSIONS)}")
+        if compression not in tuple(COMPRESSIONS):  # not hashed: it may be anything
+            raise BadValue(f"compression {compression!r:.60} is none of {', '.join(COMPRESSIONS)}")
         self.output = Output(path, overwrite=overwrite)
         try:
             self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
