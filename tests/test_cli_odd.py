@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -26,6 +27,7 @@ import reem as blocking
 import reem.snapshots
 from reem_async.errors import BadData, ReemError
 from reem_async.plan.paths import parse
+from reem_async.tools.browser.downloads import file_of
 from reem_async.tools.cli import build
 from reem_async.tools.cli.echo import _moment
 from reem_async.tools.cli.output import json_text, typed
@@ -274,6 +276,52 @@ def test_json_of_what_orjson_refuses():
         assert np.isnan(found["nan"][0])
         found["nan"][0] = None
         assert found == wanted
+
+
+def from_json(listed, dtype):
+    """The array that nested lists of JSON stand for, as `reem_async/tools/jsontext.py` documents it."""
+    if dtype.names is not None:
+        fields = [from_json([row[place] for row in listed], dtype[name]) for place, name in enumerate(dtype.names)]
+        array = np.empty(len(listed), dtype)
+        for name, field in zip(dtype.names, fields, strict=True):
+            array[name] = field
+        return array
+    turned = {
+        "c": complex,
+        "S": base64.b64decode,
+        "V": lambda text: np.void(base64.b64decode(text)),
+        "m": lambda text: "NaT" if text == "NaT" else np.timedelta64(int(text.split()[0]), *text.split()[1:]),
+    }
+    return np.array([turned.get(dtype.kind, lambda item: item)(item) for item in listed], dtype)
+
+
+PLAIN_TYPES = ["?", "i1", ">u2", "<i8", "u8", "f2", ">f4", "f8", "c8", "c16", "S3", "U2", "V4"]
+TIMES = [f"{kind}8[{unit}]" for kind in "mM" for unit in ("Y", "M", "D", "h", "s", "10ms", "us", "ns", "ps", "as")]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_json_keeps_every_value_beside_any_other(seed):
+    """Of random bits as every dtype: the same from the command line and from the page, beside None and NaN too."""
+    print("seed", seed)
+    rng = np.random.default_rng(seed)
+    for name in [*PLAIN_TYPES, *TIMES, [("n", ">i4"), ("t", "M8[ns]"), ("x", "f4"), ("d", "m8[us]")]]:
+        dtype = np.dtype(name)
+        bits = rng.integers(0, 2 if name == "?" else 127, 6 * dtype.itemsize, np.uint8)
+        array = bits.view(dtype) if dtype.kind != "U" else np.array(["a", "é\n", '"', "", "日本", "𝄞"], dtype)
+        if dtype.kind in "mM":
+            array = (rng.integers(-(10**18), 10**18, 6) >> rng.integers(0, 60, 6)).view("i8").astype(dtype.str)
+            array[0] = "NaT"
+        elif dtype.kind in "fc":
+            array = np.where(np.isnan(array), 0, array).astype(dtype)
+            array[:3] = np.nan, np.inf, -np.inf
+        for beside in ({}, {"x": None}, {"x": np.array([np.nan])}):
+            text = json_text({"array": array, **beside})
+            with np.errstate(all="ignore"):
+                assert_same(from_json(json.loads(text)["array"], dtype), array)
+        page, _ = file_of({"array": array}, ("foo",), "json", None)
+        assert repr(json.loads(page)) == repr(json.loads(json_text({"array": array})))
+    assert json.loads(json_text(np.array("2026-01-01", "M8[D]"))) == "2026-01-01"
+    assert json.loads(json_text([np.datetime64("NaT"), np.float32(0.1), np.zeros((2, 0))])) == ["NaT", 0.1, [[], []]]
 
 
 def test_a_terminal_that_does_not_know_all_characters(reem, kvs):

@@ -151,7 +151,7 @@ ORDER = [
     {"connection"},
     {"pubsub"},
     {"store"},
-    {"tools.partfile", "tools.snapshots", "tools.recording", "tools.migration"},
+    {"tools.jsontext", "tools.partfile", "tools.snapshots", "tools.recording", "tools.migration"},
     {"server"},
     {"tools.browser"},
     {"tools.cli", "tools.notebook", "tools.pytest_plugin"},

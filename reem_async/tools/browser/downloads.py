@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
 import re
@@ -11,10 +10,10 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-import orjson
 
 from ...errors import BadType, BadValue
 from ...plan.paths import Path, show
+from ..jsontext import json_text
 from .addresses import address
 from .pictures import LARGEST_SIDE, paint
 from .slices import look_at, parse_slice, part
@@ -55,27 +54,23 @@ def disposition(path: Path, kind: str, chosen: str | None = None) -> str:
 
 
 def _json(value: Any, path: Path, chosen: str | None) -> bytes:
-    plain = _plain(value, path)
+    _check_json(value, path)
     try:
-        return orjson.dumps(plain, option=orjson.OPT_INDENT_2)
-    except orjson.JSONEncodeError:
+        return json_text(value, pretty=True).encode()
+    except UnicodeEncodeError:
         raise _no_text(path) from None
 
 
-def _plain(value: Any, path: Path) -> Any:
-    """Return a value for JSON: arrays of numbers as lists, bytes as base64, as `reem get --json` writes them."""
-    if isinstance(value, dict):
-        return {key: _plain(item, (*path, key)) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item, (*path, index)) for index, item in enumerate(value)]
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode()
-    if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST and value.dtype.kind in "biufU":
-        return value.tolist()
-    leaf = leaf_of(value)
-    raise BadType(f"{show(path)}, {leaf.label} {leaf.summary}, is nothing for JSON; choose npy for it, or use Python")
+def _check_json(value: Any, path: Path) -> None:
+    """Raise BadType for what is not kept for this instant, and for arrays that are too long for a list."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _check_json(item, (*path, key))
+    elif not (value is None or isinstance(value, str | bool | int | float | bytes)):
+        if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST:
+            return
+        leaf = leaf_of(value)
+        raise BadType(f"{show(path)}, {leaf.label} {leaf.summary}, cannot be JSON; choose npy for it, or use Python")
 
 
 def _bin(value: Any, path: Path, chosen: str | None) -> bytes:

@@ -41,7 +41,11 @@ def get(
     force: Force = False,
     raw: Annotated[bool, typer.Option("--raw", "-r", help="Print text as it is, without quotes.")] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON in one line, arrays as nested lists, bytes in base64.")
+        bool,
+        typer.Option(
+            "--json",
+            help="Print JSON in one line: arrays as lists, bytes in base64, NaN by name, times in ISO 8601.",
+        ),
     ] = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",

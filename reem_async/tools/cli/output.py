@@ -12,6 +12,8 @@ from typing import Any
 
 import typer
 
+from reem_async.tools import jsontext
+
 __all__ = [
     "clean", "columns", "cut", "emit", "emit_json", "is_terminal", "json_text", "note", "size_text", "styled", "typed",
     "width", "write_over",
@@ -71,43 +73,8 @@ def write_over(text: str) -> None:
 
 
 def json_text(value: Any, *, pretty: bool = False) -> str:
-    """Return JSON; arrays as nested lists, bytes in base64, NaN and infinity by name, as Python's json reads them."""
-    import orjson
-
-    options = orjson.OPT_SERIALIZE_NUMPY | (orjson.OPT_INDENT_2 if pretty else 0)
-    try:
-        text = orjson.dumps(value, default=_plain, option=options).decode()
-    except orjson.JSONEncodeError:  # nested very deep, or half a surrogate pair
-        text = _by_pythons(_simple(value), pretty)
-    # orjson writes null for NaN and infinity without a word: the slower way, with names, only where there is one.
-    if "null" in text:  # None, or a float that is no number
-        named = _by_pythons(_simple(value), pretty)
-        if "NaN" in named or "Infinity" in named:
-            text = named
-    return "\n".join(map(clean, text.split("\n")))
-
-
-def _by_pythons(value: Any, pretty: bool) -> str:
-    separators = None if pretty else (",", ":")
-    return json.dumps(value, indent=2 if pretty else None, separators=separators, ensure_ascii=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, bytes):
-        import base64
-
-        return base64.b64encode(value).decode()
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return str(value)
-
-
-def _simple(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _simple(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_simple(item) for item in value]
-    return value if value is None or isinstance(value, str | int | float) else _simple(_plain(value))
+    """Return JSON that a terminal can be sent; `reem_async.tools.jsontext` says how each value is written."""
+    return "\n".join(map(clean, jsontext.json_text(value, pretty=pretty).split("\n")))
 
 
 def emit_json(value: Any) -> None:
