@@ -191,7 +191,7 @@ def test_downloads(ask, robot):
         assert (np.asarray(image) == IMAGE).all()
     assert get("n", format="json").json() == 1
     whole = ask.http.get(f"/view/{robot}", params={"format": "json"}).json()
-    assert whole["depth"] == [[0.5, None], [2.0, 3.0]]
+    assert repr(whole["depth"]) == "[[0.5, nan], [2.0, 3.0]]"
     assert whole["image"] == IMAGE.tolist()
     assert whole["raw"] == "AAH/"
     assert get("raw", format="bin").content == b"\x00\x01\xff"
@@ -201,7 +201,7 @@ def test_downloads(ask, robot):
 
 
 def test_what_json_cannot_hold_is_refused_and_not_left_out(ask, kvs, key):
-    kvs[key()] = {"z": np.array([1j])}
+    kvs[key()] = {"z": np.zeros(1_000_001, np.uint8)}
     answer = ask.http.get(f"/view/{key()}", params={"format": "json"})
     assert answer.status_code == 400
     assert f"{key()}.z" in answer.json()["error"]

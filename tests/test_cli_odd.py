@@ -304,12 +304,23 @@ def test_json_keeps_every_value_beside_any_other(seed):
     """Of random bits as every dtype: the same from the command line and from the page, beside None and NaN too."""
     print("seed", seed)
     rng = np.random.default_rng(seed)
-    for name in [*PLAIN_TYPES, *TIMES, [("n", ">i4"), ("t", "M8[ns]"), ("x", "f4"), ("d", "m8[us]")]]:
+    for name in [
+        *PLAIN_TYPES,
+        *TIMES,
+        ">M8[ns]",
+        ">m8[ms]",
+        [("n", ">i4"), ("t", ">M8[ns]"), ("x", "f4"), ("d", "m8[us]")],
+    ]:
         dtype = np.dtype(name)
         bits = rng.integers(0, 2 if name == "?" else 127, 6 * dtype.itemsize, np.uint8)
         array = bits.view(dtype) if dtype.kind != "U" else np.array(["a", "é\n", '"', "", "日本", "𝄞"], dtype)
         if dtype.kind in "mM":
-            array = (rng.integers(-(10**18), 10**18, 6) >> rng.integers(0, 60, 6)).view("i8").astype(dtype.str)
+            array = (
+                (rng.integers(-(10**18), 10**18, 6) >> rng.integers(0, 60, 6))
+                .astype(f"{dtype.str[0]}i8")
+                .view(dtype)
+                .copy()
+            )
             array[0] = "NaT"
         elif dtype.kind in "fc":
             array = np.where(np.isnan(array), 0, array).astype(dtype)

@@ -64,8 +64,9 @@ def _listed(array: np.ndarray[Any, Any]) -> Any:
     if array.dtype.names is not None:
         return _rows(array)
     if kind == "M":
-        # Without a unit it can only be NaT.
-        dated = array.astype("M8[s]") if np.datetime_data(array.dtype)[0] == "generic" else array
+        # numpy reads other byte orders as the machine's own here. Without a unit it can only be NaT.
+        generic = np.datetime_data(array.dtype)[0] == "generic"
+        dated = array.astype("M8[s]" if generic else array.dtype.newbyteorder("="))
         return np.datetime_as_string(dated).tolist()
     if kind == "m":
         return _durations(array)
