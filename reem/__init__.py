@@ -6,11 +6,13 @@ kvs["foo"] = {"number": 1, "image": np.zeros((480, 640, 3))}
 image = kvs["foo"]["image"].read()
 """
 
+import warnings
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
+from reem_async._installation import CURE, original_reem
 from reem_async.concurrency.aside import ensure_imported
 
 from .accessor import Accessor
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
 
     from .publish import Publisher, PublishSpace
     from .subscribe import CallbackSubscriber, SilentSubscriber
+
+if clash := original_reem():
+    warnings.warn(f"{clash}; run: {CURE}", RuntimeWarning, stacklevel=2)
 
 _LATER = {
     "CallbackSubscriber": "reem.subscribe",

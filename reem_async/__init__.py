@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ._moved import keep_old_names
 
-__version__ = "1.0.0"
+__version__ = "1.0.0rc1"
 
 keep_old_names(__name__)
 

@@ -15,7 +15,7 @@ from reem_async.server import EmbeddedServer
 from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording import Recorder
 
-pytest.importorskip("mcap", reason="mcap is not installed: pip install 'reem[tools]'")
+pytest.importorskip("mcap", reason="mcap is not installed: pip install 'reem-async[tools]'")
 
 
 async def record(path):

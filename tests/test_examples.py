@@ -115,7 +115,7 @@ def test_the_demo_fails_if_a_program_does(url, tmp_path):
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     error = run("image_system", "--seconds", 1, "--out", tmp_path / "x.png", "--url", url, code=1, PYTHONPATH=path)
     assert "The demo failed: the camera ended with exit code 1" in error
-    assert "pip install 'reem[demo]'" in error
+    assert "pip install 'reem-async[demo]'" in error
     assert not (tmp_path / "x.png").exists()
 
 

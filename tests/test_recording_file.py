@@ -18,8 +18,8 @@ import numpy as np
 import orjson
 import pytest
 from conftest import aeventually, assert_same, eventually, python, sized
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from test_recording import FRAME, IMAGE
+from test_recording_layout import RawImage
 
 import reem
 import reem.recording

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import struct
 
 import google.protobuf.descriptor_pb2 as descriptors
@@ -11,8 +12,6 @@ import numpy as np
 import orjson
 import pytest
 from conftest import assert_same
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import example, given, settings
 from test_values import arrays, mixed
@@ -33,6 +32,17 @@ from reem_async.transport.recorder import CommandRecorder
 
 SHIPS = Ships(default_ships(), CommandRecorder)
 TIME = 1_700_000_000_123_456_000
+
+
+def message_class(schema):
+    """The class that a viewer makes of what the file has: the schema's descriptors."""
+    pool = DescriptorPool()
+    for file in descriptors.FileDescriptorSet.FromString(schema_bytes(schema)).file:
+        pool.Add(file)
+    return factory.GetMessageClass(pool.FindMessageTypeByName(schema))
+
+
+RawImage, CompressedImage = message_class("foxglove.RawImage"), message_class("foxglove.CompressedImage")
 
 
 def there_and_back(value):
@@ -184,14 +194,19 @@ def test_compressed_pictures_are_foxglove_s(data, name):
     assert (encoded.schema, image.format, image.data) == ("foxglove.CompressedImage", name, data)
 
 
+@pytest.mark.parametrize("name", ["RawImage", "CompressedImage"])
+def test_the_schemas_are_those_that_foxglove_publishes(name):
+    pytest.importorskip("google.protobuf", "5.29.6", "Foxglove's package does not say so, and needs that release")
+    module = importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2")
+    published = descriptors.FileDescriptorProto()
+    module.DESCRIPTOR.CopyToProto(published)
+    assert descriptors.FileDescriptorSet.FromString(schema_bytes(f"foxglove.{name}")).file[-1] == published
+
+
 def test_other_arrays_carry_their_schema():
     """A viewer that has only the file can read them, with figures to plot."""
     encoded = encode("numpy", np.array([1.0, 2.0, 6.0]), "a", TIME)
-    files = descriptors.FileDescriptorSet.FromString(schema_bytes(encoded.schema))
-    pool = DescriptorPool()
-    for file in files.file:
-        pool.Add(file)
-    message = factory.GetMessageClass(pool.FindMessageTypeByName("reem.NdArray")).FromString(b"".join(encoded.pieces))
+    message = message_class("reem.NdArray").FromString(b"".join(encoded.pieces))
     assert (list(message.shape), message.dtype, message.min, message.max, message.mean) == ([3], "float64", 1, 6, 3)
     assert message.npy.startswith(b"\x93NUMPY")
 

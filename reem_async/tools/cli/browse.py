@@ -79,7 +79,7 @@ def _check_packages(log: Path | None) -> None:
     needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
     absent = [name for module, name in needed.items() if find_spec(module) is None]
     if absent:
-        raise Refused(f"needs {', '.join(absent)}: pip install 'reem[tools]'")
+        raise Refused(f"needs {', '.join(absent)}: pip install 'reem-async[tools]'")
 
 
 def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int) -> Source:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reem_async._installation import CURE, original_reem
 from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
@@ -316,15 +317,19 @@ async def _clock(server: Transport) -> Finding:
 
 
 def _of_installation() -> Iterator[Finding]:
-    names = ("reem", "redis", "hiredis", "numpy", "orjson", "anyio")
+    names = ("reem-async", "redis", "hiredis", "numpy", "orjson", "anyio")
     versions = {name: _version(name) for name in names}
     text = ", ".join([f"{name} {number}" for name, number in versions.items() if number])
     python = ".".join(map(str, sys.version_info[:3]))
     missing = [name for name, number in versions.items() if not number]
     if missing:
-        yield Finding("libraries", WARN, f"no version is known of {', '.join(missing)}; {text}", "pip install reem")
+        yield Finding(
+            "libraries", WARN, f"no version is known of {', '.join(missing)}; {text}", "pip install reem-async"
+        )
     else:
         yield Finding("libraries", OK, f"Python {python}, {text}")
+    if clash := original_reem():
+        yield Finding("installation", FAIL, clash, CURE)
     for extra, what in _EXTRAS.items():
         needed = _needed(extra)
         absent = [name for name in needed if not _version(name)]
@@ -332,7 +337,10 @@ def _of_installation() -> Iterator[Finding]:
             yield Finding(f"[{extra}]", OK, ", ".join([f"{name} {_version(name)}" for name in needed]))
         elif needed:
             yield Finding(
-                f"[{extra}]", OK, f"not installed: {', '.join(absent)}", f"for {what}: pip install 'reem[{extra}]'"
+                f"[{extra}]",
+                OK,
+                f"not installed: {', '.join(absent)}",
+                f"for {what}: pip install 'reem-async[{extra}]'",
             )
 
 
@@ -346,10 +354,10 @@ def _version(name: str) -> str:
 def _needed(extra: str) -> list[str]:
     """Return the packages that one of REEM's extras brings."""
     try:
-        lines = metadata.requires("reem") or []
+        lines = metadata.requires("reem-async") or []
     except metadata.PackageNotFoundError:
         return []
     # A requirement of an extra reads: pillow>=10; extra == 'tools'.
     marked = re.compile(rf"""extra\s*==\s*["']{extra}["']""")
     names = [re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in lines if marked.search(line)]
-    return sorted(name for name in names if name != "reem")
+    return sorted(name for name in names if name != "reem-async")

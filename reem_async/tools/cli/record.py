@@ -138,7 +138,7 @@ def tools(name: str) -> Any:
     try:
         from reem_async.tools import recording
     except ModuleNotFoundError as error:
-        if "reem[tools]" not in str(error):
+        if "reem-async[tools]" not in str(error):
             raise
         raise Refused(str(error)) from None
     return getattr(recording, name)

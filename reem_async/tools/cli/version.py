@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError
-from importlib.metadata import version as installed_version
 from typing import Annotated
 
 import typer
+
+from reem_async import __version__
 
 
 def _show(wanted: bool) -> None:
     if not wanted:
         return
-    try:
-        typer.echo(f"reem {installed_version('reem')}")
-    # Not installed, as in a clone that was never set up.
-    except PackageNotFoundError:
-        typer.echo("reem, run from its sources")
+    typer.echo(f"reem {__version__}")
     raise typer.Exit
 
 

@@ -20,7 +20,7 @@ except ModuleNotFoundError as error:
     package = (error.name or "reem").partition(".")[0]
     if package.startswith("reem"):
         raise
-    raise ModuleNotFoundError(f"recordings need {package}: pip install 'reem[tools]'", name=package) from None
+    raise ModuleNotFoundError(f"recordings need {package}: pip install 'reem-async[tools]'", name=package) from None
 
 __all__ = [
     "ArrayHandle",

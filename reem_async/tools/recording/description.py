@@ -7,10 +7,10 @@ import os
 import platform
 import time
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
+from ... import __version__
 from ...session import Session
 from .sample import Sample
 
@@ -21,12 +21,8 @@ def description(
     session: Session, patterns: Sequence[str], samples: Sequence[Sample], keyframe: float
 ) -> dict[str, str]:
     """Return the metadata of a recording that begins now."""
-    try:
-        ours = version("reem")
-    except PackageNotFoundError:
-        ours = "from its sources"
     return {
-        "version": ours,
+        "version": __version__,
         "format": "1",
         "server": session.options.address,
         "namespace": session.namespace,

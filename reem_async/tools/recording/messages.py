@@ -11,10 +11,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
-from google.protobuf.message import DecodeError, Message
+from google.protobuf import descriptor_pool, message_factory, timestamp_pb2
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.message import DecodeError
 
 from ...errors import BadData
 from ...ships.numpy import NumpyShip, flat
@@ -53,52 +52,49 @@ class Encoded(NamedTuple):
     pieces: list[Any]
 
 
-def _messages() -> tuple[type[Message], type[Message]]:
-    """Make the classes of REEM's own two messages; no generated code, no compiler."""
-    file = descriptor_pb2.FileDescriptorProto(name="reem/recording.proto", package="reem", syntax="proto3")
-    file.dependency.append("google/protobuf/timestamp.proto")
-    kinds = descriptor_pb2.FieldDescriptorProto
-    array: list[tuple[str, Any, bool]] = [
-        ("timestamp", kinds.TYPE_MESSAGE, False),
-        ("dtype", kinds.TYPE_STRING, False),
-        ("shape", kinds.TYPE_UINT64, True),
-        # The array itself, exactly; the figures beside it are for plots.
-        ("npy", kinds.TYPE_BYTES, False),
-        ("min", kinds.TYPE_DOUBLE, False),
-        ("max", kinds.TYPE_DOUBLE, False),
-        ("mean", kinds.TYPE_DOUBLE, False),
-    ]
-    blob: list[tuple[str, Any, bool]] = [
-        ("timestamp", kinds.TYPE_MESSAGE, False),
-        ("label", kinds.TYPE_STRING, False),
-        ("size", kinds.TYPE_UINT64, False),
-        ("data", kinds.TYPE_BYTES, False),
-    ]
-    for name, fields in (("NdArray", array), ("Blob", blob)):
-        message = file.message_type.add(name=name)
-        for number, (field, kind, repeated) in enumerate(fields, 1):
-            label = kinds.LABEL_REPEATED if repeated else kinds.LABEL_OPTIONAL
-            it = message.field.add(name=field, number=number, type=kind, label=label)
-            if kind == kinds.TYPE_MESSAGE:
-                it.type_name = ".google.protobuf.Timestamp"
-    # A pool of its own: the default one is shared by all of a program, and may know another message of this name.
-    pool = descriptor_pool.DescriptorPool()
-    timestamp = descriptor_pb2.FileDescriptorProto()
-    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
-    pool.Add(timestamp)
-    pool.Add(file)
-    made = [message_factory.GetMessageClass(pool.FindMessageTypeByName(f"reem.{name}")) for name in ("NdArray", "Blob")]
-    return made[0], made[1]
-
-
-_NdArray, _Blob = _messages()
-
-_CLASSES: dict[str, Any] = {
-    "foxglove.RawImage": RawImage,
-    "foxglove.CompressedImage": CompressedImage,
-    "reem.NdArray": _NdArray,
-    "reem.Blob": _Blob,
+# Fields with their numbers. Those of Foxglove are its published schemas; a test compares them. They are made here
+# because Foxglove's package of generated code needs certain releases of protobuf.
+_SCHEMAS = {
+    "foxglove.RawImage": "timestamp:1 frame_id:7 width:2 height:3 encoding:4 step:5 data:6",
+    "foxglove.CompressedImage": "timestamp:1 frame_id:4 data:2 format:3",
+    # npy is the array itself, exactly; the figures behind it are for plots.
+    "reem.NdArray": "timestamp:1 dtype:2 shape:3 npy:4 min:5 max:6 mean:7",
+    "reem.Blob": "timestamp:1 label:2 size:3 data:4",
 }
+_KINDS = (
+    {"timestamp": FieldDescriptorProto.TYPE_MESSAGE}
+    | dict.fromkeys(("shape", "size"), FieldDescriptorProto.TYPE_UINT64)
+    | dict.fromkeys(("frame_id", "encoding", "format", "dtype", "label"), FieldDescriptorProto.TYPE_STRING)
+    | dict.fromkeys(("width", "height", "step"), FieldDescriptorProto.TYPE_FIXED32)
+    | dict.fromkeys(("min", "max", "mean"), FieldDescriptorProto.TYPE_DOUBLE)
+    | dict.fromkeys(("data", "npy"), FieldDescriptorProto.TYPE_BYTES)
+)
+
+
+def _classes() -> dict[str, Any]:
+    """Make the classes of all messages at run time: no generated code, no compiler."""
+    files: dict[str, FileDescriptorProto] = {}
+    for schema, fields in _SCHEMAS.items():
+        package, name = schema.split(".")
+        path = f"{package}/{'recording' if package == 'reem' else name}.proto"
+        file = files.setdefault(path, FileDescriptorProto(name=path, package=package, syntax="proto3"))
+        file.dependency[:] = ["google/protobuf/timestamp.proto"]
+        message = file.message_type.add(name=name)
+        for field, number in (each.split(":") for each in fields.split()):
+            label = FieldDescriptorProto.LABEL_REPEATED if field == "shape" else FieldDescriptorProto.LABEL_OPTIONAL
+            it = message.field.add(name=field, number=int(number), type=_KINDS[field], label=label)
+            if field == "timestamp":
+                it.type_name = ".google.protobuf.Timestamp"
+    # A pool of its own: the default one is shared by all of a program, and may know other messages of these names.
+    pool = descriptor_pool.DescriptorPool()
+    timestamp = FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+    for file in (timestamp, *files.values()):
+        pool.Add(file)
+    return {schema: message_factory.GetMessageClass(pool.FindMessageTypeByName(schema)) for schema in _SCHEMAS}
+
+
+_CLASSES = _classes()
 _DATA_FIELD = {
     "foxglove.RawImage": "data",
     "foxglove.CompressedImage": "data",
@@ -109,7 +105,7 @@ _DATA_FIELD = {
 
 def schema_bytes(schema: str) -> bytes:
     """Return the FileDescriptorSet of a schema, dependencies first."""
-    files = descriptor_pb2.FileDescriptorSet()
+    files = FileDescriptorSet()
     seen = set()
 
     def add(file: Any) -> None:
@@ -136,9 +132,9 @@ def encode(label: str, value: Any, frame: str, time: int) -> Encoded:
         return _picture(value, frame, time) if _is_picture(label, value) else _array(value, time)
     picture = _compressed(value)
     if label == "bytes" and picture:
-        head = CompressedImage(frame_id=frame, format=picture)
+        head = _CLASSES["foxglove.CompressedImage"](frame_id=frame, format=picture)
         return _encoded("foxglove.CompressedImage", "", head, time, [value])
-    return _encoded("reem.Blob", "", _Blob(label=label, size=len(value)), time, [value])
+    return _encoded("reem.Blob", "", _CLASSES["reem.Blob"](label=label, size=len(value)), time, [value])
 
 
 def _encoded(schema: str, channels: str, head: Any, time: int, pieces: list[Any]) -> Encoded:
@@ -172,7 +168,7 @@ def _is_picture(label: str, array: np.ndarray[Any, Any]) -> bool:
 def _picture(array: np.ndarray[Any, Any], frame: str, time: int) -> Encoded:
     height, width, *last = array.shape
     channels = last[0] if last else 1
-    head = RawImage(
+    head = _CLASSES["foxglove.RawImage"](
         frame_id=frame,
         width=width,
         height=height,
@@ -183,7 +179,7 @@ def _picture(array: np.ndarray[Any, Any], frame: str, time: int) -> Encoded:
 
 
 def _array(array: np.ndarray[Any, Any], time: int) -> Encoded:
-    head: Any = _NdArray(dtype=str(array.dtype)[:100], shape=array.shape)
+    head: Any = _CLASSES["reem.NdArray"](dtype=str(array.dtype)[:100], shape=array.shape)
     if array.size and array.dtype.kind in "biuf":
         with np.errstate(all="ignore"):
             head.min, head.max, head.mean = float(array.min()), float(array.max()), float(array.mean(dtype=float))
