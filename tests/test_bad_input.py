@@ -25,7 +25,6 @@ from reem_async.errors import (
     BadType,
     BadValue,
     InterfaceClosed,
-    MissingKey,
     Overflow,
     PathRefused,
     ReemError,
@@ -192,13 +191,6 @@ def test_a_circle_is_called_circular(front, key):
         front.write([key()], circle())
 
 
-def test_the_same_object_twice_is_no_circle(front, key):
-    """A shared list or array is written twice."""
-    shared = [1, np.arange(2)]
-    front.write([key()], {"a": shared, "b": [shared, shared]})
-    assert_same(front.read([key()]), {"a": shared, "b": [shared, shared]})
-
-
 def test_depth_counts_from_the_root_of_the_document(front, key, raw):
     """What could not be written whole cannot be built step by step either."""
     named = {}
@@ -227,78 +219,7 @@ def test_checks_are_real_exceptions_also_under_optimization(server_url, key):
     assert done.stdout.split() == ["refused"] * 4, done.stderr
 
 
-# --- keys and paths --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "top",
-    ["", "a{b", "a}b", "{a}", "x" * 513, "é" * 257, "a\ud800", 5, None, True, 1.5, b"foo", ("a",)],
-    ids=lambda top: repr(top)[:12],
-)
-def test_a_top_level_key_is_checked(front, raw, top):
-    """A str of 1 to 512 bytes without braces; read, write and delete alike."""
-    with nothing_sent(raw):
-        for call in (front.read, front.delete, lambda path: front.write(path, 1)):
-            with pytest.raises(BadInput) as caught:
-                call([top])
-            assert isinstance(caught.value, (BadKey, BadValue))
-
-
-def test_a_top_level_key_of_512_bytes_is_fine(front, key):
-    """With dots, spaces, quotes and unicode in it."""
-    for top in (key("x" * 300).ljust(512, "y"), key(" a.b é🤖 *$[]'")):
-        front.write([top], {"a": np.arange(2)})
-        assert_same(front.read([top, "a"]), np.arange(2))
-
-
-@pytest.mark.parametrize("element", ["a\\b", "\\", "\"'", "x'y\"z"])
-def test_an_element_that_cannot_be_addressed_is_refused_as_a_path(front, key, raw, element):
-    """A backslash or both kinds of quotes: the server would write another key. The document may hold it."""
-    document = {"odd": {element: 1, "image": np.arange(2)}}
-    front.write([key()], document)
-    with nothing_sent(raw):
-        for call in (front.read, front.delete, lambda path: front.write(path, 2), front.length):
-            with pytest.raises(BadKey, match=key()):
-                call([key(), "odd", element])
-        with pytest.raises(BadKey):
-            front.write([key(), "odd", element, "below"], 2)
-    assert_same(front.read([key()]), document)
-
-
-@pytest.mark.parametrize("element", [None, True, 1.5, b"a", ("a",), slice(0, 1), "\ud800"], ids=repr)
-def test_a_path_element_is_a_string_or_an_integer(front, key, raw, stored, element):
-    """A bool is no index."""
-    with nothing_sent(raw):
-        for call in (front.read, front.delete, lambda path: front.write(path, 1)):
-            with pytest.raises(BadInput):
-                call([key(), "outer", element])
-
-
-@pytest.mark.parametrize("element", ["*", "..", ".", "$", "$.*", "[*]", "?(@)", '"],$["n', "'],$['n", "n,outer"])
-def test_path_syntax_inside_an_element_is_just_a_name(front, key, stored, element):
-    """Nothing is matched, joined or escaped by it."""
-    with pytest.raises(MissingKey):
-        front.read([key(), element])
-    with pytest.raises(MissingKey):
-        front.delete([key(), element])
-    front.write([key(), element], "here")
-    assert front.read([key(), element]) == "here"
-    assert front.read([key(), "n"]) == 1
-    front.delete([key(), element])
-
-
 # --- what the server holds -------------------------------------------------------------------------
-
-
-def test_a_missing_key_or_path_is_a_key_error(front, key, stored):
-    """On read, delete, length, type and append; the text names the path. A whole key that is missing reads as None."""
-    calls = (front.read, front.delete, front.length, front.type, lambda path: front.append(path, 1))
-    for call in calls[1:]:
-        with pytest.raises(MissingKey, match=key("absent")):
-            call([key("absent")])
-    for call in calls:
-        with pytest.raises(KeyError, match="absent"):
-            call([key(), "outer", "absent"])
 
 
 @pytest.mark.parametrize("value", [1, np.arange(3), {"a": [np.arange(3), b"x"]}], ids=["plain", "array", "mixed"])
@@ -392,54 +313,6 @@ def test_the_server_never_calculates_near_the_end_of_its_range(front, key, raw):
         front.increment(path, 2)
     assert commands_run(raw).get("json.numincrby", 0) == before + 4
     assert front.read(path) == 10
-
-
-@pytest.mark.parametrize("value", ["text", None, True, [1], {"a": 1}, np.arange(3), np.array(1), b"1"], ids=repr)
-def test_arithmetic_on_what_is_no_number_is_a_type_error(front, key, value):
-    """An array is none: its elements are not on the server as numbers."""
-    front.write([key()], {"n": value})
-    for method in (front.increment, front.multiply, front.divide):
-        with pytest.raises(BadType, match=key()):
-            method([key(), "n"], 2)
-    assert_same(front.read([key(), "n"]), value)
-
-
-@pytest.mark.parametrize("operand", ["1", None, 1j, float("nan"), float("inf"), {1}], ids=repr)
-def test_arithmetic_with_a_bad_operand_is_refused(front, key, raw, stored, operand):
-    """Before anything is sent."""
-    with nothing_sent(raw):
-        for method in (front.multiply, front.divide):
-            with pytest.raises((BadInput, TypeError)):
-                method([key(), "n"], operand)
-        with pytest.raises((BadInput, TypeError)):
-            front.increment([key(), "n"], operand)
-
-
-def test_a_division_by_zero_changes_nothing(front, key, stored):
-    """And is an error."""
-    with pytest.raises((ZeroDivisionError, BadInput)):
-        front.divide([key(), "n"], 0)
-
-
-@pytest.mark.parametrize("value", ["text", None, 1, {"a": 1}, np.arange(3), b"1"], ids=repr)
-def test_append_and_extend_on_what_is_no_list_is_a_type_error(front, key, raw, value):
-    """Also with an array to append, of which nothing is left."""
-    front.write([key()], {"l": value})
-    for item in (1, np.arange(2)):
-        with pytest.raises(BadType, match=key()):
-            front.append([key(), "l"], item)
-        with pytest.raises(TypeError):
-            front.extend([key(), "l"], [item])
-    assert_same(front.read([key(), "l"]), value)
-    assert_no_orphans(raw, key())
-
-
-@pytest.mark.parametrize("value", [1, 1.5, None, True, np.array(1)], ids=repr)
-def test_what_has_no_length_is_a_type_error(front, key, value):
-    """As in Python."""
-    front.write([key()], {"x": value})
-    with pytest.raises(TypeError):
-        front.length([key(), "x"])
 
 
 # --- the interface ---------------------------------------------------------------------------------

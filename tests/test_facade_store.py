@@ -22,35 +22,6 @@ from reem import Conflict, KeyValueStore, MissingKey, RedisInterface
 # --- Python's own syntax ---------------------------------------------------------------------------
 
 
-def test_items_are_assigned_read_and_deleted(kvs, key):
-    """As in a dictionary, but for `.read()`."""
-    kvs[key()] = {"number": 1000, "string": "REEM"}
-    assert kvs[key()].read() == {"number": 1000, "string": "REEM"}
-    assert kvs[key()]["number"].read() == 1000
-    kvs[key()]["bar"] = {"deep": [1, 2]}
-    kvs[key()]["bar"]["deep"][1] = 5
-    assert kvs[key()]["bar"]["deep"][1].read() == 5
-    del kvs[key()]["bar"]["deep"][0]
-    assert kvs[key()]["bar"].read() == {"deep": [5]}
-    del kvs[key()]["bar"]
-    assert len(kvs[key()]) == 2
-    del kvs[key()]
-    with pytest.raises(MissingKey):
-        kvs[key()].type()
-    with pytest.raises(KeyError):
-        del kvs[key()]
-
-
-def test_write_is_the_same_as_assigning(kvs, key):
-    """For an accessor held in a variable."""
-    kvs[key()] = {}
-    accessor = kvs[key()]["bar"]
-    accessor.write({"image": np.arange(3)})
-    assert_same(kvs[key()].read(), {"bar": {"image": np.arange(3)}})
-    accessor.write(2)
-    assert accessor.read() == 2
-
-
 def test_an_accessor_keeps_its_path(kvs, key):
     """Going deeper from it leaves it alone."""
     kvs[key()] = {"x": {"foo": 3}}
@@ -60,61 +31,6 @@ def test_an_accessor_keeps_its_path(kvs, key):
     assert a.read() == {"x": {"foo": 4}}
     assert b.read() == {"foo": 4}
     assert a["x"]["foo"].read() == 4
-
-
-@pytest.mark.parametrize("value", [1.5, "text", None, True, [1, 2], np.arange(3), b"x", 1795566739.2821043], ids=repr)
-def test_a_root_value_need_not_be_a_dict(kvs, key, value):
-    """A set point is a number."""
-    kvs[key()] = value
-    assert_same(kvs[key()].read(), value)
-
-
-def test_augmented_assignment(kvs, key):
-    """`+= -= *= /=` on numbers and `+=` of a list, at the root and below."""
-    kvs[key()] = {"n": 5, "f": 1.5, "l": [1]}
-    kvs[key()]["n"] += 3
-    kvs[key()]["n"] -= 2
-    kvs[key()]["n"] *= 4
-    assert_same(kvs[key()]["n"].read(), 24)
-    kvs[key()]["f"] += 0.25
-    kvs[key()]["f"] -= 1
-    assert_same(kvs[key()]["f"].read(), 0.75)
-    kvs[key()]["n"] /= 5
-    assert kvs[key()]["n"].read() == 4.8
-    kvs[key()]["l"] += [2, np.arange(2)]
-    kvs[key()]["l"].append("x")
-    assert_same(kvs[key()]["l"].read(), [1, 2, np.arange(2), "x"])
-    kvs[key("root")] = 10
-    kvs[key("root")] += 1
-    assert kvs[key("root")].read() == 11
-    kvs[key("list")] = []
-    kvs[key("list")] += [1]
-    kvs[key("list")].append([2])
-    assert kvs[key("list")].read() == [1, [2]]
-    held = kvs[key()]["n"]
-    held += 1
-    assert held.read() == 5.8
-
-
-def test_a_division_is_a_true_one(kvs, key):
-    """7 / 2 is 3.5, as in Python."""
-    kvs[key()] = {"n": 7, "third": 1.0}
-    kvs[key()]["n"] /= 2
-    assert kvs[key()]["n"].read() == 3.5
-    kvs[key()]["third"] /= 3
-    assert kvs[key()]["third"].read() == pytest.approx(1 / 3, rel=1e-15)
-
-
-def test_a_with_block_edits(kvs, key, raw):
-    """Written back on success, at the root and below; arrays are writable inside."""
-    kvs[key()] = {"a": {"n": 1, "image": np.zeros(3)}, "l": [3, 1, 2]}
-    with kvs[key()]["a"] as value:
-        value["n"] = 2
-        value["image"] += 1
-    with kvs[key()]["l"] as items:
-        items.sort()
-    assert_same(kvs[key()].read(), {"a": {"n": 2, "image": np.ones(3)}, "l": [1, 2, 3]})
-    assert_no_orphans(raw, key())
 
 
 def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, server_url):
@@ -233,15 +149,6 @@ def test_handles_can_be_pickled(kvs, pspace, interface, key):
 
 
 # --- threads and visibility ------------------------------------------------------------------------
-
-
-def test_a_write_that_returned_is_visible_everywhere_at_once(kvs, key, server_url):
-    """No sleep is ever needed, for arrays neither."""
-    with contextlib.closing(RedisInterface(server_url)) as other:
-        reading = KeyValueStore(other)
-        for n in range(100):
-            kvs[key()] = {"n": n, "image": np.full(3, n)} if n % 3 else n
-            assert_same(reading[key()].read(), {"n": n, "image": np.full(3, n)} if n % 3 else n)
 
 
 def test_several_threads_share_one_interface(kvs, key, raw):
@@ -500,19 +407,3 @@ def test_publishing_in_a_handler_of_signals_does_not_wait_for_itself(server_url,
     )
     done = python(code, server_url, key(), flags=())
     assert (done.stdout, done.stderr) == ("False\n", "")
-
-
-def test_two_blocking_processes_count_together(kvs, key, server_url):
-    """Increments happen on the server."""
-    kvs[key()] = {"n": 0}
-    code = (
-        "import sys, reem\n"
-        "with reem.RedisInterface(sys.argv[1]) as interface:\n"
-        "    for _ in range(200): reem.KeyValueStore(interface)[sys.argv[2]]['n'] += 1\n"
-    )
-    other = python(code, server_url, key(), start=True)
-    for _ in range(200):
-        kvs[key()]["n"] += 1
-    _, errors = other.communicate(timeout=60)
-    assert (other.returncode, errors) == (0, "")
-    assert kvs[key()]["n"].read() == 400

@@ -260,26 +260,6 @@ def test_an_update_is_published_value_by_value(kvs, pspace, key):
         assert not second.gap
 
 
-def test_setdefault_stores_only_where_nothing_is(kvs, key, raw):
-    """And returns what is there then."""
-    kvs[key()] = {"n": 1, "none": None}
-    assert kvs[key()].setdefault("n", 5) == 1
-    assert kvs[key()].setdefault("none", 5) is None
-    assert kvs[key()].setdefault("m", [1]) == [1]
-    assert_same(kvs[key()].setdefault("image", np.arange(3)), np.arange(3))
-    assert_same(kvs[key()].setdefault("image", 7), np.arange(3))
-    assert kvs.setdefault(key("other"), {}) == {}
-    assert kvs.setdefault(key("other"), {"x": 1}) == {}
-    with pytest.raises(PathRefused):
-        kvs[key("third")].setdefault("x", 1)
-    with pytest.raises(BadType):
-        kvs[key()].setdefault("bad", {1})
-    with pytest.raises(BadKey):
-        kvs[key()].setdefault(0, 1)
-    assert_same(kvs[key()].read(), {"n": 1, "none": None, "m": [1], "image": np.arange(3)})
-    assert_no_orphans(raw, key())
-
-
 def test_a_store_is_updated_key_by_key_after_all_was_looked_at(kvs, pspace, key):
     """Nothing is stored if one cannot be."""
     kvs.update({key(): {"n": 1}}, **{key("image"): np.ones(2)})

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 
 import numpy as np
 import pytest
@@ -12,71 +11,6 @@ from conftest import aeventually, assert_no_orphans, assert_same, commands_run
 from reem_async import KeyValueStore, PublishSpace, SilentSubscriber
 from reem_async.concurrency.queues import Every
 from reem_async.errors import MissingKey, PathRefused, WrongType
-
-LISTS = [[], [1], [1, 2], [{"x": 1}, {"x": [2, 3]}, [4]], {"a": 1}, 5]
-PATHS = [[-1], [-2], [-3], [-9], [-2, "x"], [-2, "x", -1], [-2, "x", -3], [-3, "y"], [0, -1], [-1, -1]]
-
-
-def python_read(value, path):
-    for element in path:
-        if not isinstance(value, dict if isinstance(element, str) else list):
-            raise LookupError
-        value = value[element]
-    return value
-
-
-@pytest.mark.parametrize("value", LISTS, ids=repr)
-@pytest.mark.parametrize("path", PATHS, ids=repr)
-def test_they_mean_what_they_mean_in_python(front, key, value, path):
-    where = [key(), "l", *path]
-
-    def fresh():
-        front.write([key()], {"l": value})
-        return json.loads(json.dumps(value))
-
-    plain = fresh()
-    try:
-        expected = python_read(plain, path)
-    except LookupError:
-        with pytest.raises(MissingKey):
-            front.read(where)
-        with pytest.raises(MissingKey):
-            front.delete(where)
-        with pytest.raises(MissingKey):
-            front.increment(where, 1)
-    else:
-        assert front.read(where) == expected
-        assert front.type(where) is type(expected)
-        front.delete(where)
-        del python_read(plain, path[:-1])[path[-1]]
-        assert front.read([key(), "l"]) == plain
-    plain = fresh()
-    try:
-        parent = python_read(plain, path[:-1])
-        if not isinstance(parent, dict if isinstance(path[-1], str) else list):
-            raise LookupError
-        parent[path[-1]] = "new"
-    except LookupError:
-        with pytest.raises(PathRefused):
-            front.write(where, "new")
-        plain = value
-    else:
-        front.write(where, "new")
-    assert front.read([key(), "l"]) == plain
-
-
-def test_arrays_in_lists_are_reached_from_the_end(front, key, raw):
-    items = [np.arange(3), {"a": np.arange(4)}, 7]
-    front.write([key()], {"l": items})
-    assert_same(front.read([key(), "l", -2]), items[1])
-    assert_same(front.read([key(), "l", -2]), items[1])
-    front.write([key(), "l", -3], np.arange(5.0))
-    front.write([key(), "l", -2, "b"], np.ones(2))
-    front.delete([key(), "l", -2, "a"])
-    front.append([key(), "l"], [np.zeros(1)])
-    front.append([key(), "l", -1], np.arange(2))
-    assert_same(front.read([key(), "l"]), [np.arange(5.0), {"b": np.ones(2)}, 7, [np.zeros(1), np.arange(2)]])
-    assert_no_orphans(raw, key())
 
 
 def test_a_read_from_the_end_is_one_command(front, key, raw):
@@ -175,27 +109,3 @@ async def test_an_append_below_an_index_from_the_end_goes_to_one_list(ainterface
             await space[key()][-2].append(1)
         with pytest.raises(WrongType):
             await space[key()][-1][-1].append(1)
-
-
-async def test_an_edit_from_the_end_keeps_to_the_item_it_read(akvs, key, raw):
-    await akvs[key()].write([[1], {"a": np.arange(3)}])
-    async with akvs[key()][-1].edit() as value:
-        value["a"][0] = 9
-        value["b"] = 1
-    async with akvs[key()][-2].edit() as value:
-        value.append(2)
-    assert_same(await akvs[key()].read(), [[1, 2], {"a": np.array([9, 1, 2]), "b": 1}])
-    assert_no_orphans(raw, key())
-
-
-@pytest.mark.parametrize("index", [-1, -2, -3])
-@pytest.mark.parametrize("value", [5, np.arange(3)], ids=["a number", "an array"])
-def test_what_is_not_there_is_put_below_an_index_from_the_end(kvs, key, raw, index, value):
-    """A place that is made must have a path without slices; a parent that is no dict is named."""
-    kvs[key()] = [{"a": 1}, {"a": np.arange(2)}, {}]
-    assert_same(kvs[key()][index].setdefault("n", value), value)
-    assert_same(kvs[key()][index + 3]["n"].read(), value)
-    with pytest.raises(PathRefused):
-        kvs[key()][index]["n"].setdefault("m", value)
-    assert_same(kvs[key()][index].pop("n"), value)
-    assert_no_orphans(raw, key())

@@ -5,9 +5,6 @@ Programs in our own words; where the manual runs for five seconds, these run for
 
 from __future__ import annotations
 
-import threading
-import time
-
 import numpy as np
 import pytest
 from conftest import assert_no_orphans, assert_same, eventually
@@ -15,10 +12,7 @@ from conftest import assert_no_orphans, assert_same, eventually
 import reem
 from reem.connection import RedisInterface
 from reem.datatypes import CallbackSubscriber, KeyValueStore, PublishSpace, SilentSubscriber
-from reem.ships import NumpyShip, SpecialDatatypeShip
-
-A_WHILE = 0.5
-"""Seconds that a chapter 4 program runs here."""
+from reem.ships import SpecialDatatypeShip
 
 
 @pytest.fixture
@@ -53,14 +47,6 @@ def test_the_client_tutorial(opened, key):
     server[foo]["numpy"] = numbers
     assert_same(server[foo].read(), {"number": 100.0, "string": "REEM", "numpy": numbers})
     assert_same(server[foo]["numpy"].read(), numbers)
-
-
-def test_the_key_value_store_chapter(opened, key):
-    """Set a dict, read it and one of its entries."""
-    server = KeyValueStore(opened())
-    server[key("foo")] = {"number": 1000, "string": "REEM"}
-    assert server[key("foo")].read() == {"number": 1000, "string": "REEM"}
-    assert server[key("foo")]["number"].read() == 1000
 
 
 def test_the_limitations_of_the_manual(opened, key):
@@ -190,195 +176,7 @@ def test_a_ship_written_like_the_manuals(opened, key, raw):
     assert_no_orphans(raw, key("foo"))
 
 
-def test_a_custom_ship_beside_the_numpy_ship(opened, key, raw):
-    """The default one is named in the list to keep it."""
-    interface = opened(ships=[reem.ships.NumpyShip(), CelsiusShip()])
-    assert issubclass(NumpyShip, SpecialDatatypeShip)
-    server = KeyValueStore(interface)
-    server[key("foo")] = {"room": Celsius(21.5), "image": np.arange(3)}
-    got = server[key("foo")].read()
-    assert got["room"].degrees == 21.5
-    assert_same(got["image"], np.arange(3))
-    with SilentSubscriber(key("foo"), interface) as mirror:
-        PublishSpace(interface)[key("foo")]["room"] = Celsius(22.0)
-        eventually(lambda: mirror["room"].read().degrees == 22.0)
-    assert_no_orphans(raw, key("foo"))
-
-
-# --- chapter 4 -------------------------------------------------------------------------------------
-
-
-def test_the_image_processing_system(opened, key):
-    """A camera publishes frames, a processor their mean, an actuator hears of it: three interfaces."""
-    camera, processor, actuator = (opened() for _ in range(3))
-    results = PublishSpace(interface=processor)
-    wrong, acted = [], []
-
-    def process(data, updated_path):
-        if updated_path != key("raw_image") or data["image"].mean() != data["images_sent"]:
-            wrong.append((updated_path, data["images_sent"]))
-        results[key("processed_info")] = {
-            "mean": np.mean(data["image"]),
-            "time_stamp": data["time_stamp"],
-            "images_sent": data["images_sent"],
-        }
-
-    def act(data, updated_path):
-        acted.append((data["images_sent"], data["mean"], time.time() - data["time_stamp"]))
-
-    CallbackSubscriber(channel=key("processed_info"), interface=actuator, callback_function=act, kwargs={}).listen()
-    CallbackSubscriber(channel=key("raw_image"), interface=processor, callback_function=process, kwargs={}).listen()
-    frames = PublishSpace(interface=camera)
-    sent = 0
-    deadline = time.time() + A_WHILE
-    while time.time() < deadline or sent < 5:
-        frames[key("raw_image")] = {
-            "image": np.full((640, 480, 3), float(sent)),
-            "images_sent": sent,
-            "time_stamp": time.time(),
-        }
-        sent += 1
-    eventually(lambda: acted and acted[-1][0] == sent - 1)
-    assert not wrong
-    numbers = [number for number, _, _ in acted]
-    assert numbers == sorted(set(numbers)), "in order, none twice"
-    assert all(number == mean and 0 <= latency < 10 for number, mean, latency in acted)
-
-
-def _set_points(space, name):
-    """A controller that sets a time stamp at 100 Hz for a while; returns the last one."""
-    deadline = time.time() + A_WHILE
-    while time.time() < deadline:
-        following = time.time() + 0.01
-        command = time.time()
-        space[name] = command
-        time.sleep(max(0.0, following - time.time()))
-    return command
-
-
-def _poll(get, over):
-    """An actuator that looks as often as it can; returns what it saw."""
-    seen = []
-    while not over.is_set():
-        command = get()
-        if command and (not seen or command != seen[-1]):
-            seen.append(command)
-        time.sleep(0.001)
-    return seen
-
-
-@pytest.mark.parametrize("paradigm", ["database", "publish/subscribe"])
-def test_the_arm_actuator(opened, key, paradigm):
-    """Set points at one rate, an actuator that reads them at another: each seen exactly, in order."""
-    if paradigm == "database":
-        controller, actuator = KeyValueStore(interface=opened()), KeyValueStore(opened())
-        controller[key("set_point")] = time.time()
-        get = actuator[key("set_point")].read
-    else:
-        controller = PublishSpace(interface=opened())
-        subscriber = SilentSubscriber(channel=key("set_point"), interface=opened())
-        subscriber.listen()
-        get = subscriber.value
-    over, seen = threading.Event(), []
-    thread = threading.Thread(target=lambda: seen.extend(_poll(get, over)))
-    thread.start()
-    try:
-        last = _set_points(controller, key("set_point"))
-        eventually(lambda: get() == last)
-        time.sleep(0.05)
-    finally:
-        over.set()
-        thread.join()
-    assert len(seen) > 5
-    assert seen == sorted(seen)
-    assert seen[-1] == last
-
-
 # --- chapter 5 -------------------------------------------------------------------------------------
-
-
-def _place(store, path):
-    for element in path[:-1]:
-        store = store[element]
-    return store, path[-1]
-
-
-def _assign(store, path, value):
-    place, last = _place(store, path)
-    place[last] = value
-
-
-def _get(store, path):
-    place, last = _place(store, path)
-    return place[last].read()
-
-
-def test_dictionaries_of_many_entries(opened, key):
-    """Of text and of arrays, written again and again in growing numbers (5.1.1)."""
-    store = KeyValueStore(opened())
-    for entry in ("A" * 100, np.random.default_rng(5).random((3, 4))):
-        for copies in (1, 10, 40, 100):
-            data = {f"copy_{number}_single_key": entry for number in range(copies)}
-            for _ in range(3):
-                _assign(store, [key("growth")], data)
-            assert_same(_get(store, [key("growth")]), data)
-
-
-def test_frame_rates_of_arrays_on_an_empty_server(opened, key, raw):
-    """One array under a sub-key of what was not there before, in growing sizes; then read (5.1.2)."""
-    store = KeyValueStore(opened())
-    for edge in (10, 200, 400):
-        frame = np.random.default_rng(edge).random((edge, edge))
-        for name in ("set", "read"):
-            for _ in range(3):
-                _assign(store, [key(name), "subkey"], frame)
-        store[key("read")]["subkey"] = frame
-        for _ in range(3):
-            assert_same(_get(store, [key("read"), "subkey"]), frame)
-    assert_same(_get(store, [key("set")]), {"subkey": frame})
-    for name in ("set", "read"):
-        assert_no_orphans(raw, key(name))
-
-
-def test_a_dictionary_or_its_one_entry(opened, key):
-    """In turns, text and array."""
-    store, frame = KeyValueStore(opened()), np.random.default_rng(5).random((100, 400))
-    for value in (frame, "A" * 300_000):
-        _assign(store, [key("foo")], {"bar": value})
-        _assign(store, [key("foo"), "bar"], value)
-        assert_same(_get(store, [key("foo"), "bar"]), value)
-
-
-def test_the_overhead_of_subscribers(opened, key):
-    """Each of several is called for each of many time stamps (5.2)."""
-    subscribers = [[] for _ in range(3)]
-
-    def note_latency(data, updated_path, times):
-        times.append(time.time() - data["timestamp"])
-
-    for times in subscribers:
-        CallbackSubscriber(key("overhead"), opened(), note_latency, {"times": times}).listen()
-    publisher = PublishSpace(opened())
-    for _ in range(50):
-        publisher[key("overhead")] = {"timestamp": time.time()}
-        time.sleep(0.002)
-    eventually(lambda: all(len(times) == 50 for times in subscribers))
-    assert all(0 <= latency < 10 for times in subscribers for latency in times)
-
-
-def test_a_deep_dictionary_and_one_entry_of_it(opened, key):
-    """As it is compared with another package (5.3)."""
-    inner = {f"copy_{number}_single_key": "A" * 100 for number in range(100)}
-    inner |= {f"copy_{number}_nested_data": {"subkey": "A" * 100} for number in range(100)}
-    data, path = inner, [key("deep")]
-    for level in reversed(range(5)):
-        data = {f"sub_{level}": data}
-    path += [f"sub_{level}" for level in range(5)]
-    store = KeyValueStore(opened())
-    for _ in range(3):
-        _assign(store, path[:1], data)
-    assert _get(store, [*path, "copy_0_single_key"]) == "A" * 100
-    assert _get(store, path) == inner
 
 
 # --- REEM 0.1.x ------------------------------------------------------------------------------------
@@ -439,23 +237,6 @@ def test_marshallers_are_ships_by_their_old_names(opened, key):
     server[key()] = {"room": Celsius(20.5), "image": np.arange(3)}
     assert server[key()]["room"].read().degrees == 20.5
     assert_same(server[key()]["image"].read(), np.arange(3))
-
-
-def test_a_tolerant_store_creates_missing_parents(opened, key, raw):
-    """Writes need no parent; dotted names and ordinary ones both work."""
-    from reem.marshalling import TolerantKeyValueStore
-
-    interface = opened()
-    tolerant = TolerantKeyValueStore(interface)
-    tolerant[key()]["a"]["b"]["c"] = 1
-    tolerant[key()]["a"]["image"] = np.arange(3)
-    assert_same(tolerant[key()].read(), {"a": {"b": {"c": 1}, "image": np.arange(3)}})
-    tolerant[key("other") + ".x.y"] = 5
-    assert KeyValueStore(interface)[key("other")].read() == {"x": {"y": 5}}
-    assert tolerant[key("other") + ".x.y"].read() == 5
-    tolerant[key()]["a"]["b"]["d"] = 2
-    assert tolerant[key()]["a"]["b"].read() == {"c": 1, "d": 2}
-    assert_no_orphans(raw, key())
 
 
 # --- chapter 7 -------------------------------------------------------------------------------------

@@ -17,21 +17,6 @@ from reem_async.store.catalog import outline
 # --- a top-level key that is not there ----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("below", [(), ("a",), ("a", "b", 0), (0,), (-1,), ("a", -1)])
-def test_reading_a_top_level_key_that_is_not_there_gives_none(front, key, below):
-    """At any depth: an actuator that starts before its controller (manual, 4.2.1) finds no command yet."""
-    assert front.read([key("absent"), *below]) is None
-
-
-def test_what_is_missing_from_a_document_that_is_there_is_an_error(front, key):
-    """Whatever the way it is addressed."""
-    front.write([key()], {"l": [1], "none": None})
-    for path in (["absent"], ["l", 1], ["l", -2], ["l", "x"], ["none", "x"]):
-        with pytest.raises(MissingKey):
-            front.read([key(), *path])
-    assert front.read([key(), "none"]) is None
-
-
 def test_a_program_that_must_know_asks(front, key, raw):
     """`key in store`, `await store.contains(key)`: None that is stored counts, what others stored does not."""
     assert not front.contains(key())
@@ -115,28 +100,6 @@ def test_it_does_so_though_another_program_deleted_the_key_meanwhile(open_front,
     front.write([key(), "subkey"], np.arange(5))
     assert_same(other.read([key()]), {"subkey": np.arange(5)})
     assert_no_orphans(raw, key())
-
-
-def test_what_is_there_meanwhile_stays(open_front, key, raw):
-    """The dict is made only where there is none: both of two that begin at once are there afterwards."""
-    one, other = open_front(), open_front()
-    one.write([key(), "a"], np.arange(2))
-    other.write([key(), "b"], np.arange(3))
-    assert_same(one.read([key()]), {"a": np.arange(2), "b": np.arange(3)})
-
-
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        (["x"], 5), (["x"], {"image": np.arange(3)}), (["x"], [np.arange(3)]), (["x"], {}), (["x"], "text"),
-        (["x", "y"], np.arange(3)), ([0], np.arange(3)), ([-1], np.arange(3)),
-    ],
-)  # fmt: skip
-def test_nothing_else_makes_a_top_level_key(front, key, raw, path, value):
-    """As the originals' tests define it."""
-    with pytest.raises(redis.exceptions.ResponseError, match=key()):
-        front.write([key(), *path], value)
-    assert not list(raw.scan_iter(match=f"*{key()}*"))
 
 
 def test_followers_see_the_dict_that_an_array_made(interface, pspace, key):

@@ -8,7 +8,6 @@ import json
 
 import pytest
 import redis
-from conftest import FRONTS, BlockingFront
 
 import reem
 import reem_async
@@ -26,18 +25,6 @@ INDEXES = [0, 1, -1, -2, -3, 2**31, -(2**31) - 1, 2**63 - 1, -(2**63)]
 UNADDRESSABLE = [" ", " x", "  x", "a\\b", "\"'", 2**63, 2**64, 10**30, -(2**63) - 1]
 PARSER = "Error occurred on position"
 """What the server says of a path that it cannot read."""
-STATES = {"absent": None, "text": "t", "number": 1, "list": [1, {"一": [1]}], "dict": {"a": {"b": 1}, "一": [[1], {}]}}
-
-CALLS = {
-    "read": lambda front, path: front.read(path),
-    "length": lambda front, path: front.length(path),
-    "type": lambda front, path: front.type(path),
-    "increment": lambda front, path: front.increment(path, 1),
-    "divide": lambda front, path: front.divide(path, 2),
-    "extend": lambda front, path: front.extend(path, [1]),
-    "write": lambda front, path: front.write(path, 1),
-    "delete": lambda front, path: front.delete(path),
-}
 
 
 @pytest.fixture(scope="module")
@@ -51,26 +38,6 @@ def odd_paths():
     yield from ([element] for element in elements)
     yield from ([first, element] for first in ("a", "一", -1, -2) for element in elements)
     yield [*["一", -2] * 20]
-
-
-@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
-@pytest.mark.parametrize("state", STATES)
-def test_no_path_ends_the_server(server, state, space):
-    calls = [*CALLS] if space == "KeyValueStore" else ["increment", "divide", "extend", "write", "delete"]
-    with redis.Redis(unix_socket_path=server.socket_path) as raw:
-        front, said = BlockingFront(server.url, space), []
-        for path in odd_paths():
-            raw.delete("foo", "{foo}:ships")
-            if STATES[state] is not None:
-                raw.execute_command("JSON.SET", "foo", "$", json.dumps(STATES[state]))
-            for name in calls:
-                try:
-                    CALLS[name](front, ["foo", *path])
-                except (ReemError, redis.ResponseError, TypeError, ZeroDivisionError) as error:
-                    said.append((name, path, str(error)))
-        front.close()
-        assert server.running
-        assert [each for each in said if PARSER in each[-1]] == []
 
 
 async def test_no_path_of_a_page_or_a_notice_ends_the_server(server):
@@ -100,36 +67,12 @@ async def test_no_path_of_a_page_or_a_notice_ends_the_server(server):
     assert [each for each in said if PARSER in each[-1]] == []
 
 
-@pytest.mark.parametrize("element", UNADDRESSABLE, ids=repr)
-@pytest.mark.parametrize("front", FRONTS)
-def test_what_cannot_be_addressed_is_refused_everywhere(server, element, front):
-    opened = FRONTS[front](server.url)
-    opened.write(["foo"], {"x": "important", "": "too"})
-    for call in CALLS.values():
-        with pytest.raises(BadKey, match="foo"):
-            call(opened, ["foo", element])
-        with pytest.raises(BadKey):
-            call(opened, ["foo", "x", element, "y"])
-        assert opened.read(["foo"]) == {"x": "important", "": "too"}
-    with pytest.raises(BadKey):
-        to_jsonpath(("x", element))
-    opened.close()
-
-
 def test_a_mirror_refuses_them_too(server):
     with reem.RedisInterface(server) as interface:
         with pytest.raises(BadKey):
             reem.SilentSubscriber("foo. x", interface)
         with pytest.raises(BadKey):
             reem.SilentSubscriber("foo", interface)[" x"]
-
-
-def test_a_top_level_key_may_begin_with_a_space(server):
-    with reem.RedisInterface(server) as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs[" foo"] = {"x": 1}
-        kvs["foo"] = {"x": 2}
-        assert (kvs.get(" foo.x"), kvs[" foo"]["x"].read(), kvs["foo"]["x"].read()) == (1, 1, 2)
 
 
 def assert_exact(raw, keys):

@@ -9,7 +9,6 @@ import importlib
 import pickle
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -532,40 +531,3 @@ def test_the_state_server_of_a_robot(server_url, key, raw):
     assert (type(again), again.get([key(), "b"])) == (StateServer, 5)
     for each in (state, again):
         each.interface.close()
-
-
-def test_the_command_server_of_a_robot(server_url, key):
-    """Health and commands of modules, from several threads: lists in dicts, replaced and deleted as they come."""
-    server = reem.KeyValueStore(StateServer(server_url))
-    server[key("state")] = 0
-    server[key("commands")] = {"P0": [], "P1": []}
-    server[key("health")] = {}
-    assert server[key("ui")].read() is None  # the user interface has not started yet
-
-    def module(name):
-        for number in range(20):
-            server[key("health")][name] = [True, time.time()]
-            server[key("state")] = {"Position": {"base": [0.0, number], "arm": {}}, "Velocity": {}}
-            server[key("commands")][name].append(f"move({number})")
-
-    threads = [threading.Thread(target=module, args=(name,)) for name in ("P0", "P1")]
-    for each in threads:
-        each.start()
-    done = {"P0": [], "P1": []}
-    deadline = time.monotonic() + 20
-    while time.monotonic() < deadline and (any(each.is_alive() for each in threads) or not all(done.values())):
-        commands = server[key("commands")].read()
-        for name in commands:
-            if commands[name]:
-                done[name].append(commands[name][0])
-                server[key("commands")][name] = commands[name][1:]
-    for each in threads:
-        each.join()
-    assert all(server[key("health")][name].read()[0] for name in done)
-    assert server[key("state")].read()["Position"]["base"] == [0.0, 19]
-    del server[key("health")]["P0"]
-    with pytest.raises(KeyError):
-        server[key("health")]["P0"].read()
-    with pytest.raises(redis.exceptions.ResponseError):
-        server[key("health")]["P0"].type()
-    server.interface.close()

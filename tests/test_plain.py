@@ -336,49 +336,6 @@ async def test_a_cancelled_change_is_done_once_or_not_at_all(server):
             assert_same(after["a"], np.full(3, steps) if after["n"] == steps + 1 else before[1])
 
 
-def test_an_edit_of_what_has_changed_is_a_conflict(open_front):
-    one, other = open_front(), open_front()
-    one.write(["edited"], {"a": {"x": 1}})
-    if isinstance(one, FRONTS["blocking"]):
-
-        def edit():
-            with one.at(["edited", "a"]) as value:
-                other.write(["edited", "a", "x"], 2)
-                value["y"] = 1
-
-    else:
-
-        async def edit_on_a_loop():
-            async with one.at(["edited", "a"]).edit() as value:
-                await one.at(["edited", "a", "x"]).write(2)
-                value["y"] = 1
-
-        def edit():
-            one.run(edit_on_a_loop())
-
-    with pytest.raises(reem.Conflict):
-        edit()
-    assert one.read(["edited"]) == {"a": {"x": 2}}
-
-
-async def test_updates_come_whole_and_in_order(server):
-    async with reem_async.RedisInterface(server) as interface:
-        space = reem_async.PublishSpace(interface)
-        await space["told"].write({"n": 0})
-        seen = []
-        async with reem_async.CallbackSubscriber("told", interface, lambda data, updated_path: seen.append(data)):
-            for number in range(1, 30):
-                await space["told"]["n"].write(number)
-                await space["told"]["image"].write(np.full(3, number))
-            await asyncio.to_thread(eventually, lambda: seen and _is_last(seen[-1]))
-        numbers = [data["n"] for data in seen]
-        assert numbers == sorted(numbers)
-
-
-def _is_last(data):
-    return data["n"] == 29 and "image" in data and data["image"][0] == 29
-
-
 # --- a cluster, and servers of the other kind -------------------------------------------------
 
 

@@ -43,60 +43,6 @@ class SetShip(reem.SpecialDatatypeShip):
         return "set"
 
 
-# --- arrays in lists ------------------------------------------------------------------------------
-
-
-def test_an_array_in_a_list_item_leaves_nothing_when_it_is_replaced(front, key, raw):
-    """By path, by arrays again and again, and by what is no array."""
-    front.write([key()], {"t": [{"img": 0}]})
-    for value in (A, A + 1, {"deep": [A]}, A, 5):
-        front.write([key(), "t", 0, "img"], value)
-        assert_same(front.read([key()]), {"t": [{"img": value}]})
-        assert_no_orphans(raw, key())
-    assert not keys_of(raw, key()) - {"{" + key() + "}:ships"}
-
-
-def test_arrays_below_a_list_item_leave_nothing_when_the_item_is_replaced(front, key, raw):
-    """Whether they were written with the item, below it, or appended with it."""
-    front.write([key()], {"t": [{"img": A, "l": [A]}]})
-    front.append([key(), "t"], {"img": A})
-    for index in (1, 0):
-        front.write([key(), "t", index, "img"], A + 1)
-        front.write([key(), "t", index, "more"], [A, {"x": A}])
-        front.write([key(), "t", index, "more", 1, "x"], 5)
-        assert_no_orphans(raw, key())
-        front.write([key(), "t", index], 5)
-        assert_no_orphans(raw, key())
-    assert front.read([key()]) == {"t": [5, 5]}
-    assert not keys_of(raw, key()) - {"{" + key() + "}:ships"}
-
-
-def test_arrays_of_items_that_a_delete_has_shifted_leave_nothing_when_they_are_replaced(front, key, raw):
-    """The item at [0] bears a name that says [1]."""
-    front.write([key()], {"t": [{"img": A}, {"img": A + 1}, {"img": A + 2}]})
-    front.delete([key(), "t", 0])
-    front.write([key(), "t", 0, "img"], A + 10)
-    assert_no_orphans(raw, key())
-    assert_same(front.read([key()]), {"t": [{"img": A + 10}, {"img": A + 2}]})
-    front.write([key(), "t", 1, "img"], A + 20)
-    front.delete([key(), "t", 0])
-    front.write([key(), "t", 0, "img"], 6)
-    assert_no_orphans(raw, key())
-    front.write([key(), "t", 0], 7)
-    assert_no_orphans(raw, key())
-    assert_same(front.read([key()]), {"t": [7]})
-
-
-def test_an_array_that_an_edit_wrote_anew_leaves_nothing_when_it_is_replaced_by_path(kvs, key, raw):
-    """An edit gives arrays names with a suffix."""
-    kvs[key()] = {"p": {"img": A}}
-    with kvs[key()] as value:
-        value["n"] = 1
-    kvs[key()]["p"]["img"] = 5
-    assert_no_orphans(raw, key())
-    assert kvs[key()].read() == {"p": {"img": 5}, "n": 1}
-
-
 # --- track_schema_changes(False) ------------------------------------------------------------------
 
 

@@ -7,12 +7,12 @@ import pickle
 
 import numpy as np
 import pytest
-from conftest import ROOT, assert_no_orphans, assert_same, keys_of, nothing_sent, python
+from conftest import ROOT, assert_no_orphans, assert_same, nothing_sent, python
 from redis.crc import key_slot
 
 import reem
 import reem_async
-from reem_async.errors import BadKey, Conflict, MissingKey, NotConnected, PathRefused, WriteOnly
+from reem_async.errors import Conflict, MissingKey, NotConnected, WriteOnly
 
 # --- asyncio only ----------------------------------------------------------------------------------
 
@@ -40,21 +40,6 @@ async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):
         akvs[key()]["bar"] = 1
 
 
-async def test_arithmetic_append_and_extend_are_methods(akvs, key):
-    """The twins of += -= *= /= and += [..]."""
-    await akvs[key()].write({"n": 5, "l": [1]})
-    n, items = akvs[key()]["n"], akvs[key()]["l"]
-    await n.increment(3)
-    await n.multiply(4)
-    assert_same(await n.read(), 32)
-    await n.increment(-2)
-    await n.divide(4)
-    assert await n.read() == 7.5
-    await items.append({"a": np.arange(2)})
-    await items.extend([b"x", 2])
-    assert_same(await items.read(), [1, {"a": np.arange(2)}, b"x", 2])
-
-
 async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):
     """Also arrays, which are writable copies inside the block."""
     await akvs[key()].write({"n": 1, "image": np.zeros(3), "gone": np.ones(2)})
@@ -71,16 +56,6 @@ async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):
     assert_same(await akvs[key()]["new"].read(), [np.arange(2), "tail"])
 
 
-async def test_an_edit_that_raises_writes_nothing(akvs, key):
-    """The exception passes through."""
-    await akvs[key()].write({"n": 1})
-    with pytest.raises(ZeroDivisionError):  # noqa: PT012
-        async with akvs[key()].edit() as value:
-            value["n"] = 2
-            value["n"] /= 0
-    assert await akvs[key()].read() == {"n": 1}
-
-
 @pytest.mark.parametrize("image", [None, np.zeros(4)], ids=["plain", "array"])
 async def test_an_edit_that_somebody_overtook_is_a_conflict(akvs, kvs, key, image, raw):
     """Nothing is written; the other's value stands, also if only an array's content changed."""
@@ -95,13 +70,6 @@ async def test_an_edit_that_somebody_overtook_is_a_conflict(akvs, kvs, key, imag
     expected = {"n": 1, "image": None, "m": 3} if image is None else {"n": 1, "image": image + 1}
     assert_same(await akvs[key()].read(), expected)
     assert_no_orphans(raw, key())
-
-
-async def test_an_edit_of_something_missing_is_a_key_error(akvs, key):
-    """Before the block runs."""
-    with pytest.raises(MissingKey):
-        async with akvs[key()].edit():
-            pytest.fail("the block ran")
 
 
 async def test_many_edits_at_once_lose_nothing(akvs, key):
@@ -185,37 +153,6 @@ async def test_the_interface_need_not_be_initialized(server_url, key):
 # --- both fronts -----------------------------------------------------------------------------------
 
 
-def test_a_missing_key_may_have_a_default(front, key):
-    """`accessor.get(default)`, and `accessor.get(key, default)` as in REEM 0.1.2."""
-    front.write([key()], {"a": 1, "none": None})
-
-    def get(path, *arguments):
-        got = front.at(path).get(*arguments)
-        return front.run(got) if hasattr(got, "__await__") else got
-
-    assert get([key(), "a"]) == 1
-    assert get([key(), "b"]) is None
-    assert get([key(), "b"], 5) == 5
-    assert get([key("absent")], "x") == "x"
-    assert get([key(), "none"], 5) is None
-    assert get([key()], "a", 7) == 1
-    assert get([key()], "b", 7) == 7
-
-
-def test_dotted_access(front, key):
-    """`get` and `set` of the store take `foo.bar`; a missing one is a KeyError unless there is a default."""
-    front.set(key(), {"bar": {"n": 1}})
-    front.set(key() + ".bar.image", np.arange(3))
-    assert_same(front.get(key() + ".bar"), {"n": 1, "image": np.arange(3)})
-    assert front.get(key() + ".bar.n") == 1
-    with pytest.raises(MissingKey, match=key()):
-        front.get(key() + ".bar.absent")
-    assert front.get(key() + ".bar.absent", 5) == 5
-    assert front.get(key("absent") + ".x", None) is None
-    with pytest.raises(PathRefused):
-        front.set(key() + ".absent.x", 1)
-
-
 def test_types_are_python_types(front, key):
     """Of the value as it would be read."""
     values = {
@@ -238,139 +175,6 @@ def test_types_are_python_types(front, key):
         assert front.type([key(), name]) is expected
         front.write([key(name)], value)
         assert front.type([key(name)]) is expected
-
-
-def test_lengths(front, key):
-    """Dict entries, list items, characters, bytes, the first dimension of an array."""
-    values = {
-        "d": {"a": 1, "b": 2},
-        "l": [1, np.arange(9), 3],
-        "s": "é🤖x",
-        "b": b"12345",
-        "a": np.zeros((7, 2)),
-    }
-    lengths = {"d": 2, "l": 3, "s": 3, "b": 5, "a": 7}
-    front.write([key()], values | {"ship": "$ship x"})
-    assert front.length([key()]) == 6
-    assert {name: front.length([key(), name]) for name in lengths} == lengths
-    assert front.length([key(), "ship"]) == 7
-    front.write([key("root")], np.zeros((4, 5)))
-    assert front.length([key("root")]) == 4
-
-
-def test_integer_indexes(front, key, raw):
-    """Lists are read, written and deleted by index; negative ones count from the end when reading."""
-    front.write([key()], {"l": [0, np.arange(1), {"x": np.arange(2)}, 3]})
-    assert front.read([key(), "l", 0]) == 0
-    assert front.read([key(), "l", -1]) == 3
-    assert_same(front.read([key(), "l", -2]), {"x": np.arange(2)})
-    assert_same(front.read([key(), "l", 2, "x"]), np.arange(2))
-    front.write([key(), "l", 0], np.arange(5))
-    front.write([key(), "l", 1], "plain")
-    front.write([key(), "l", 2, "y"], np.arange(3))
-    expected = [np.arange(5), "plain", {"x": np.arange(2), "y": np.arange(3)}, 3]
-    assert_same(front.read([key(), "l"]), expected)
-    front.delete([key(), "l", 0])
-    assert_same(front.read([key(), "l"]), expected[1:])
-    with pytest.raises(MissingKey):
-        front.read([key(), 0])
-    assert_no_orphans(raw, key())
-
-
-@pytest.mark.parametrize("index", [3, -4, 100, -100])
-def test_an_index_out_of_range_touches_nothing(front, key, index):
-    """The server itself would take the first or the last item in its place."""
-    front.write([key()], {"l": [0, np.arange(1), {"n": 1}]})
-    for call in (front.read, front.delete, front.length, front.type, lambda path: front.increment(path, 1)):
-        with pytest.raises(MissingKey):
-            call([key(), "l", index])
-    with pytest.raises((PathRefused, BadKey)):
-        front.write([key(), "l", index], 5)
-    with pytest.raises((PathRefused, BadKey)):
-        front.write([key(), "l", index, "n"], np.arange(2))
-    assert_same(front.read([key()]), {"l": [0, np.arange(1), {"n": 1}]})
-
-
-def test_arrays_in_a_list_stay_apart_when_the_list_shifts(front, key, raw):
-    """Deleting an item moves the others; a later append must not take the place of one of them."""
-    arrays = [np.full(3, n) for n in range(6)]
-    front.write([key()], {"l": arrays[:3]})
-    front.delete([key(), "l", 0])
-    front.append([key(), "l"], arrays[3])
-    assert_same(front.read([key(), "l"]), arrays[1:4])
-    front.delete([key(), "l", 1])
-    front.extend([key(), "l"], arrays[4:])
-    assert_same(front.read([key(), "l"]), [arrays[1], arrays[3], arrays[4], arrays[5]])
-    front.write([key(), "l", 1], np.full(2, 99))
-    assert_same(front.read([key(), "l"]), [arrays[1], np.full(2, 99), arrays[4], arrays[5]])
-    assert_no_orphans(raw, key())
-
-
-def test_arrays_under_paths_that_look_alike_stay_apart(front, key, raw):
-    """Dots, quotes, brackets and digits in keys do not make two arrays share one place."""
-    document = {
-        "a.b": np.full(1, 1),
-        "a": {"b": np.full(1, 2), "b.c": np.full(1, 3), "0": np.full(1, 4)},
-        "a.b.c": np.full(1, 5),
-        "l": [np.full(1, 6), {"0": np.full(1, 7)}],
-        "l.0": np.full(1, 8),
-        "l[0]": np.full(1, 9),
-        "": {"": np.full(1, 10)},
-        ".": np.full(1, 11),
-        "'q'": np.full(1, 12),
-        '"q"': np.full(1, 13),
-        "\\": np.full(1, 14),
-        "é\n*$ {}": np.full(1, 15),
-        "ships": np.full(1, 16),
-        ":ships": np.full(1, 17),
-    }
-    front.write([key()], document)
-    assert_same(front.read([key()]), document)
-    assert_same(front.read([key(), "a.b"]), np.full(1, 1))
-    assert_same(front.read([key(), "a", "b"]), np.full(1, 2))
-    front.write([key(), "a"], {"b": {"c": np.full(1, 18)}})
-    document["a"] = {"b": {"c": np.full(1, 18)}}
-    assert_same(front.read([key()]), document)
-    for name in document:
-        if name != "\\":
-            front.delete([key(), name])
-    assert_same(front.read([key()]), {"\\": np.full(1, 14)})
-    front.delete([key()])
-    assert keys_of(raw, key()) == set()
-
-
-@pytest.mark.parametrize("name", ["a.b", "a b", "'", '"', "", "*", "$", "]", "[0]", "0", "é🤖", "\n\t\x01", "\u2028"])
-def test_odd_keys_are_addressed_by_path(front, key, raw, name):
-    """Every character but a backslash, and one kind of quotes."""
-    front.write([key()], {})
-    front.write([key(), name], {"image": np.arange(3)})
-    front.write([key(), name, name], 1.5)
-    assert_same(front.read([key()]), {name: {"image": np.arange(3), name: 1.5}})
-    front.increment([key(), name, name], 1)
-    assert front.read([key(), name, name]) == 2.5
-    front.delete([key(), name, "image"])
-    assert front.length([key(), name]) == 1
-    assert_no_orphans(raw, key())
-
-
-def test_replacing_and_deleting_unlinks_the_arrays(front, key, raw):
-    """Whatever replaces them, and `foobar` is not `foo`."""
-    arrays = {"image": np.arange(3), "deep": {"l": [np.arange(2), b"x"]}, "imagebar": np.arange(9)}
-    front.write([key("foobar")], arrays)
-    for value in (1, {"deep": np.arange(1)}, [np.arange(2)], np.arange(5), "x", {}):
-        front.write([key("foo")], arrays)
-        assert_no_orphans(raw, key("foo"))
-        front.write([key("foo"), "image"], value)
-        front.write([key("foo"), "deep", "l"], value)
-        assert_same(front.read([key("foo"), "imagebar"]), np.arange(9))
-        assert_no_orphans(raw, key("foo"))
-        front.write([key("foo")], value)
-        assert_same(front.read([key("foo")]), value)
-        assert_no_orphans(raw, key("foo"))
-    front.delete([key("foo")])
-    assert keys_of(raw, key("foo")) == set()
-    assert_same(front.read([key("foobar")]), arrays)
-    assert_no_orphans(raw, key("foobar"))
 
 
 def test_a_namespace_prefixes_every_key_and_keeps_programs_apart(open_front, key, raw):

@@ -19,6 +19,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--steps", type=int, default=0, help="so many steps, in place of a time")
     parser.add_argument("--faults", type=float, default=0.15, help="the share of steps that are broken off")
+    parser.add_argument("--plain", action="store_true", help="without the JSON module")
     parser.add_argument("--secured", action="store_true", help="with TLS, as a user with few rights")
     given = parser.parse_args()
     seed = secrets.randbelow(10**6) if given.seed is None else given.seed
@@ -28,7 +29,7 @@ def main() -> int:
     sys.unraisablehook = lambda it: None
     logging.disable(logging.WARNING)
     print(f"seed {seed}", flush=True)
-    hunter, begun, wrong = Hunter(seed, given.faults, secured=given.secured), time.monotonic(), ""
+    hunter, begun, wrong = Hunter(seed, given.faults, secured=given.secured, plain=given.plain), time.monotonic(), ""
     try:
         hunter.run(given.minutes * 60, given.steps)
     except Difference as difference:
@@ -38,7 +39,7 @@ def main() -> int:
     print(f"seed {seed}: {hunter.steps} steps in {seconds:.0f} s, {hunter.steps / seconds:.0f} a second\n{counts}")
     if wrong:
         again = f"python -m tests.hunt --seed {seed} --steps {hunter.steps} --faults {given.faults}"
-        again += " --secured" if given.secured else ""
+        again += " --secured" * given.secured + " --plain" * given.plain
         print(f"DIFFERENCE at step {hunter.steps}: {wrong}\nagain: {again}")
     return int(bool(wrong))
 

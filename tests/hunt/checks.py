@@ -50,8 +50,8 @@ def compare(read: Any, due: Any, what: str) -> None:
 class Server:
     """What a bare client sees of a server."""
 
-    def __init__(self, url: str) -> None:
-        self.url = url
+    def __init__(self, url: str, *, json: bool) -> None:
+        self.url, self._get = url, "JSON.GET" if json else "GET"
         self.raw = redis.Redis.from_url(url)
 
     def check(self, documents: dict[str, Any]) -> None:
@@ -68,7 +68,7 @@ class Server:
 
     def _check_document(self, name: str, document: Any) -> set[bytes]:
         """Compare one document; returns the keys that belong to it."""
-        text = self.raw.execute_command("JSON.GET", name)
+        text = self.raw.execute_command(self._get, name)
         assert text is not None, f"there is no {name!r}"
         suffixes: dict[str, Placeholder] = {}
         _same_json(json.loads(text), document, suffixes, name)

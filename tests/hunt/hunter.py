@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from chaos.proxy import Proxy
 
-from reem_async.errors import BadType, ConnectionLost, InterfaceClosed, NotConnected, PathRefused
+from reem_async.errors import BadType, ConnectionLost, InterfaceClosed, NotConnected, PathRefused, ReemError
 from reem_async.server import EmbeddedServer
 
 from . import faults
@@ -44,10 +44,11 @@ class Hunter:
         seed: What all chance comes from.
         share: The part of the steps that are broken off.
         secured: Use TLS, and a user with no more rights than deploy/users.acl gives.
+        plain: Use servers without the JSON module.
     """
 
-    def __init__(self, seed: int, share: float, *, secured: bool = False) -> None:
-        self.share, self.secured = share, secured
+    def __init__(self, seed: int, share: float, *, secured: bool = False, plain: bool = False) -> None:
+        self.share, self.secured, self.plain = share, secured, plain
         self.rng = random.Random(seed)
         self.inputs = Inputs(self.rng)
         self.documents: dict[str, Any] = {}
@@ -79,7 +80,8 @@ class Hunter:
             faulthandler.cancel_dump_traceback_later()
 
     def _open(self, stack: contextlib.ExitStack) -> None:
-        self.here, self.there = (Server(stack.enter_context(EmbeddedServer()).url) for _ in range(2))
+        made = [stack.enter_context(EmbeddedServer(json=not self.plain)) for _ in range(2)]
+        self.here, self.there = (Server(server.url, json=server.json) for server in made)
         at = secured(stack, self.here) if self.secured else (self.here.url, {})
         main, spaced = Blocking("blocking", at, ""), Blocking("blocking r:", at, NAMESPACES[1])
         self.static = Blocking("static", at, "", static=True)
@@ -169,6 +171,9 @@ class Hunter:
             if due.error is None or not isinstance(error, due.error):
                 wanted = f"{due.error}" if due.error else f"{due.result!r:.500}"
                 raise Difference(f"{op!r} raised {error!r:.500}, due: {wanted}{self._told(full)}") from error
+            text = str(error)
+            if isinstance(error, ReemError) and op.path[0] == "pose" and ("pose" not in text or len(text) > 1000):
+                raise Difference(f"{op!r}: the message is too long or does not name the key: {text:.1200}") from error
             return
         if due.error is not None:
             raise Difference(f"{op!r} brought {result!r:.500}, due: {due.error}{self._told(full)}")
