@@ -368,7 +368,7 @@ def test_bytes_of_arrays_never_become_commands(server, name):
 MODULES = sorted(path for package in ("reem", "reem_async") for path in (ROOT / package).rglob("*.py"))
 RUNS_CODE = {
     "builtins.eval", "builtins.exec", "builtins.compile", "builtins.__import__", "pickle", "cPickle", "cloudpickle",
-    "dill", "joblib", "shelve", "yaml", "jsonpickle", "allow_pickle=", "shell=", "numpy.fromfile", "numpy.memmap",
+    "dill", "joblib", "shelve", "yaml", "jsonpickle", "allow_pickle=", "shell=", "numpy.fromfile", "numpy.memmap(",
     "numpy.lib.format.read_array", "numpy.lib.format.open_memmap", "numpy.loadtxt", "numpy.genfromtxt",
     "numpy.recfromcsv", "numpy.safe_eval", "marshal.load", "marshal.loads", "os.system", "os.popen", "code", "codeop",
     "runpy", "timeit",
@@ -391,6 +391,7 @@ def used(path):
             for alias in node.names:
                 names[alias.asname or alias.name] = f"{node.module}.{alias.name}"
                 found |= {(node.module, node.lineno), (f"{node.module}.{alias.name}", node.lineno)}
+    called = {node.func for node in ast.walk(tree) if isinstance(node, ast.Call)}
     for node in ast.walk(tree):
         if (
             isinstance(node, ast.keyword)
@@ -402,7 +403,8 @@ def used(path):
             text = ast.unparse(node)
             first, dot, rest = text.partition(".")
             if text.replace(".", "").isidentifier() and (first in names or not dot):
-                found.add((names.get(first, f"builtins.{first}") + dot + rest, node.lineno))
+                name = names.get(first, f"builtins.{first}") + dot + rest
+                found |= {(name, node.lineno), (f"{name}(" * (node in called), node.lineno)}
     return found
 
 
@@ -411,7 +413,7 @@ def test_the_search_for_dangerous_calls_finds_them(tmp_path):
     for number, text in enumerate([
         "import pickle", "from pickle import loads as l", "import numpy as np\nnp.load(x, allow_pickle=y)", "eval(x)",
         "import marshal\nmarshal.loads(x)", "from os import system", "f = exec",
-        "import numpy.lib.format as f\nf.read_array(x)",
+        "import numpy.lib.format as f\nf.read_array(x)", "import numpy\nnumpy.memmap(x)",
     ]):  # fmt: skip
         file = tmp_path / f"m{number}.py"
         file.write_text(text)
