@@ -188,9 +188,10 @@ class CallbackSubscriber(SilentSubscriber):
     names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
     which path was updated, such as "callback_channel.number". Calls are made one after the other,
     in order, on a thread of the subscriber's own; they may use REEM. An exception in one is logged
-    and does not end the subscription. If calls are slower than updates, the oldest of over 1000
-    waiting ones are dropped; a warning says so. After a large update `data` may have later ones in it
-    already, which are called for too.
+    and does not end the subscription. So is SystemExit, since `sys.exit()` cannot end the program from a
+    thread, and KeyboardInterrupt, which is also raised in the main thread. If calls are slower than
+    updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
+    `data` may have later ones in it already, which are called for too.
 
     Args:
         channel: The path to follow.
@@ -239,7 +240,7 @@ class CallbackSubscriber(SilentSubscriber):
         take_short_turns()  # the event loop's thread has had its wake-up before: waiting once in line is enough
         try:
             while True:
-                caller.call(queue.take_waiting(), queue.dropped)
+                caller.call_on_thread(queue.take_waiting(), queue.dropped)
         except Exception as reason:
             caller.ended(reason)
 

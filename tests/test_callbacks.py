@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import gc
 import os
@@ -12,8 +13,9 @@ import time
 import weakref
 
 import pytest
-from conftest import PATIENCE, aeventually, python
+from conftest import PATIENCE, aeventually, eventually, python
 
+import reem
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
 from reem_async.concurrency.queues import BoundedQueue, Ended, Every, Last, Newest
@@ -59,6 +61,103 @@ async def test_an_awaited_call_may_close_its_own_subscriber(ainterface, apspace,
     await subscriber.listen()
     await apspace[key()].write(0)
     await aeventually(lambda: told == [0, 1])
+
+
+@pytest.mark.parametrize("how", ["one by one", "gather", "wait_for", "TaskGroup"])
+async def test_calls_may_close_all_subscribers_at_once(ainterface, apspace, key, how):
+    """Two callbacks that close each other do not wait for each other; whoever else closes waits for both."""
+    subscribers, reached = [], []
+
+    async def stop(data, updated_path, side):
+        closing = [subscriber.close() for subscriber in subscribers]
+        if how == "gather":
+            await asyncio.gather(*closing)
+        elif how == "TaskGroup":
+            async with asyncio.TaskGroup() as group:
+                for each in closing:
+                    group.create_task(each)
+        else:
+            for each in closing:
+                await (asyncio.wait_for(each, PATIENCE) if how == "wait_for" else each)
+        await asyncio.sleep(0.05)
+        reached.append(side)
+
+    for side in "left", "right":
+        subscribers.append(CallbackSubscriber(key(), ainterface, stop, {"side": side}))
+        await subscribers[-1].listen()
+    await apspace[key()].write(True)
+    await aeventually(lambda: all(subscriber._link.closed for subscriber in subscribers))
+    for subscriber in subscribers:
+        await subscriber.close()
+    assert sorted(reached) == ["left", "right"]
+
+
+class Odd(BaseException):
+    """Neither an Exception nor one that asyncio knows."""
+
+
+@pytest.mark.parametrize("kind", [ValueError, SystemExit, KeyboardInterrupt, Odd])
+def test_whatever_a_call_raises_on_its_thread_is_reported_once_and_calls_go_on(interface, pspace, key, kind, caplog):
+    """KeyboardInterrupt is raised in the main thread too."""
+    told = []
+
+    def callback(data, updated_path):
+        told.append(data)
+        if data < 2:
+            raise kind
+
+    with reem.CallbackSubscriber(key(), interface, callback):
+        with pytest.raises(KeyboardInterrupt) if kind is KeyboardInterrupt else contextlib.nullcontext():
+            pspace[key()] = 0
+            eventually(lambda: told == [0])
+            time.sleep(0.2)
+        with contextlib.suppress(KeyboardInterrupt):
+            pspace[key()] = 1
+            time.sleep(0.2)
+        for number in range(2, 5):
+            pspace[key()] = number
+        eventually(lambda: told == list(range(5)))
+    (record,) = [it for it in caplog.records if it.exc_info]
+    assert record.exc_info[0] is kind
+
+
+@pytest.mark.parametrize("awaited", [False, True])
+@pytest.mark.parametrize("kind", [SystemExit, KeyboardInterrupt, Odd])
+def test_what_a_call_raises_leaves_the_event_loop_and_the_subscription_goes_on(server_url, key, kind, awaited, caplog):
+    """As from any callback of asyncio; SystemExit only once, so that a program can close what it has open."""
+    told, left = [], []
+
+    def callback(data, updated_path):
+        told.append(data)
+        if data < 2:
+            raise kind
+
+    async def acallback(data, updated_path):
+        callback(data, updated_path)
+
+    loop = asyncio.new_event_loop()
+    interface = RedisInterface(server_url)
+    space, subscriber = (
+        PublishSpace(interface),
+        CallbackSubscriber(key(), interface, acallback if awaited else callback),
+    )
+
+    async def publish(number):
+        await space[key()].write(number)
+        await aeventually(lambda: told == list(range(number + 1)))
+
+    loop.run_until_complete(subscriber.listen())
+    for number in range(4):
+        publishing = loop.create_task(publish(number))
+        while not publishing.done():
+            try:
+                loop.run_until_complete(publishing)
+            except kind:
+                left.append(number)
+    loop.run_until_complete(interface.close())
+    loop.close()
+    assert left == {SystemExit: [0], KeyboardInterrupt: [0, 1], Odd: []}[kind]
+    assert [it.exc_info[0] for it in caplog.records if it.exc_info] == ([] if kind is KeyboardInterrupt else [kind])
 
 
 async def test_a_function_that_returns_something_to_await_is_awaited(ainterface, apspace, key):

@@ -7,22 +7,25 @@ import contextlib
 import logging
 import os
 import pickle
+import random
 import signal
 import threading
 import time
 
 import numpy as np
+import orjson
 import pytest
 from chaos.proxy import Proxy
-from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually
+from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually, sized
 
 import reem
 import reem_async
 from reem_async.concurrency.queues import Every
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.plan.trees import MISSING, CannotApply, removed, replaced
 from reem_async.server.embedded import EmbeddedServer
 from reem_async.store import outage
-from reem_async.store.document import DocumentWriter
+from reem_async.store.document import Assignment, DocumentWriter
 
 
 class Server:
@@ -391,6 +394,67 @@ def test_an_update_of_several_is_kept_by_its_entries(publisher, server, reader):
     server.start()
     front.eventually(lambda: front.kvs.waiting == 0)
     assert reader()["a"].read() == {"x": 1, "y": 2, "z": 0}
+
+
+def _random_call(random, tree):
+    """Return a path below `tree`, and what is written there, MISSING if it is deleted: what the server would do."""
+    path = ()
+    while isinstance(tree, dict | list) and tree and (not path or random.random() < 0.7):
+        key = random.choice(list(tree) if isinstance(tree, dict) else [*range(len(tree)), -1])
+        path, tree = (*path, key), tree[key]
+    choices = [random.randrange(100), [random.randrange(10) for _ in range(3)], {"x": [1, [2, 3]]}, MISSING]
+    return path, random.choice(choices) if path else {"l": [0, [1, {"y": 2}]], "d": {"l": [4, 5]}}
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_is_kept_leads_to_what_the_calls_lead_to(seed):
+    """Also where items are removed from lists, so that an index names another item. What is kept stays small."""
+    rng = random.Random(seed)
+    for _ in range(sized(50, 500)):
+        start = {"l": [0, [1, {"y": 2}], 3], "d": {"l": [4, 5]}, "n": 1}
+        kept, expected, count, replaced_count = outage._Out(None), start, rng.randrange(30), 0
+        for _ in range(count):
+            path, value = _random_call(rng, expected)
+            expected = removed(expected, path) if value is MISSING else replaced(expected, path, value)
+            text = None if value is MISSING else orjson.dumps(value)
+            replaced_count += kept.put(outage._Kept(Assignment(path, text), 1, 0.0))
+        found = start
+        for it, _, _ in kept.kept.values():
+            value = it.text and orjson.loads(it.text)
+            with contextlib.suppress(CannotApply):  # the server refuses it: only l[-1] and l[2] may be one place
+                found = removed(found, it.path) if value is None else replaced(found, it.path, value)
+        assert found == expected
+        assert len(kept.kept) == kept.size == count - replaced_count
+    for number in range(100):
+        kept.put(outage._Kept(Assignment(("l", 0), b"%d" % number), 1, 0.0))
+    assert sum(path == ("l", 0) for path, _ in kept.kept) == 1
+
+
+def test_an_outage_ends_in_the_event_loop_after_one_that_was_closed(server):
+    """The task that asked for the server went with the first loop."""
+    interface = reem_async.RedisInterface(server.url)
+    space, store = reem_async.PublishSpace(interface, outage="newest"), reem_async.KeyValueStore(interface)
+
+    async def lose():
+        await space["a"].write(0)
+        server.stop()
+        await space["a"].write(1)
+        await space["a"].write(2)
+
+    async def go_on():
+        await space["a"].write(3)
+        await aeventually(lambda: space.waiting == 0)
+        await space["a"].write(4)
+        assert await store["a"].read() == 4
+        await interface.close()
+
+    first = asyncio.new_event_loop()
+    first.run_until_complete(lose())
+    for task in asyncio.all_tasks(first):  # it would complain of them, as it may
+        task._log_destroy_pending = False
+    first.close()
+    server.start()
+    asyncio.run(go_on())
 
 
 def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):

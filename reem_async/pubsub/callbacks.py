@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import inspect
 import logging
 import sys
 from collections.abc import Awaitable, Callable, Mapping
-from contextvars import copy_context
+from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING, Any
 
 from ..concurrency.queues import EMPTY, Ended
@@ -28,6 +29,9 @@ _TOLD = frozenset(10**power for power in range(1, 12))
 """Numbers of equal exceptions of a callback that are worth a line: at 200 Hz each would fill the log."""
 
 _GIVEN = "data", "updated_path"
+
+_current_call: ContextVar[asyncio.Task[Any] | None] = ContextVar("_current_call", default=None)
+"""The task that awaits the callback which this code belongs to; tasks that the callback starts inherit it."""
 
 
 def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callable[..., Any]:
@@ -108,6 +112,18 @@ class Caller:
             self.failed(update)
             return None
 
+    def call_on_thread(self, update: Update, dropped: int) -> None:
+        """As `call`, on a thread of its own: nothing that the function raises ends the thread.
+
+        A KeyboardInterrupt is also raised in the main thread.
+        """
+        try:
+            self.call(update, dropped)
+        except BaseException as error:
+            self.failed(update)
+            if isinstance(error, KeyboardInterrupt):
+                _thread.interrupt_main()
+
     def failed(self, update: Update) -> None:
         """Log the exception that is being handled: of each kind the first, then only how many there were by now."""
         error, trace = sys.exc_info()[1:]
@@ -149,6 +165,7 @@ class Calls:
         self._kept = kept
         self._busy = False
         self._awaited: asyncio.Task[Any] | None = None
+        self._has_exited = False
         self._over = self.loop.create_future()
         self._context = copy_context()
         self._context.run(forget)  # a time limit given for listen() is not meant for what callbacks do
@@ -164,7 +181,7 @@ class Calls:
             self.loop.call_soon(self._call_waiting, context=self._context)
 
     def _call_waiting(self) -> None:
-        queue = self._updates.queue
+        queue, update = self._updates.queue, None
         try:
             # All that waits, in one turn of the loop: a task or a timer for each would cost more than the calls.
             while (update := queue.take()) is not EMPTY:
@@ -176,11 +193,14 @@ class Calls:
         except Exception as reason:
             self._caller.ended(reason)
             self._end()
-        except BaseException:
-            self._end()
-            raise
+        except BaseException as error:
+            self._resume()
+            if self._leaves(error):
+                raise
+            self._caller.failed(update)  # type: ignore[arg-type]  # only a call raises anything else
 
     async def _wait(self, update: Update, result: Awaitable[Any]) -> None:
+        _current_call.set(asyncio.current_task())
         try:
             await result
         except (Exception, asyncio.CancelledError):
@@ -188,9 +208,30 @@ class Calls:
                 self._end()
                 raise
             self._caller.failed(update)
-        # Calls go on where an awaited one has left off; what came meanwhile waits in the queue.
+        except GeneratorExit:  # the event loop was closed
+            raise
+        except BaseException as error:
+            if self._leaves(error):
+                self.loop.call_soon(_raise, error)  # not as the result of this task, which nothing asks for
+            else:
+                self._caller.failed(update)
+        self._resume()
+
+    def _resume(self) -> None:
+        """Go on with the calls where one has left off; what came meanwhile waits in the queue."""
         self._busy = False
         self._go_on()
+
+    def _leaves(self, error: BaseException) -> bool:
+        """Return whether an exception leaves the event loop, as it would from any callback of asyncio.
+
+        Of SystemExit only the first: the loop runs again while the program closes what it has open, and the calls that
+        still come then must not break that off.
+        """
+        if isinstance(error, SystemExit):
+            has_exited, self._has_exited = self._has_exited, True
+            return not has_exited
+        return isinstance(error, KeyboardInterrupt)
 
     def _end(self) -> None:
         self._kept.discard(self)
@@ -199,9 +240,15 @@ class Calls:
             self._over.set_result(None)
 
     async def done(self) -> None:
-        """Wait until the queue, which is closed, is empty and all calls were made, unless one of them asks for it.
+        """Wait until the queue, which is closed, is empty and all calls were made.
 
-        None is made in another event loop than theirs, nor in a forked child.
+        Returns at once within a callback, this one or any other, and in tasks that it has started: two callbacks that
+        close each other would wait for ever. No call is made in another event loop than theirs, nor in a forked child.
         """
-        if self.loop is asyncio.get_running_loop() and self._awaited is not asyncio.current_task():
+        caller = _current_call.get()
+        if self.loop is asyncio.get_running_loop() and (caller is None or caller.done()):
             await asyncio.wait([self._over])
+
+
+def _raise(error: BaseException) -> None:
+    raise error

@@ -304,7 +304,8 @@ class CallbackSubscriber(SilentSubscriber):
     Called as `callback(data, updated_path, **kwargs)`, the first two by name where it has these
     names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
     which path was updated, such as "callback_channel.number". Calls are made one after the other,
-    in order. An exception in one is logged and does not end the subscription. If calls are slower
+    in order. An exception in one is logged and does not end the subscription. SystemExit and
+    KeyboardInterrupt leave the event loop, as from any callback of asyncio. If calls are slower
     than updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
     `data` may have later ones in it already, which are called for too.
 
@@ -365,7 +366,10 @@ class CallbackSubscriber(SilentSubscriber):
         return Caller(self.channel, self._call, self.kwargs)
 
     async def close(self) -> None:
-        """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""
+        """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent.
+
+        Within a callback it does not wait, in asyncio also not for calls of other subscribers.
+        """
         await super().close()
         if self._calls is not None:
             await self._calls.done()

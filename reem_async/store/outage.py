@@ -12,6 +12,7 @@ so what is kept is sent before anything later, and nothing is kept that nobody w
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import time
@@ -57,6 +58,10 @@ _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
 """What a call raises in an outage; but for TlsRefused, a NotConnected that no waiting mends."""
 
 
+_Place = tuple[Path, int]
+"""A path, and how many items had been removed from its outermost list before."""
+
+
 class _Kept(NamedTuple):
     """An assignment that is sent later.
 
@@ -72,7 +77,11 @@ class _Kept(NamedTuple):
 
 
 class _Out:
-    """A top-level key that is out of reach, and what is kept of it: by path, in the order of the calls.
+    """A top-level key that is out of reach, and what is kept of it, in the order of the calls.
+
+    A newer value of a place replaces older ones of the same place and inside it. An index of a list names another item
+    after an item was removed. So a removal of an item is never replaced by another one, and what was kept of the
+    list's items before it is not replaced by what comes after it. Only a new list, or what is around it, replaces both.
 
     Attributes:
         sending: How many are on their way and not among those kept.
@@ -80,23 +89,39 @@ class _Out:
 
     def __init__(self, writer: DocumentWriter) -> None:
         self.writer = writer
-        self.kept: dict[Path, _Kept] = {}
+        self.kept: dict[_Place, _Kept] = {}
         self.size = 0
         self.sending = 0
+        self._removals: dict[Path, int] = {}  # of items, by the outermost list
 
-    def put(self, it: _Kept) -> None:
-        self.kept[it.assignment.path] = it
+    def put(self, it: _Kept) -> int:
+        """Keep an assignment in place of those that it replaces; returns how many these are."""
+        path = it.assignment.path
+        outermost = _outermost_list(path)
+        place = path, self._removals.get(outermost, 0) if outermost is not None else 0
+        replaced = [each for each in self.kept if below(each[0], path) and (outermost is None or each[1] == place[1])]
+        for each in replaced:
+            self.pop(each)
+        self.kept[place] = it
         self.size += it.size
+        if outermost is not None and it.assignment.text is None and isinstance(path[-1], int):
+            self._removals[outermost] = place[1] + 1
+        return len(replaced)
 
-    def pop(self, path: Path) -> _Kept:
-        it = self.kept.pop(path)
+    def pop(self, place: _Place) -> _Kept:
+        it = self.kept.pop(place)
         self.size -= it.size
         return it
 
-    def put_back(self, it: _Kept) -> None:
+    def put_back(self, place: _Place, it: _Kept) -> None:
         """Keep it again, before all others."""
-        self.kept = {it.assignment.path: it, **self.kept}
+        self.kept = {place: it, **self.kept}
         self.size += it.size
+
+
+def _outermost_list(path: Path) -> Path | None:
+    """Return the path of the outermost list that a path names an item of, None if there is none."""
+    return next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
 
 
 class Outage:
@@ -122,7 +147,9 @@ class Outage:
         self._out: dict[str, _Out] = {}  # by document
         self._dropped: dict[str, int] = {}  # likewise: counted in a key's turn, so that threads lose no count
         self._told = 0  # how many were dropped when the last outage began
-        self._asking = False
+        self._asking: asyncio.AbstractEventLoop | bool = (
+            False  # a task asks whether the server is back, in this event loop
+        )
         self._away = False  # the server has not answered since it was last called or asked
 
     @classmethod
@@ -208,12 +235,8 @@ class Outage:
             self._drop(writer.keys, len(assignments))
             return
         for it in assignments:
-            replaced = [place for place in out.kept if below(place, it.path)]
-            for place in replaced:
-                out.pop(place)
             own = _owned(it)
-            out.put(_Kept(own, _size(own), called))
-            self._drop(writer.keys, len(replaced))
+            self._drop(writer.keys, out.put(_Kept(own, _size(own), called)))
         while out.kept and sum([each.size for each in list(self._out.values())]) > _MOST:
             out.pop(next(iter(out.kept)))
             self._drop(writer.keys, 1)
@@ -232,9 +255,14 @@ class Outage:
 
     def _have_asked(self) -> None:
         """Have a task ask whether the server is back, if none does."""
-        if self._asking or not self._out:
+        if not self._out:
             return
-        self._asking = True
+        if self._asking is True or (self._asking and not self._asking.is_closed()):
+            return
+        try:
+            self._asking = asyncio.get_running_loop()
+        except RuntimeError:  # in the blocking front
+            self._asking = True
         try:
             self._session.tasks.start(self._until_back(), "reem outage")
         except BaseException:
@@ -242,7 +270,7 @@ class Outage:
             raise
 
     async def _until_back(self) -> None:
-        tries = 0
+        tries, asking = 0, self._asking
         try:
             while self._out and not await self._all_sent():
                 await self._session.transport.pause(_PAUSES[min(tries, len(_PAUSES) - 1)])
@@ -250,7 +278,8 @@ class Outage:
         except InterfaceClosed:  # `close` counts what was kept
             return
         finally:
-            self._asking = False
+            if self._asking is asking:  # else a closed event loop ended this, and the next one has a task of its own
+                self._asking = False
         if self._out:  # a call has come just before
             self._have_asked()
             return
@@ -291,7 +320,8 @@ class Outage:
         keys = out.writer.keys
         while out.kept:
             out.sending = 1
-            it = out.pop(next(iter(out.kept)))  # first: whatever happens now, it is not sent twice
+            place = next(iter(out.kept))
+            it = out.pop(place)  # first: whatever happens now, it is not sent twice
             turn.time = it.time
             try:
                 await out.writer.send(turn, [it.assignment])
@@ -299,7 +329,7 @@ class Outage:
                 continue
             except (NotConnected, ServerNotReady):
                 turn.not_sent(1)
-                out.put_back(it)
+                out.put_back(place, it)
                 raise
             except BaseException as error:
                 self._count(keys, 1)

@@ -334,6 +334,7 @@ class PublishSpace(KeyValueStore):
     - "drop": What is published is dropped, and counted in `dropped`.
     - "newest": The newest update of each place is kept, with the bytes and the time of its call, and sent when the
       server is back, in the order of the calls, each by itself; what a newer one replaces is counted in `dropped`.
+      Removals of list items are all kept, since an index names another item after each of them.
       Of more than 256 MB of values, in all, the oldest of a key go first, and are counted.
 
     Nothing is applied twice: an update that was under way when the connection broke was applied or not, is not sent

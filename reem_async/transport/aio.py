@@ -139,12 +139,13 @@ class AsyncTransport:
         return await asyncio.shield(opening)
 
     async def _open_lane(self, bulk: bool) -> Wire:
+        task = asyncio.current_task()
         try:
             wire = self._lanes[bulk] = await self._opened(large=bulk)
             return wire
         finally:
             # Not if all was forgotten meanwhile, and another attempt has begun since.
-            if self._opening.get(bulk) is asyncio.current_task():
+            if self._opening.get(bulk) is task:
                 del self._opening[bulk]
 
     async def _opened(
