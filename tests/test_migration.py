@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
+import shlex
 
 import numpy as np
 import oldkit
@@ -49,6 +51,14 @@ def check(kvs, version, only=None):
     for name, value in stored(version).items():
         if only is None or name in only:
             assert_same(kvs[name].read(), value, name)
+
+
+def old_array(raw, name, place, array):
+    """As REEM 0.1 stored an array: a hash named after document and place, which the second document names."""
+    raw.hset(name + place, mapping={"arr": array.tobytes(), "dtype": str(array.dtype), "shape": str(array.shape)})
+    raw.execute_command("JSON.SET", f"{name}&&&&metadata", "$", '{"special_paths":{}}', "NX")
+    path = f"$.special_paths[{json.dumps(place)}]"
+    raw.execute_command("JSON.SET", f"{name}&&&&metadata", path, '"default_numpy_handler"')
 
 
 def old_keys(raw):
@@ -515,3 +525,27 @@ def test_an_old_rdb_file_comes_by_reem_up_from(own, raw, tmp_path):
     with EmbeddedServer(0, None, None, file) as started, reem.RedisInterface(started, ships=ships()) as interface:
         assert migrate(interface).problems == ()
         check(reem.KeyValueStore(interface), "reem_0_1_2")
+
+
+@pytest.mark.parametrize("entry", ["x1", "it's", "x[0]"])
+@pytest.mark.parametrize("arrays", ["", "r", "e", "re", "n"])
+@pytest.mark.parametrize("which", ["value", "entry"])
+def test_a_value_with_an_entry_beside_it_is_converted_after_what_the_message_says(kvs, raw, entry, arrays, which):
+    """Value and entry are plain or arrays (`n`: an array inside the entry); the command deletes just the one."""
+    root, beside = np.arange(4) if "r" in arrays else 5, np.arange(3) if "e" in arrays else 7
+    beside = {"deep": np.arange(2), "n": 1} if "n" in arrays else beside
+    document = {} if "r" in arrays else {"%%%%ROOT%%%%": root}
+    document |= {} if "e" in arrays else {entry: {"n": 1} if "n" in arrays else beside}
+    raw.execute_command("JSON.SET", "foo", "$", json.dumps(document))
+    for place, value in ((".%%%%ROOT%%%%", root), (f".{entry}", beside), (f".{entry}.deep", np.arange(2))):
+        if isinstance(value, np.ndarray) and ("n" in arrays or not place.endswith("deep")):
+            old_array(raw, "foo", place, value)
+    (key,) = migrate(kvs.interface).problems
+    commands = re.findall(r"with `([^`]*)`", key.problem)[which == "entry"]
+    for command in commands.split(" && "):
+        program, *words = shlex.split(command)
+        assert program == "redis-cli"
+        assert raw.execute_command(*words) == 1, command
+    assert migrate(kvs.interface).problems == ()
+    assert_same(kvs["foo"].read(), root if which == "entry" else {entry: beside})
+    assert old_keys(raw) == []

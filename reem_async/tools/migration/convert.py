@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+import shlex
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -11,8 +12,8 @@ from ...connection import RedisInterface
 from ...errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
 from ...plan import Command, Plan, Reply
 from ...plan.changes import EncodedAttachment, Telling
-from ...plan.olddata import METADATA, special_paths
-from ...plan.paths import Path, check_top_key
+from ...plan.olddata import METADATA, candidates, special_paths
+from ...plan.paths import Path, check_top_key, to_jsonpath
 from ...plan.patterns import Pattern
 from ...plan.placeholders import Placeholder, Slot
 from ...plan.reads import RawRead, get_command, read
@@ -186,6 +187,8 @@ class _Converter:
         found = special_paths(second)
         labels = found or {}
         raw_read = await self._sealed()
+        # Before the ships' values are put into it.
+        tops = set(raw_read.holder[0]) if raw_read.holder and isinstance(raw_read.holder[0], dict) else set()
         tree = Tree(raw_read.holder, [(slot.container, slot.key) for slot, _, _ in raw_read.slots])
         # A ship of today holds something there: written since, so it is newer than what the old one has.
         missing = {place: label for place, label in labels.items() if not tree.holds(place)}
@@ -194,7 +197,7 @@ class _Converter:
         put = [place for place in sorted(missing) if tree.put(place, await self._value(place, missing[place]))]
         if raw_read.slots:
             await opened(raw_read)
-        root = tree.root()
+        root = tree.root(lambda entry: self._deletion(entry, entry in tops, labels))
         rooted = root is not raw_read.holder
         # The second document last: while it is there, another run knows what there is to remove.
         gone = [*(self.keys.document + place for place in labels), *self._key.stale]
@@ -205,6 +208,13 @@ class _Converter:
         if gone and not dry_run and not removed_with_it:
             await self._remove(gone)
         return Migrated(self.name, tuple(put), rooted, tuple(gone), tuple(self._key.lost))
+
+    def _deletion(self, entry: str, in_document: bool, places: Iterable[str]) -> str:
+        """Return the commands that delete an entry: from the document, and what the second document names in it."""
+        paths: list[tuple[str, Path]] = [(self.keys.document, (entry,))] if in_document else []
+        inside = [place for place in places if any(path[:1] == (entry,) for path in candidates(place))]
+        paths += [(self._second, ("special_paths", place)) for place in inside]
+        return " && ".join([shlex.join(["redis-cli", "JSON.DEL", name, to_jsonpath(path)]) for name, path in paths])
 
     async def _replies(self, commands: Sequence[Command]) -> Sequence[Reply]:
         if not commands:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -111,8 +111,10 @@ class Tree:
                 return True
         return False
 
-    def root(self) -> list[Any]:
+    def root(self, deletion: Callable[[str], str]) -> list[Any]:
         """Return the whole value in a list of one, empty if there is none; taken out of the dict made for it.
+
+        `deletion` returns what deletes an entry of the old key, to be told where there is one too many.
 
         Raises:
             BadData: There are entries beside it, which old programs read by path only.
@@ -123,7 +125,7 @@ class Tree:
         if others:
             raise BadData(
                 f"it holds both a value and, beside it, {', '.join(map(shorten, others[:3]))}, which no key can any "
-                f"more; delete one: redis-cli JSON.DEL KEY '$[\"{ROOT}\"]' or JSON.DEL KEY '$[\"{others[0]}\"]'"
+                f"more; delete the value with `{deletion(ROOT)}`, or {shorten(others[0])} with `{deletion(others[0])}`"
             )
         return [self._holder[0][ROOT]]
 
