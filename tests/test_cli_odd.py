@@ -82,12 +82,23 @@ def test_no_name_of_an_array_is_special_to_a_file(tmp_path):
         assert_same({name: found[name] for name in found.files}, value)
 
 
-@pytest.mark.parametrize("kind", ["a/b", "", "xml"])
-def test_a_format_of_an_export_that_there_is_not(tmp_path, kind):
-    """It became a part of the file's name first, and some cannot."""
-    run = CliRunner().invoke(build(), ["log", "export", str(tmp_path / "run.mcap"), "--to", kind], prog_name="reem")
-    assert (run.exit_code, run.stderr) == (2, f"reem log export: {kind!r} is none of csv, npz, parquet\n")
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        *[(["--to", kind], f"{kind!r} is none of csv, npz, parquet") for kind in ("a/b", "", "xml")],
+        (["-o", "run.txt"], "no format is known by the name run.txt"),
+        (["-o", "run.npz", "--to", "csv"], "--to csv does not fit the name run.npz"),
+        (["-o", "-", "--to", "npz"], "npz is not text"),
+        (["-o", "-", "--json"], "name a file with -o"),
+    ],
+)
+def test_a_format_of_an_export_that_there_is_not(tmp_path, options, said):
+    """It is refused before the recording is opened, and before it becomes a part of a file's name."""
+    run = CliRunner().invoke(build(), ["log", "export", str(tmp_path / "run.mcap"), *options], prog_name="reem")
+    assert run.exit_code == 2
+    assert run.stderr.startswith(f"reem log export: {said}") or said in run.stderr
     assert isinstance(run.exception, SystemExit)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_link_to_a_file_stays_a_link(tmp_path):

@@ -140,6 +140,13 @@ def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
     assert np.load(tmp_path / "run.npz")[f"{key('a')}.n"].tolist() == list(range(11))
     run = reem("log", "export", file, "--to", "npz")
     assert (run.returncode, "there already" in run.stderr) == (2, True)
+    assert reem("log", "export", file, "-o", tmp_path / "by_name.npz").returncode == 0
+    assert np.load(tmp_path / "by_name.npz").files
+    run = reem("log", "export", file, "-o", "-")
+    assert (run.returncode, run.stderr.count("\n"), run.stdout.count("\n")) == (0, 1, 12), "a note on the picture"
+    assert run.stdout.startswith("time,")
+    assert not (tmp_path / "-").exists()
+    assert reem("record", "-o", "-").returncode == 2
 
 
 def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
@@ -149,6 +156,8 @@ def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
     data = bytearray(file.read_bytes())
     data[info.offset + info.length - 5] ^= 1
     file.write_bytes(data)
+    info = reem("log", "info", file, "--verify")
+    assert (info.returncode, "1 records are damaged or missing" in info.stdout) == (1, True)
     play = reem("play", file, "--rate", "100")
     assert (play.returncode, "left out (see reem log info --verify)" in play.stdout) == (1, True)
     assert json.loads(reem("play", file, "--rate", "100", "--json").stdout.splitlines()[-1])["unreadable"] > 0

@@ -19,7 +19,7 @@ from reem_async.pubsub.division import Division, Heard
 from reem_async.pubsub.fetching import divided_read
 from reem_async.pubsub.gaps import Numbers
 from reem_async.tools.recording.key_queue import KeyQueue
-from reem_async.tools.recording.order import Item, skipped
+from reem_async.tools.recording.order import Item
 from reem_async.tools.recording.state import applied
 from reem_async.tools.recording.stored import New, Unchanged
 
@@ -73,7 +73,7 @@ class World:
         self.stored = self.replaced = 0  # how often something was stored, and before the last update of all
         self.delivered, self.lost, self.written = [], [], []
         self.arrived = 0  # the log time of what arrived last
-        self.failed = False
+        self.behind = False  # a read has failed, and the key is to be read anew some time
         self.read()
 
     def add(self, numbers, publisher, path, value, *, deleted, tree):
@@ -138,10 +138,14 @@ class World:
                 self.read()
         except (NotConnected, Conflict):
             self.reading = self.waits = None
-            head = self.queue.items.popleft()
-            if head.role == "update":
-                self.written.append(skipped(head))
-            self.read()
+            head = self.queue.give_up()
+            if head.role == "skip":
+                self.written.append(head)
+            self.behind = True
+
+    def catch_up(self):
+        self.behind = False
+        self.read()
 
     # --- what may happen next
 
@@ -155,6 +159,8 @@ class World:
             choices.append(self.write)
         if self.stream and self.rng.random() < self.faults.breaks:
             choices.append(self.reconnect)
+        if self.behind:
+            choices.append(self.catch_up)
         if not choices:
             return False
         self.rng.choice(choices)()
@@ -291,6 +297,7 @@ SCHEDULES = {
     "reconnected": Faults(loses=0.01, breaks=0.1),
     "failing reads": Faults(fails=0.2),
     "stored": Faults(stores=0.3),
+    "stored and failing reads": Faults(fails=0.5, stores=0.5),
     "stored and lost": Faults(stores=0.3, loses=0.2),
     "everything": Faults(loses=0.1, repeats=0.1, breaks=0.05, fails=0.1, stores=0.2),
 }

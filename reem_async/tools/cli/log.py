@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import datetime
+import shutil
+import sys
+import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reem_async.errors import BadValue
 from reem_async.tools.cli.bar import progress_bar
 from reem_async.tools.cli.options import AsJson, Force
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, size_text, styled
@@ -27,6 +31,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
+_STDOUT = Path("-")
+
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
 
 
@@ -36,7 +42,10 @@ def info(
     verify: Annotated[bool, typer.Option("--verify", help="Read all of the file and count what is damaged.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show what a recording holds: when, what, how often, how much, and what is missing."""
+    """Show what a recording holds: when, what, how often, how much, and what is missing.
+
+    The exit code is 1 if a part of the file was found to be damaged or missing.
+    """
 
     def work() -> int:
         with ExitStack() as stack:
@@ -49,7 +58,7 @@ def info(
                 emit_json(_summary(log, channels))
             else:
                 _print(log, channels)
-            return 1 if verify and log.damaged else 0
+            return 1 if log.damaged else 0
 
     _guard("log info", work)
 
@@ -82,7 +91,7 @@ def _channel(each: ChannelSummary) -> dict[str, Any]:
 
 def _print(log: Log, channels: list[ChannelSummary]) -> None:
     metadata = log.metadata
-    damage = f"; {log.damaged} damaged records are skipped" if log.damaged else ""
+    damage = f"; {log.damaged} records are damaged or missing" if log.damaged else ""
     complete = "complete" if log.indexed else "not ended properly: the last second may be missing"
     # First what was recorded, then what REEM notes of it.
     order = sorted(channels, key=lambda each: each.topic.startswith("/_reem"))
@@ -147,11 +156,20 @@ def export(
         list[str] | None,
         typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
     ] = None,
-    to: Annotated[str, typer.Option("--to", metavar="FORMAT", help="csv, npz or parquet.")] = "csv",
+    to: Annotated[
+        str | None,
+        typer.Option(
+            "--to", metavar="FORMAT", show_default=False, help="csv, npz or parquet; else the end of FILE, or csv."
+        ),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="The file; the recording's name with another end if not given."
+            "--output",
+            "-o",
+            metavar="FILE",
+            show_default=False,
+            help="The file; - is the standard output, for csv. The recording's name with another end if not given.",
         ),
     ] = None,
     force: Force = False,
@@ -165,13 +183,20 @@ def export(
 
     def work() -> int:
         open_log = tools("open_log")
-        from reem_async.tools.recording.export import check_format
         from reem_async.tools.recording.export import export as write
 
-        check_format(to)  # before it becomes a part of a name
-        with open_log(file) as log:
-            target = output or file.with_suffix(f".{to}")
-            result = write(log, to, target, patterns or ["*"], overwrite=force)
+        kind, to_stdout = _format(to, output), output == _STDOUT
+        if to_stdout and as_json:
+            raise BadValue("--json and the export would both be on the standard output; name a file with -o")
+        with open_log(file) as log, ExitStack() as stack:
+            target = output or file.with_suffix(f".{kind}")
+            if to_stdout:
+                target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "export"
+            result = write(log, kind, target, patterns or ["*"], overwrite=force)
+            size = target.stat().st_size
+            if to_stdout:
+                with target.open(encoding="utf-8", newline="") as text:
+                    shutil.copyfileobj(text, sys.stdout)
         for path, why in result.left_out.items():
             note(f"left out: {path}: {why}")
         if result.time != "time":
@@ -181,12 +206,25 @@ def export(
         if as_json:
             names = ("rows", "columns", "left_out", "time", "unreadable")
             emit_json({"file": str(target)} | {name: getattr(result, name) for name in names})
-        else:
-            emit(
-                clean(
-                    f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(target.stat().st_size)}"
-                )
-            )
+        elif not to_stdout:
+            emit(clean(f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(size)}"))
         return 1 if result.unreadable else 0
 
     _guard("log export", work)
+
+
+def _format(to: str | None, output: Path | None) -> str:
+    """Return the format of an export; BadValue if there is none of this name, or the file's name is that of another."""
+    from reem_async.tools.recording.export import FORMATS, check_format
+
+    end = "" if output is None else output.suffix.removeprefix(".").lower()
+    by_name = "csv" if output in (None, _STDOUT) else end
+    kind = by_name if to is None else to
+    if to is None and kind not in FORMATS:
+        raise BadValue(f"no format is known by the name {output}; let it end in .csv, .npz or .parquet, or give --to")
+    check_format(kind)
+    if end in FORMATS and end != kind:
+        raise BadValue(f"--to {kind} does not fit the name {output}; leave out --to, or choose another name")
+    if output == _STDOUT and kind != "csv":
+        raise BadValue(f"{kind} is not text and is not written to the standard output; name a file with -o")
+    return kind

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
+from reem_async.errors import BadValue
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Patterns, Url, existing
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
 from reem_async.tools.cli.running import Refused, prepared, run
@@ -125,6 +126,8 @@ def _recorder(
     compression: str,
     force: bool,
 ) -> Recorder:
+    if output == Path("-"):
+        raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
     kind = prepared("record", lambda: tools("Recorder"))
     # Refused here if the file is there already: nothing was sent for it yet.
     recorder: Recorder = kind(

@@ -1,33 +1,66 @@
-"""Reading an MCAP file by its index, and without one: any file that was cut short or damaged opens too.
+"""The messages of an MCAP file, whichever of the format's optional parts its writer has left out.
 
-The library reads the summary and the records; what is done here is to find single messages without taking
-whole chunks apart, to make the index of a file that has none, and to leave out what is damaged.
+With a complete summary only the end of the file is read. Otherwise the file is read from record to record once: its
+recorder was killed, or another tool has written it without chunks, without indexes, or without a summary. What is
+damaged is left out and counted: a whole chunk, or all that follows a damaged record outside of chunks.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import struct
 import threading
+import zlib
 from collections import OrderedDict
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
+import orjson
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
 
 from .errors import DamagedRecording
-from .index import Index, index_of, parse_index, record_starts
-from .records import MESSAGE, checked, take_records, unpacked
-from .scan import Scan, Told
-from .sink import TOTALS
-from .source import Source
-from .summary import MAGIC, ChunkInfo, index_places, read_summary
+from .mcap_reader import (
+    HEAD,
+    MAGIC,
+    ChunkInfo,
+    Contents,
+    Footer,
+    Index,
+    Source,
+    index_of,
+    index_places,
+    parse_index,
+    read_footer,
+    read_summary,
+    record_starts,
+)  # fmt: skip
+from .sink import CHANNELS, TOTALS
 
-__all__ = ["ChunkInfo", "Container", "Message", "Told"]
+__all__ = ["Container", "Message", "Progress", "noted"]
 
 # Unpacked chunks that are kept: neighbours in time are asked for together.
 _CACHED_BYTES = 96 << 20
 _CACHED_ENTRIES = 4 << 20
 """Messages of which the places are kept, 16 bytes for each."""
+_LARGEST_CHUNK = 1 << 31
+"""Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
+_BARE_BYTES = 1 << 20
+"""Bytes of messages outside of chunks that are read as one chunk."""
+# Head of the record, channel, sequence, log time, publish time; the data follow.
+_MESSAGE = struct.Struct("<BQHIQQ")
+# Head of the record, checksum of all before it.
+_DATA_END = struct.Struct("<BQI")
+
+Progress = Callable[[int, int], None]
+"""Called with how much of something is done, and how much there is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +74,147 @@ class Message:
     data: bytes
 
 
+def _unpacked(source: Source, info: ChunkInfo) -> bytes | None:
+    """Return the content of a chunk, None if it is damaged."""
+    if info.bare:
+        return source.read(info.offset, info.length)
+    body = source.read(info.offset + HEAD.size, info.length - HEAD.size)
+    try:
+        chunk = Chunk.read(ReadDataStream(io.BytesIO(body)))
+        if chunk.uncompressed_size > _LARGEST_CHUNK or chunk.message_start_time != info.start:
+            return None
+        # The checksum is of the unpacked bytes, so damage in what unpacks well is found too.
+        stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+        content = stream.read(length)
+    except Exception:  # zstandard and lz4 have errors of their own for what is damaged
+        return None
+    return content if len(content) == chunk.uncompressed_size else None
+
+
+def _take_records(content: bytes, contents: Contents) -> Index | None:
+    """Take the schemas and channels out of a chunk; return the index of its messages, None if it is damaged."""
+    places: dict[int, list[tuple[int, int]]] = {}
+    position = 0
+    try:
+        while position < len(content):
+            opcode, length = HEAD.unpack_from(content, position)
+            start, end = position + HEAD.size, position + HEAD.size + length
+            if end > len(content):
+                return None
+            if opcode == Opcode.MESSAGE:
+                _, _, channel_id, _, log_time, _ = _MESSAGE.unpack_from(content, position)
+                places.setdefault(channel_id, []).append((log_time, position))
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                stream = ReadDataStream(io.BytesIO(content[start:end]))
+                record, known = (
+                    (Schema.read(stream), contents.schemas)
+                    if opcode == Opcode.SCHEMA
+                    else (Channel.read(stream), contents.channels)
+                )
+                # A number has one meaning in the whole file.
+                if known.setdefault(record.id, record) != record:
+                    return None
+            position = end
+    except (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError):
+        return None
+    return index_of(places)
+
+
+class _Scan:
+    """Reads a file from record to record, as far as it is whole.
+
+    Attributes:
+        contents: What was found.
+        damaged: How many records are damaged or cut off.
+        is_whole: The data section ends where it should.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.contents = Contents()
+        self.damaged = 0
+        self.is_whole = False
+        self._source = source
+        self._size = source.size
+
+    def run(self, footer: Footer | None, progress: Progress | None) -> None:
+        """Read the file."""
+        position, source = len(MAGIC), self._source
+        bare = position  # since where there have been messages outside of chunks
+        while position + HEAD.size <= self._size:
+            opcode, length = HEAD.unpack(source.peek(position, HEAD.size))
+            end = position + HEAD.size + length
+            # What follows a damaged head could be anything.
+            if opcode == 0 or end > self._size:
+                break
+            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE) or position - bare >= _BARE_BYTES:
+                self._take_bare(bare, position)
+                bare = position
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                self.is_whole = footer is None or end == footer.data_end or opcode == Opcode.FOOTER
+                self.damaged += not self.is_whole
+                break
+            if opcode == Opcode.CHUNK:
+                end = self._take_chunk(position, end)
+            elif opcode == Opcode.METADATA:
+                self._take_metadata(position + HEAD.size, end)
+            position = end
+            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+                bare = position
+            if progress is not None:
+                progress(position, self._size)
+        else:
+            opcode = 0
+        if opcode not in (Opcode.DATA_END, Opcode.FOOTER):
+            self._take_bare(bare, position)
+            self.damaged += position < self._size
+        self.damaged += self.contents.unknown()
+
+    def _take_bare(self, start: int, end: int) -> None:
+        """Take messages that are outside of chunks as one chunk."""
+        info = ChunkInfo(0, 0, 0, start, end - start, end, 0, np.empty(0, np.uint16), bare=True)
+        if end > start:
+            self._take_content(info)
+
+    def _take_content(self, info: ChunkInfo) -> None:
+        """Take a chunk without an index: its content says what it has."""
+        content = _unpacked(self._source, info)
+        found = None if content is None else _take_records(content, self.contents)
+        if found is None or (len(found.times) and not info.bare and found.span() != (info.start, info.end)):
+            self.damaged += 1
+        elif len(found.times):
+            first, last = found.span()
+            chunk = replace(info, start=first, end=last, index_length=0, channels=found.channels)
+            self.contents.chunks.append(chunk)
+
+    def _take_chunk(self, position: int, end: int) -> int:
+        """Take a chunk with the index behind it; return where that ends."""
+        start, last = struct.unpack("<QQ", self._source.peek(position + HEAD.size, 16))
+        index = end
+        while index + HEAD.size <= self._size:
+            opcode, length = HEAD.unpack(self._source.peek(index, HEAD.size))
+            if opcode != Opcode.MESSAGE_INDEX or index + HEAD.size + length > self._size:
+                break
+            index += HEAD.size + length
+        info = ChunkInfo(0, start, last, position, end - position, end, index - end, np.empty(0, np.uint16))
+        # Where the file ends there, a part of the index may be missing.
+        is_whole = index + HEAD.size <= self._size and opcode != Opcode.MESSAGE_INDEX
+        text = self._source.read(end, index - end)
+        found = parse_index(text, record_starts(text), start, last) if is_whole else None
+        known = found is not None and found.span() == (start, last)
+        if found is not None and known and self.contents.channels.keys() >= set(found.channels.tolist()):
+            self.contents.chunks.append(replace(info, channels=found.channels))
+        else:  # it brings new channels, or has no index
+            self._take_content(info)
+        return index
+
+    def _take_metadata(self, start: int, end: int) -> None:
+        try:
+            record = Metadata.read(ReadDataStream(io.BytesIO(self._source.read(start, end - start))))
+            self.contents.metadata.append(record)
+        except (McapError, ValueError, struct.error, EOFError):
+            self.damaged += 1
+
+
 class Container:
     """An MCAP file.
 
@@ -48,23 +222,23 @@ class Container:
 
     Args:
         path: The file.
-        progress: Is told the bytes gone through and all of them, if there is no summary.
+        progress: Called with the bytes read and all of them, if the file is read from record to record.
 
     Attributes:
-        every_chunk: All chunks, in the order of the file, by number.
+        every_chunk: All chunks, in order of their first log times, by number.
         lost: The numbers of those found to be damaged.
-        channels: By number.
+        channels: By number, as the channel records of the file describe them.
         schemas: By number.
         metadata: The metadata records, in the order of the file.
-        indexed: The file has a summary: it was closed properly.
-        damaged: How many records were found to be damaged, or cut off.
+        indexed: The file was closed properly.
+        damaged: How many records were found to be damaged, cut off or missing.
 
     Raises:
         DamagedRecording: Not an MCAP file.
         OSError: It cannot be read.
     """
 
-    def __init__(self, path: FilePath, progress: Told | None = None) -> None:
+    def __init__(self, path: FilePath, progress: Progress | None = None) -> None:
         self.path = path
         self.damaged = 0
         self.lost: set[int] = set()
@@ -73,25 +247,31 @@ class Container:
         self._cached = 0
         self._indexes: OrderedDict[int, Index] = OrderedDict()
         self._entries = 0
-        self._remade: dict[int, Index] = {}
         self._source = Source(path)
         try:
             if self._source.peek(0, len(MAGIC)) != MAGIC:
                 raise DamagedRecording(f"{path} is not an MCAP file; give one that `reem record` wrote")
             self.size = self._source.size
-            # With a summary only the end of the file is read. Without one (the recorder was killed) the whole file is
-            # gone through, which finds all but what was not yet written.
-            summary = read_summary(self._source)
-            self.indexed = summary is not None
-            if summary is None:
-                scan = Scan(self._source)
-                summary = scan.run(progress)
-                self.damaged = scan.damaged
-            self.channels, self.schemas = summary.channels, summary.schemas
-            self.every_chunk, self.metadata = summary.chunks, summary.metadata
+            self._contents = self._read_contents(progress)
         except BaseException:
             self._source.close()
             raise
+        self.channels, self.schemas = self._contents.channels, self._contents.schemas
+        self.metadata = self._contents.metadata
+        # Other tools write chunks in any order; what is asked for is asked by time.
+        chunks = sorted(self._contents.chunks, key=lambda it: (it.start, it.offset))
+        self.every_chunk = [replace(info, number=number) for number, info in enumerate(chunks)]
+
+    def _read_contents(self, progress: Progress | None) -> Contents:
+        footer = read_footer(self._source)
+        self.indexed = footer is not None
+        contents = read_summary(self._source, footer)
+        if contents is not None:
+            return contents
+        scan = _Scan(self._source)
+        scan.run(footer, progress)
+        self.damaged = scan.damaged + (footer is not None and footer.text is None)
+        return scan.contents
 
     def close(self) -> None:
         """Close the file. Idempotent."""
@@ -102,23 +282,18 @@ class Container:
 
     @property
     def chunks(self) -> list[ChunkInfo]:
-        """All chunks but those found to be damaged, in the order of the file."""
+        """All chunks but those found to be damaged, in order of their first log times."""
         return [info for info in self.every_chunk if info.number not in self.lost] if self.lost else self.every_chunk
 
-    @property
-    def left_out(self) -> int:
-        """How many of the damaged records had to be left out; indexes are made anew."""
-        return self.damaged - len(self._remade)
-
     def content(self, info: ChunkInfo) -> bytes | None:
-        """Return the content of a chunk; None, and the chunk is taken out and counted, if it is damaged."""
+        """Return the content of a chunk; None, and the chunk is left out and counted, if it is damaged."""
         with self._lock:
             if info.number in self._cache:
                 self._cache.move_to_end(info.number)
                 return self._cache[info.number]
-            content = unpacked(self._source, info)
+            content = _unpacked(self._source, info)
             if content is None:
-                self.discard(info)
+                self._discard(info)
                 return None
             self._cache[info.number] = content
             self._cached += len(content)
@@ -127,24 +302,25 @@ class Container:
                 self._cached -= len(self._cache.popitem(last=False)[1])
             return content
 
-    def discard(self, info: ChunkInfo) -> None:
-        """Take out a chunk that is damaged."""
+    def _discard(self, info: ChunkInfo) -> None:
+        """Leave out a chunk that is damaged, and count it."""
         with self._lock:
             self.damaged += info.number not in self.lost
             self.lost.add(info.number)
 
     def index(self, info: ChunkInfo) -> Index:
-        """Return when the messages of a chunk were received and where they are in it, by channel."""
+        """Return when the messages of a chunk were received and where they are in it, by channel.
+
+        If the chunk turns out to be damaged, it has no messages.
+        """
         with self._lock:
-            if info.number in self._remade:
-                return self._remade[info.number]
             if info.number in self._indexes:
                 self._indexes.move_to_end(info.number)
                 return self._indexes[info.number]
             index = self._read_index(info)
             if index is None:
-                content = self.content(info)
-                index = index_of({}) if content is None else take_records(content, self.schemas, self.channels)
+                self._discard(info)
+                index = index_of({})
             self._indexes[info.number] = index
             self._entries += len(index.times)
             while self._entries > _CACHED_ENTRIES and len(self._indexes) > 1:
@@ -152,70 +328,102 @@ class Container:
             return index
 
     def _read_index(self, info: ChunkInfo) -> Index | None:
-        """Return the index as it is in the file, None if there is none or it is damaged."""
-        text = self._source.read(info.index, info.index_length)
-        starts = index_places(self._source, info) if info.map else np.array(record_starts(text), np.int64)
-        index = parse_index(text, starts, info.start, info.end)
-        if index is None or np.array_equal(index.channels, info.channels):
-            return index
-        return index if np.array_equal(np.sort(index.channels), np.sort(info.channels)) else None
+        """Return the index of a chunk, made of its content if the file has none; None if it is damaged."""
+        if not info.index_length:
+            content = self.content(info)
+            index = None if content is None else _take_records(content, self._contents)
+        else:
+            text = self._source.read(info.index, info.index_length)
+            starts = index_places(self._source, info) if info.map else record_starts(text)
+            index = parse_index(text, starts, info.start, info.end)
+        if index is None or not np.array_equal(np.sort(index.channels), np.sort(info.channels)):
+            return None
+        return index
 
     def message(self, info: ChunkInfo, channel: int, offset: int, log_time: int) -> Message | None:
-        """Return a message that the index of a chunk names.
-
-        None if that was wrong: the chunk is damaged, and was taken out, or its index is, and was made anew.
-        Look it up again then.
-        """
+        """Return a message that the index of a chunk names; None, and the chunk is left out, if that is damaged."""
         content = self.content(info)
         if content is None:
             return None
-        # 31: head of the record (9), then channel, sequence, log time and publish time (2 + 4 + 8 + 8).
-        if offset + 31 <= len(content) and content[offset] == MESSAGE:
-            (length,) = struct.unpack_from("<Q", content, offset + 1)
-            found, sequence, time, published = struct.unpack_from("<HIQQ", content, offset + 9)
-            if found == channel and time == log_time and offset + 9 + length <= len(content):
-                return Message(found, time, published, sequence, content[offset + 31 : offset + 9 + length])
-        with self._lock:
-            self.damaged += 1
-            # An index that was made from the chunk itself cannot be wrong: the chunk must be.
-            if info.number in self._remade:
-                self.discard(info)
-            self._remade[info.number] = take_records(content, self.schemas, self.channels)
+        if offset + _MESSAGE.size <= len(content):
+            opcode, length, found, sequence, time, published = _MESSAGE.unpack_from(content, offset)
+            end = offset + HEAD.size + length
+            if opcode == Opcode.MESSAGE and (found, time) == (channel, log_time) and end <= len(content):
+                return Message(found, time, published, sequence, content[offset + _MESSAGE.size : end])
+        self._discard(info)
         return None
 
     def unpacked_size(self, info: ChunkInfo) -> int:
         """Return the bytes of a chunk before compression; a wrong number if it is damaged."""
+        if info.bare:
+            return info.length
         # Behind the head and two times: the size of the content.
-        (size,) = struct.unpack("<Q", self._source.read(info.offset + 9 + 16, 8))
+        (size,) = struct.unpack("<Q", self._source.read(info.offset + HEAD.size + 16, 8))
         return int(size)
 
     def totals(self) -> dict[int, list[int]] | None:
         """Return how many messages each channel has, their bytes, and the first and last log time.
 
-        That is what the recorder has written at the end; None if it has not, or if something is damaged.
+        The recorder notes that at the end. None if it has not, or if its notes do not agree with the channels, the
+        statistics and the chunks of the file: another tool has renumbered, filtered or damaged it.
         """
-        said = [record.metadata for record in self.metadata if record.name == TOTALS]
-        # With damage the recorder's own counts are more than can be read.
-        if self.damaged or len(said) != 1:
+        notes = noted(self.metadata, TOTALS)
+        if self.damaged or not notes or not self.every_chunk:
             return None
         try:
-            rows = checked(said[0])
-            known = all(len(row) == 5 and all(type(each) is int and each >= 0 for each in row) for row in rows)
-            return {row[0]: row[1:] for row in rows} if known else None
-        except (ValueError, KeyError, TypeError):
+            listed = {row[0]: (row[1], row[2], row[4]) for row in noted(self.metadata, CHANNELS)}
+            channels = {it.id: (it.topic, it.message_encoding, it.metadata) for it in self.channels.values()}
+            known = all(len(row) == 5 and all(type(each) is int and each >= 0 for each in row) for row in notes)
+            counts = {row[0]: row[1] for row in notes}
+            span = min(row[3] for row in notes), max(row[4] for row in notes)
+        except (IndexError, TypeError, KeyError):
             return None
+        chunks = self.every_chunk[0].start, max(info.end for info in self.every_chunk)
+        agrees = known and (listed, counts, span) == (channels, self._contents.counts, chunks)
+        return {row[0]: row[1:] for row in notes} if agrees else None
 
-    def verify(self, progress: Told | None = None) -> int:
+    def verify(self, progress: Progress | None = None) -> int:
         """Read every chunk; return how many records of the file are damaged."""
         for info in self.chunks:
             content = self.content(info)
-            if content is not None and info.index_length:
-                made = take_records(content, self.schemas, self.channels)
-                with self._lock:
-                    known = self._read_index(info)
-                    if known is None or not known.same(made):
-                        self.damaged += info.number not in self._remade
-                        self._remade[info.number] = made
+            made = None if content is None else _take_records(content, self._contents)
+            known = self._read_index(info) if made is not None and info.index_length else made
+            if made is None or known is None or not known.same(made):
+                self._discard(info)
             if progress is not None:
                 progress(info.number + 1, len(self.every_chunk))
+        # What is outside of chunks has no checksum but that of all data, if its writer has made one.
+        if not self.damaged and not self._is_sound():
+            self.damaged += 1
         return self.damaged
+
+    def _is_sound(self) -> bool:
+        """Return whether the data section has the checksum that its end names."""
+        footer = read_footer(self._source)
+        if footer is None:
+            return True
+        end = footer.data_end - _DATA_END.size
+        opcode, _, checksum = _DATA_END.unpack(self._source.read(end, _DATA_END.size))
+        if opcode != Opcode.DATA_END or checksum == 0:
+            return True
+        found = 0
+        for start in range(0, end, _BARE_BYTES):
+            found = zlib.crc32(self._source.read(start, min(_BARE_BYTES, end - start)), found)
+        return bool(found == checksum)
+
+
+def noted(metadata: Iterable[Metadata], name: str) -> list[Any]:
+    """Return the rows of the recorder's notes of one name, without what is damaged.
+
+    Other tools copy these notes as they are into files with other channels: they are only to be believed where they
+    agree with the rest of the file.
+    """
+    rows: list[Any] = []
+    for record in metadata:
+        if record.name == name:
+            with contextlib.suppress(ValueError, KeyError):
+                text = record.metadata["channels"].encode()
+                found = orjson.loads(text)
+                if type(found) is list and zlib.crc32(text) == int(record.metadata["crc32"]):
+                    rows += found
+    return rows

@@ -17,8 +17,7 @@ from ...errors import BadData, BadValue
 from ...plan.paths import Path, suffix
 from ...plan.trees import MISSING
 from ..partfile import PartFile, there_already
-from .history import EXACT, numbers
-from .log import Log
+from .log import EXACT, Log, numbers
 from .roles import Kind
 from .stored import Stored, is_inline
 

@@ -44,6 +44,7 @@ class KeyQueue:
         self.items: collections.deque[Item] = collections.deque()
         self.order = 0
         self.division: Division[Counted] = Division(GapDetector(_RECENT))
+        self._lacks = False  # something published is in nothing that was written or waits
         self._line = 0  # the order of the last update that was heard of when the read was asked for
 
     def will_read(self, *roles: Role) -> bool:
@@ -78,6 +79,13 @@ class KeyQueue:
             self.items.popleft()
             yield head
 
+    def give_up(self) -> Item:
+        """Take out the first item, which cannot be read; return what is to be written for it."""
+        head = self.items.popleft()
+        # What the update wrote is missing in what is recorded: the next read of the whole key finds it.
+        self._lacks = self._lacks or head.role != Role.STORED
+        return skipped(head) if head.role == Role.UPDATE else head
+
     def asked(self) -> None:
         """What the first item asks for is being read from now on."""
         self._line = self.order
@@ -96,8 +104,10 @@ class KeyQueue:
             else:
                 line = max(line, heard.update.order)
         asks_for_all = self.items[0].is_whole
-        if loss >= 0 and asks_for_all:  # what it differs in may have been published
-            self.items[0].role = Role.STATE
+        if asks_for_all:
+            if loss >= 0 or self._lacks:  # what it differs in may have been published
+                self.items[0].role = Role.STATE
+            self._lacks = False
         items = [skipped(it) if it.announced and it.order <= loss else it for it in self.items]
         left, unknown = settled(items, value, size, line)
         self.items = collections.deque(left)

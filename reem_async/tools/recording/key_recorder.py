@@ -23,7 +23,7 @@ from ...session import Session
 from .fetch import Fetched
 from .key_queue import KeyQueue
 from .key_reader import KeyReader
-from .order import Item, skipped
+from .order import Item
 from .roles import Kind, Role
 from .state import pruned
 from .times import Arrivals, Clock, published
@@ -250,9 +250,9 @@ class KeyRecorder:
         if self._complaint != str(error):
             logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
         counts, first, self._complaint = self._collector.writer_thread.counts, not self._complaint, str(error)
-        self._queue.items.popleft()
-        if head.role == Role.UPDATE:
-            self._emit(skipped(head))
+        given_up = self._queue.give_up()
+        if given_up.role == Role.SKIP:
+            self._emit(given_up)
         elif first:
             counts.lose(head.path)
         if not isinstance(error, BadData | WrongKind):

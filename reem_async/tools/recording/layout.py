@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import orjson
 
+from ...plan.documents import nested_over
 from ...plan.paths import Path, shorten
 from .errors import DamagedRecording
 from .stored import Stored
@@ -30,6 +31,8 @@ __all__ = ["NOTES", "WRAPPER", "Document", "from_json", "to_json", "topic_of"]
 
 NOTES = "$ship"
 WRAPPER = "value"
+_DEEPEST = 128
+"""Levels of a value. What is written has at most 100."""
 # Larger integers are not exact in JavaScript, in which most viewers are written.
 _LARGEST_EXACT = 2**53
 # Plain numbers and bools: what a short array in a message may be.
@@ -150,6 +153,8 @@ def from_json(text: bytes, *, wrapped: bool) -> Any:
             for key in keys[:-1]:
                 container = container[key]
             container[keys[-1]] = _exact(container[keys[-1]], *note)
+        if nested_over(text, holder[0], _DEEPEST):
+            raise ValueError(f"nested over {_DEEPEST} levels")
     except (AttributeError, IndexError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DamagedRecording(f"the message {shorten(text)} was not written by REEM: {error!r}") from None
     return holder[0]
@@ -162,10 +167,17 @@ def _exact(shown: Any, kind: str, *note: Any) -> Any:
         return _array(shown, *note)
     if kind == "stored":
         label, path, at, size, summary, dtype, shape = note
-        if type(at) is not int or type(size) is not int or type(label) is not str:
+        is_sound = path and all(type(key) in (str, int) for key in path) and type(path[0]) is str
+        if not is_sound or {type(it) for it in (label, summary, dtype)} != {str} or not _are_sizes([at, size]):
             raise ValueError(note)
-        return Stored(label, tuple(path), at, size, str(summary), str(dtype), None if shape is None else tuple(shape))
+        if shape is not None and not _are_sizes(shape):
+            raise ValueError(shape)
+        return Stored(label, tuple(path), at, size, summary, dtype, None if shape is None else tuple(shape))
     raise ValueError(kind)
+
+
+def _are_sizes(numbers: list[Any]) -> bool:
+    return all(type(number) is int and 0 <= number < 2**63 for number in numbers)
 
 
 def _array(shown: Any, dtype: str, shape: list[int], data: str | None) -> np.ndarray[Any, Any]:

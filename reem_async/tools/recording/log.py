@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from types import TracebackType
 from typing import Any, Self
@@ -12,31 +13,118 @@ from typing import Any, Self
 import numpy as np
 
 from ...errors import MissingKey
-from ...plan.differences import same
 from ...plan.paths import Path, parse, show
 from ...plan.patterns import parse_pattern
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
+from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.recorder import CommandRecorder
 from .container import Container
-from .entries import ArrayHandle, ChannelSummary, LogUpdate
-from .history import stacked
 from .log_reader import Past, Stream
-from .outlines import outlined
 from .roles import Role
 from .state import pruned
 from .stored import Stored, resolve
 from .timeline import Ref, Totals
 from .times import Instant, nanoseconds, seconds
 
-__all__ = ["ArrayHandle", "ChannelSummary", "Log", "LogPath", "LogUpdate", "open_log"]
+__all__ = ["EXACT", "ArrayHandle", "ChannelSummary", "Log", "LogPath", "LogUpdate", "numbers", "open_log", "stacked"]
 
 # Whole keys as they were at some instant: who goes through time, or draws a slider, asks for neighbours again and
 # again.
 _CACHED_TREES = 256
 _END = 2**63 - 1
+EXACT = 2**53
+"""Integers up to this size are floats without loss."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogUpdate:
+    """One recorded update.
+
+    Attributes:
+        time: When it was received, in seconds since 1970 on the recorder's clock.
+        path: What was updated, top-level key first.
+        value: What is there now; None if it was deleted.
+        deleted: What was there is gone.
+        published: When it was published, in seconds since 1970 on the publisher's clock; `time` if it was not.
+        sequence: Its number among its publisher's updates of the top-level key; 0 if it was not published.
+        kind: "pub" if it was published; "stored" if somebody changed what is stored and published nothing: what that
+            led to, at the instant at which it was found; "kvs" if it was sampled, or found when the key was read:
+            what is left of an update that was changed before it could be read, or what a server that does not tell
+            of stored changes had at a keyframe.
+    """
+
+    time: float
+    path: Path
+    value: Any
+    deleted: bool
+    published: float
+    sequence: int
+    kind: str
+
+    @property
+    def shown(self) -> str:
+        """The path as people write it."""
+        return show(self.path)
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayHandle:
+    """An array (or bytes, a long list, a custom value) of a past tree, not yet read.
+
+    Attributes:
+        label: "numpy", "bytes", "list", or the label of a custom ship.
+        dtype: The dtype of an array as text, else "".
+        shape: The shape of an array, else None.
+        size: Its bytes.
+        summary: What it is, such as "uint8[480,640,3]".
+    """
+
+    label: str
+    dtype: str
+    shape: tuple[int, ...] | None
+    size: int
+    summary: str
+    _stored: Stored
+    _past: Past
+
+    def read(self) -> Any:
+        """Return the value, read-only; raises DamagedRecording if it is."""
+        return self._past.value(self._stored)
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelSummary:
+    """What a channel of the file holds.
+
+    Attributes:
+        topic: What viewers call it.
+        path: The path it is about; "" if it is about the recording itself.
+        role: "update", "part", "delete", "state", "keyframe", "gap", "skip", or "".
+        kind: "pub", "stored", "kvs" or "".
+        schema: The name of its schema.
+        messages: How many.
+        bytes: Their size, before compression.
+        first: The instant of the first, 0 if there is none.
+        last: The instant of the last.
+    """
+
+    topic: str
+    path: str
+    role: str
+    kind: str
+    schema: str
+    messages: int
+    bytes: int
+    first: float
+    last: float
+
+    @property
+    def rate(self) -> float:
+        """Messages a second, from the first to the last."""
+        return (self.messages - 1) / (self.last - self.first) if self.last > self.first else 0.0
 
 
 def open_log(
@@ -125,7 +213,7 @@ class Log:
     @property
     def unreadable(self) -> int:
         """How many values were left out until now, since they are damaged, or of a type that was not recorded."""
-        return max(self._past.unreadable, self._container.left_out)
+        return max(self._past.unreadable, self._container.damaged)
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -368,16 +456,64 @@ class LogPath:
         """Yield what `history` returns one by one, for what is larger than memory."""
         after = -1 if start is None else nanoseconds(start) - 1
         until = _END if end is None else nanoseconds(end)
-        last: Any = MISSING
-        for ref, stream, value in self._log._past.following(self.path, after, until):
-            repeats = stream.role in (Role.STATE, Role.KEYFRAME) and last is not MISSING and same(value, last)
-            if value is MISSING or repeats:
-                last = value
-                continue
-            last = value
-            whole = self._log._whole(value)
+        for ns, repeats, value in self._log._past.following(self.path, after, until):
+            whole = MISSING if repeats or value is MISSING else self._log._whole(value)
             if whole is not MISSING:
-                yield seconds(ref.time), whole
+                yield seconds(ns), whole
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"
+
+
+def outlined(tree: Any, path: Path) -> Outline:
+    """Return the outline of a tree at the full `path`."""
+    kind = type(tree)
+    if kind is dict or kind is list:
+        pairs = tree.items() if kind is dict else enumerate(tree)
+        children = tuple([outlined(item, (*path, key)) for key, item in pairs])
+        return Outline(path, kind.__name__, "", None, sum([child.size for child in children]), children)
+    if kind is Stored:
+        return Outline(path, tree.label, tree.summary, None, tree.size)
+    if kind is np.ndarray:
+        size, summary = NumpyShip().describe(tree)
+        return Outline(path, "numpy", summary, None, size)
+    size = len(tree.encode()) if kind is str else 8
+    return Outline(path, kind.__name__, "", tree, size)
+
+
+def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
+    """Return values as one array if they are all numbers, arrays of one kind, or lists of as many numbers; else as is.
+
+    Numbers become bool, int64, uint64 or float64, whichever holds them all exactly.
+    """
+    if not values:
+        return np.empty(0)
+    kinds = set(map(type, values))
+    if kinds == {np.ndarray}:
+        forms = {(value.dtype, value.shape) for value in values}
+        return np.stack(values) if len(forms) == 1 else values
+    if kinds == {list}:
+        lengths = {len(value) for value in values}
+        if len(lengths) != 1 or lengths == {0}:
+            return values
+        flat = numbers([item for value in values for item in value])
+        return values if flat is None else flat.reshape(len(values), -1)
+    flat = numbers(values)
+    return values if flat is None else flat
+
+
+def numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
+    """Return numbers as an array that holds them all exactly, None if there is none."""
+    kinds = set(map(type, values))
+    if kinds == {bool}:
+        return np.array(values, bool)
+    if kinds == {int}:
+        low, high = min(values), max(values)
+        if low >= -(2**63) and high < 2**63:
+            return np.array(values, np.int64)
+        return np.array(values, np.uint64) if low >= 0 else None
+    if kinds == {float}:
+        return np.array(values, np.float64)
+    if kinds == {int, float} and all(type(value) is float or abs(value) <= EXACT for value in values):
+        return np.array(values, np.float64)
+    return None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,17 +13,19 @@ import orjson
 from mcap.records import Channel
 
 from ...errors import BadData
+from ...plan.differences import same
 from ...plan.paths import Path, below
 from ...plan.patterns import Pattern
 from ...plan.trees import MISSING, get
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .container import Container, Told
+from .container import Container, Progress, noted
 from .errors import DamagedRecording
-from .index import Numbers
 from .layout import from_json
+from .mcap_reader import Numbers
 from .messages import decode
 from .roles import NEWS, Kind, Role
+from .sink import CHANNELS
 from .state import applied
 from .stored import LOST, Stored, opened
 from .timeline import Ref, Timeline, Totals
@@ -73,13 +76,15 @@ class Past:
         self._of_channel: dict[int, Stream] = {}
         # A path has several channels in one role if its type changed: for users they are one stream.
         for channel in container.channels.values():
-            place = _place(channel)
+            place = _place(channel.metadata)
             if place is not None:
                 stream = by_place.setdefault(place, Stream(*place, []))
                 stream.channels.append(channel.id)
                 self._of_channel[channel.id] = stream
-        if not by_place and not any(record.name == "reem" for record in container.metadata):
+        is_described = any(record.name == "reem" for record in container.metadata)
+        if not by_place and not is_described:
             raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
+        container.damaged += self._missing(is_described)
         self.streams = list(by_place.values())
         self.names: dict[str, list[Stream]] = {}
         self._parts: dict[Path, list[int]] = {}
@@ -89,6 +94,23 @@ class Past:
                 self.names.setdefault(str(stream.path[0]), []).append(stream)
             if stream.role in (Role.PART, Role.UPDATE):
                 self._parts.setdefault(stream.path, []).extend(stream.channels)
+
+    def _missing(self, is_described: bool) -> int:
+        """Return how many channels another tool has left out of keys that are still there.
+
+        Without the channel of its deletions, for example, a key would seem to hold what was deleted.
+        """
+        channels = self._container.channels.values()
+        if not is_described:  # nor are the notes on channels there; but each recording has topics of its own
+            return int(not any(channel.topic.startswith("/_reem/") for channel in channels))
+        names = {stream.path[0] for stream in self._of_channel.values()}
+        missing: Counter[str] = Counter()
+        for row in noted(self._container.metadata, CHANNELS):
+            place = _place(row[4]) if type(row) is list and len(row) == 5 and type(row[4]) is dict else None
+            if place is not None and place[0][0] in names:
+                missing[str(sorted(row[4].items()))] += 1
+        missing.subtract(str(sorted(channel.metadata.items())) for channel in channels)
+        return sum(count for count in missing.values() if count > 0)
 
     def tree(self, path: Path, until: int) -> Any:
         """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
@@ -162,10 +184,14 @@ class Past:
         return sorted([it for it in lasts if it is not None], key=lambda it: it[0].time)
 
     def _between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
-        """Yield the messages between two instants in order: what was found behind an update has the same instant."""
+        """Yield the messages between two instants in order."""
+        for refs in self._instants(channels, after, until):
+            yield from refs
+
+    def _instants(self, channels: Iterable[int], after: int, until: int) -> Iterator[list[Ref]]:
+        """Yield the messages of each instant: what was published comes before what a read found behind it."""
         for _, refs in itertools.groupby(self._timeline.between(channels, after, until), key=lambda ref: ref.time):
-            # At one instant, what was published comes before what a read found behind it.
-            yield from sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
+            yield sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
 
     def _load(self, ref: Ref, stream: Stream) -> list[Any] | None:
         """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
@@ -218,13 +244,10 @@ class Past:
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
         for channel in self._parts.get(it.path, ()):
-            # Again after each damaged index that was made anew; without one the loop ends at once.
-            while (ref := self._timeline.exactly(channel, it.at)) is not None:
-                message = self._timeline.message(ref)
-                if message is not None and self._container.channels[channel].message_encoding == "protobuf":
-                    return self._decoded(self._container.channels[channel], message.data)
-                if message is not None:
-                    break
+            ref = self._timeline.exactly(channel, it.at)
+            message = None if ref is None else self._timeline.message(ref)
+            if message is not None and self._container.channels[channel].message_encoding == "protobuf":
+                return self._decoded(self._container.channels[channel], message.data)
         raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
 
     def changed(self, name: str, until: int) -> int:
@@ -276,39 +299,48 @@ class Past:
         """Whether anything that was read until now turned out to be damaged."""
         return bool(self._container.damaged) or self._has_skipped
 
-    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[Ref, Stream, Any]]:
-        """Yield what was at a full path after each piece of news on it between two instants.
+    def following(self, path: Path, after: int, until: int) -> Iterator[tuple[int, bool, Any]]:
+        """Yield what was at a full path after each instant with news on it, and whether that only repeats.
 
-        If a part of the file is damaged, what keyframes tell is news too.
+        If a part of the file is damaged, keyframes are news too.
         """
         streams = self.names.get(str(path[0]), []) if path else []
         anchor = _anchor(path, streams)
         roles = (*NEWS, Role.KEYFRAME)
         related = [it for it in streams if it.role in roles and (below(it.path, anchor) or below(anchor, it.path))]
         tree = self.tree(anchor, after) if related and after >= 0 else MISSING
-        for ref in self._between([each for it in related for each in it.channels], after, until):
-            stream = self._of_channel[ref.channel]
-            # Keyframes repeat what is known, unless something is damaged: then they are what mends it.
-            if stream.role == Role.KEYFRAME and not self.is_damaged:
-                continue
-            loaded = self._readable(ref, stream)
-            if loaded is None:
-                continue
-            # An update of the path itself or of what is around it brings all of it; one from inside changes a part.
-            if len(stream.path) <= len(anchor):
-                tree = self._inside(loaded[0], anchor[len(stream.path) :])
-            else:
-                tree = self._applied(tree, anchor, stream, loaded[0])
-            yield ref, stream, self._inside(tree, path[len(anchor) :])
+        last: Any = MISSING
+        for refs in self._instants([each for it in related for each in it.channels], after, until):
+            is_read, is_whole = False, True
+            for ref in refs:
+                stream = self._of_channel[ref.channel]
+                # Keyframes repeat what is known, unless something is damaged: then they bring what is missing.
+                if stream.role == Role.KEYFRAME and not self.is_damaged:
+                    continue
+                loaded = self._readable(ref, stream)
+                if loaded is None:
+                    continue
+                is_read, is_whole = True, is_whole and stream.role in (Role.STATE, Role.KEYFRAME)
+                # An update of the path or of what is around it brings all of it; one from inside changes a part.
+                if len(stream.path) <= len(anchor):
+                    tree = self._inside(loaded[0], anchor[len(stream.path) :])
+                else:
+                    tree = self._applied(tree, anchor, stream, loaded[0])
+            if is_read:
+                value = self._inside(tree, path[len(anchor) :])
+                repeats = is_whole and value is not MISSING and last is not MISSING and same(value, last)
+                last = value
+                yield refs[0].time, repeats, value
 
     def gaps(self) -> Iterator[tuple[Ref, Stream, int | None]]:
         """Yield where updates were lost, and how many."""
         # A gap says how many were lost if their publisher's numbers told it.
         channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.GAP]
         for ref in self._timeline.between(channels, -1, 2**63 - 1):
-            message = self._timeline.message(ref)
-            said = orjson.loads(message.data) if message is not None else {}
-            yield ref, self._of_channel[ref.channel], said.get("missed") if type(said) is dict else None
+            message, missed = self._timeline.message(ref), None
+            with contextlib.suppress(ValueError, TypeError, KeyError):
+                missed = orjson.loads(message.data)["missed"] if message is not None else None
+            yield ref, self._of_channel[ref.channel], missed if type(missed) is int else None
 
     def skips(self) -> Iterator[tuple[Ref, Stream]]:
         """Yield the updates whose values could not be had any more."""
@@ -321,7 +353,7 @@ class Past:
         message = self._timeline.message(ref)
         return (message.publish_time, message.sequence) if message is not None else (0, 0)
 
-    def totals(self, progress: Told | None = None) -> dict[int, Totals]:
+    def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
         """Return how much each channel has; see `Timeline.totals`."""
         return self._timeline.totals(progress)
 
@@ -332,14 +364,19 @@ class Past:
             yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
 
 
-def _place(channel: Channel) -> tuple[Path, Role, Kind] | None:
-    """Return path, role and kind of a channel; None if it is none of REEM's."""
+def _place(metadata: Mapping[str, str]) -> tuple[Path, Role, Kind] | None:
+    """Return path, role and kind of a channel by its metadata; None if it is none of REEM's."""
     try:
-        path = orjson.loads(channel.metadata["reem.path"])
-        role, kind = Role(channel.metadata["reem.role"]), Kind(channel.metadata["reem.kind"])
-    except (KeyError, ValueError):  # also what orjson raises, and a role of a later REEM
+        path = orjson.loads(metadata["reem.path"])
+        role, kind = Role(metadata["reem.role"]), Kind(metadata["reem.kind"])
+    except (KeyError, ValueError, TypeError):  # also what orjson raises, and a role of a later REEM
         return None
-    if type(path) is not list or not path or not all(type(key) in (str, int) for key in path):
+    if (
+        type(path) is not list
+        or not path
+        or type(path[0]) is not str
+        or not all(type(key) in (str, int) for key in path)
+    ):
         return None
     return tuple(path), role, kind
 

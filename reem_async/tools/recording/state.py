@@ -31,7 +31,7 @@ def planted(tree: Any, path: Path, value: Any) -> Any:
         known = tree if type(tree) is dict else {}
         return {**known, key: planted(known.get(key, MISSING), rest, value)}
     items = list(tree) if type(tree) is list else []
-    if key >= _LONGEST_PADDING:
+    if not -len(items) <= key < _LONGEST_PADDING:
         return items
     items += [None] * (key + 1 - len(items))
     items[key] = planted(items[key], rest, value)

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .container import ChunkInfo, Container, Message, Told
-from .index import Index, Numbers
+from .container import Container, Message, Progress
+from .mcap_reader import ChunkInfo, Index, Numbers
 
 __all__ = ["Ref", "Timeline", "Totals"]
 
@@ -25,15 +25,16 @@ class Ref(NamedTuple):
 
     Attributes:
         time: Its log time in ns.
-        channel: Its channel.
-        offset: Its place in the chunk.
         chunk: The chunk.
+        offset: Its place in the chunk.
+        channel: Its channel. The last field: of one instant, messages come in the order of the file, whatever numbers
+            another tool has given to the channels.
     """
 
     time: int
-    channel: int
-    offset: int
     chunk: ChunkInfo
+    offset: int
+    channel: int
 
 
 class Totals(NamedTuple):
@@ -46,9 +47,7 @@ class Totals(NamedTuple):
 
 
 class Timeline:
-    """The messages of a file by channel and time.
-
-    Of one channel, messages are in the file in the order of their log times.
+    """The messages of a file by channel and time, in whatever order the file has them.
 
     Args:
         container: The file.
@@ -57,10 +56,11 @@ class Timeline:
     def __init__(self, container: Container) -> None:
         self._container = container
         self._chunks = container.every_chunk
+        # In order: chunks are numbered so.
         self._starts = np.array([info.start for info in self._chunks], np.uint64)
         self._ends = np.array([info.end for info in self._chunks], np.uint64)
-        # Chunks may overlap in time; from a place on, all begin later than an instant.
-        self._all_begin = np.minimum.accumulate(self._starts[::-1])[::-1]
+        # Chunks may overlap in time: when the last one up to a place ends.
+        self._all_end = np.maximum.accumulate(self._ends)
         self._blocks: Numbers | None = None
 
     def _holders(self, channel: int, before: int) -> Iterator[ChunkInfo]:
@@ -79,18 +79,21 @@ class Timeline:
         """Return the last message of a channel that is not later than `until` and later than `after`, or None."""
         if until < 0:
             return None
-        # No chunk from this one on can have a message so early.
-        before = int(np.searchsorted(self._all_begin, np.uint64(until), side="right"))
+        # No chunk from this one on has a message so early.
+        before = int(np.searchsorted(self._starts, np.uint64(until), side="right"))
+        best: Ref | None = None
         for info in self._holders(channel, before):
-            # A channel's messages are in order: those in earlier chunks are older still.
+            # Neither this chunk nor one that begins before it has a later message.
+            if int(self._all_end[info.number]) <= after:
+                break
             if info.end <= after:
-                return None
+                continue
             times, offsets = self._container.index(info).of(channel)
             position = int(np.searchsorted(times, np.uint64(until), side="right")) - 1
-            if position >= 0:
-                found = int(times[position])
-                return Ref(found, channel, int(offsets[position]), info) if found > after else None
-        return None
+            if position >= 0 and int(times[position]) > after:
+                after = int(times[position])
+                best = Ref(after, info, int(offsets[position]), channel)
+        return best
 
     def between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
         """Yield the messages of some channels that are later than `after` and not later than `until`, by time."""
@@ -110,8 +113,7 @@ class Timeline:
         if until < 0:
             return
         inside = (self._ends > np.uint64(max(after, 0))) if after >= 0 else np.ones(len(self._chunks), bool)
-        numbers = np.flatnonzero(inside & (self._starts <= np.uint64(until)))
-        for number in numbers[np.argsort(self._starts[numbers], kind="stable")].tolist():
+        for number in np.flatnonzero(inside & (self._starts <= np.uint64(until))).tolist():
             info = self._chunks[number]
             if number not in self._container.lost and wanted[info.channels].any():
                 yield info
@@ -141,12 +143,12 @@ class Timeline:
         found = self.latest(channel, time)
         return found if found is not None and found.time == time else None
 
-    def totals(self, progress: Told | None = None) -> dict[int, Totals]:
+    def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
         """Return what each channel has: as the recorder says, or else by the indexes of all chunks."""
         said = self._container.totals()
         return self._counted(progress) if said is None else {number: Totals(*each) for number, each in said.items()}
 
-    def _counted(self, progress: Told | None) -> dict[int, Totals]:
+    def _counted(self, progress: Progress | None) -> dict[int, Totals]:
         messages, sizes, lasts = np.zeros((3, _CHANNELS), np.int64)
         firsts = np.full(_CHANNELS, _END)
         for info in self._chunks:
@@ -173,7 +175,7 @@ class Timeline:
         return np.maximum(sizes, 0)
 
     def message(self, ref: Ref) -> Message | None:
-        """Return a message; None if it turned out to be damaged: what is around it must be looked up again."""
+        """Return a message; None, and its chunk is left out, if it is damaged. Then find again what it was part of."""
         return self._container.message(ref.chunk, ref.channel, ref.offset, ref.time)
 
 
@@ -198,4 +200,4 @@ def _inside(info: ChunkInfo, index: Index, wanted: Numbers, after: int, until: i
     chosen = wanted[channels] & _between(index.times, after, until)
     columns = (index.times[chosen].tolist(), channels[chosen].tolist(), index.offsets[chosen].tolist())
     for time, channel, offset in zip(*columns, strict=True):
-        yield Ref(time, channel, offset, info)
+        yield Ref(time, info, offset, channel)

@@ -1,0 +1,252 @@
+"""Recordings that another tool has rewritten are read as they were, refused, or reported as damaged; never differently.
+
+A generator draws the variants: all that MCAP leaves optional. A failure names its seed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import random
+import zlib
+
+import mcap.reader
+import mcap.writer
+import numpy as np
+import pytest
+from conftest import eventually
+
+import reem
+import reem.recording
+from reem_async.tools.browser.logsource import LogSource
+from reem_async.tools.recording import DamagedRecording, Replayer, open_log
+from reem_async.tools.recording.export import export
+
+IMAGE = np.arange(40 * 30 * 3, dtype=np.uint8).reshape(40, 30, 3)
+
+
+@pytest.fixture(scope="module")
+def recorded(server_url, tmp_path_factory):
+    """A recording with all that there is: pictures, items that go, keys that go, keyframes, plain writes."""
+    file, name = tmp_path_factory.mktemp("rewritten") / "run.mcap", f"rewritten{os.getpid()}"
+    arm, base, note = f"{name}arm", f"{name}base", f"{name}note"
+    with reem.RedisInterface(server_url) as interface:
+        space, store = reem.PublishSpace(interface), reem.KeyValueStore(interface)
+        with reem.recording.Recorder(interface, [f"{name}*"], file, keyframe=0.2) as recorder:
+            for number in range(24):
+                before = recorder.status.messages
+                space[arm] = {"speed": 100 + number, "q": [1, 2, number], "image": IMAGE + np.uint8(number)}
+                space[base] = {"speed": -number, "at": [[number] * 70, "x" * number]}
+                if number % 4 == 1:
+                    del space[arm]["q"][0]
+                    del space[base]["at"]
+                if number % 6 == 2:
+                    store[note] = {"text": str(number), "image": IMAGE}
+                eventually(lambda before=before: recorder.status.messages > before + 2)
+                recorder._core._sink._closed_at -= number % 3 == 0
+            del space[arm], space[base], store[note]
+    return file, name
+
+
+@pytest.fixture(scope="module")
+def original(recorded):
+    with open_log(recorded[0]) as log:
+        assert (log.verify(), log.indexed) == (0, True)
+        assert {it.role for it in log.channels()} >= {"update", "part", "delete", "keyframe"}
+        instants = np.linspace(log.start - 0.01, log.end + 0.01, 9).tolist()
+        return records(recorded[0]), instants, contents(log, instants)
+
+
+def plain(it):
+    """A value as one that compares by `==`, types included; arrays by their checksum."""
+    if isinstance(it, np.ndarray):
+        return it.dtype.str, it.shape, zlib.crc32(it.tobytes())
+    if isinstance(it, dict):
+        return {key: plain(value) for key, value in it.items()}
+    return [plain(each) for each in it] if isinstance(it, list | tuple) else repr(it)
+
+
+def contents(log, instants):
+    """All that a reader can ask for, by top-level key."""
+    found = {}
+    for name in log.names():
+        updates = log.updates(patterns=[name])
+        paths = [path for path in log.paths() if path[0] == name]
+        trees = [log.readable_at(name, instant) for instant in instants]
+        told = [(it.time, it.path, it.value, it.deleted, it.published, it.sequence, it.kind) for it in updates]
+        histories = [list(log[path].values()) for path in [(name,), (name, "speed"), (name, "q", 0), *paths]]
+        counts = [(it.path, it.role, it.kind, it.messages, it.first, it.last) for it in log.channels()]
+        mine = [it for it in counts if it[0].startswith(name)]
+        found |= {(name, number): plain(it) for number, it in enumerate((told, trees, histories, sorted(mine)))}
+    return found
+
+
+def assert_equal(found, whole):
+    assert not [each for each in found if found[each] != whole.get(each)]
+
+
+def records(file):
+    with file.open("rb") as stream:
+        reader = mcap.reader.make_reader(stream)
+        return list(reader.iter_messages(log_time_order=False)), list(reader.iter_metadata())
+
+
+def rewritten(original, rng, chosen, *, metadata):
+    """The records in another file, each optional part of the format drawn: its bytes."""
+    messages, notes = original
+    kinds, stream = mcap.writer.IndexType, io.BytesIO()
+    options = ("repeat_channels", "repeat_schemas", "use_chunking", "use_statistics", "use_summary_offsets",
+               "enable_crcs", "enable_data_crcs")  # fmt: skip
+    writer = mcap.writer.Writer(
+        stream,
+        chunk_size=rng.choice([1, 3000, 50_000, 1 << 30]),
+        compression=rng.choice(list(mcap.writer.CompressionType)),
+        index_types=rng.choice([kinds.ALL, kinds.ALL, kinds(rng.randrange(32))]),
+        **{option: rng.random() < 0.7 for option in options},
+    )
+    writer.start("", "another tool")
+    wanted = [each for each in messages if chosen(each[1])]
+    match rng.choice(["as it was", "reversed", "backwards", "shuffled", "by channel"]):
+        case "reversed":
+            size = rng.choice([1, 7, 50])
+            blocks = [wanted[start : start + size] for start in range(0, len(wanted), size)]
+            wanted = [each for block in reversed(blocks) for each in block]
+        case "shuffled":
+            rng.shuffle(wanted)
+        case "by channel":
+            wanted.sort(key=lambda each: each[1].topic)
+        case "backwards":
+            wanted.reverse()
+    channels = list({channel.id: (schema, channel) for schema, channel, _ in wanted}.values())
+    rng.shuffle(channels)
+    schemas, numbers = {}, {}
+    for schema, channel in channels:
+        if schema.id not in schemas:
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        parts = channel.topic, channel.message_encoding, schemas[schema.id], channel.metadata
+        numbers[channel.id] = writer.register_channel(*parts)
+    early = rng.random() < 0.5
+    for each in notes if metadata and early else ():
+        writer.add_metadata(each.name, each.metadata)
+    if rng.random() < 0.3:
+        writer.add_attachment(1, 1, "map.png", "image/png", b"a picture")
+    for _, channel, message in wanted:
+        times = message.log_time, message.data, message.publish_time, message.sequence
+        writer.add_message(numbers[channel.id], *times)
+    for each in notes if metadata and not early else ():
+        writer.add_metadata(each.name, each.metadata)
+    writer.finish()
+    return stream.getvalue()
+
+
+def starts(data):
+    """Where the records of a file begin."""
+    places, position = [], 8
+    while position + 9 <= len(data):
+        places.append(position)
+        position += 9 + int.from_bytes(data[position + 1 : position + 9], "little")
+    return places
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "variant.mcap"
+
+
+def test_whatever_is_optional_it_is_read_equal(original, file):
+    """Renumbered, in any order, with and without each index, summary part, chunk, checksum and metadata record."""
+    source, instants, whole = original
+    for seed in range(60):
+        rng = random.Random(seed)
+        file.write_bytes(rewritten(source, rng, lambda _: True, metadata=rng.random() < 0.7))
+        try:
+            with open_log(file) as log:
+                assert log.indexed
+                found = contents(log, instants)
+                assert found.keys() == whole.keys()
+                assert_equal(found, whole)
+                assert (log.damaged, log.unreadable, log.verify()) == (0, 0, 0)
+        except BaseException as error:
+            error.add_note(f"seed {seed}")
+            raise
+
+
+def test_filtered_it_is_equal_where_nothing_is_missing_or_else_reported(original, recorded, file):
+    """Whole keys may go; of a key whose deletions or keyframes went, the rest would tell something else."""
+    source, instants, whole = original
+    equal = reported = 0
+    for seed in range(40):
+        rng = random.Random(seed)
+        topics = sorted({channel.topic for _, channel, _ in source[0]})
+        keys = [f"{recorded[1]}{each}" for each in ("arm", "base", "note") if rng.random() < 0.6]
+        left = set(rng.sample(topics, len(topics) // 2)) if rng.random() < 0.5 else set(topics)
+
+        def chosen(channel, left=left, keys=keys):
+            path = json.loads(channel.metadata.get("reem.path", "[null]"))
+            return channel.topic in left and (path[0] in keys or path[0] is None)
+
+        data = rewritten(source, rng, chosen, metadata=True)
+        file.write_bytes(data)
+        try:
+            with open_log(file) as log:
+                found = contents(log, instants)
+                if log.damaged:
+                    reported += 1
+                    assert log.unreadable
+                else:
+                    equal += 1
+                    assert_equal(found, whole)
+        except BaseException as error:
+            error.add_note(f"seed {seed}")
+            raise
+    assert min(equal, reported) > 5
+
+
+def test_cut_at_every_record_it_is_equal_or_reported(original, file):
+    """And between them; what is read was recorded."""
+    source, instants, whole = original
+    known = [it for (_, part), told in whole.items() if part == 0 for it in told]
+    for seed in range(5):
+        rng = random.Random(seed)
+        data = rewritten(source, rng, lambda _: True, metadata=rng.random() < 0.7)
+        places = starts(data)
+        places = rng.sample(places, min(len(places), 25)) + [rng.randrange(8, len(data)) for _ in range(10)]
+        for place in places:
+            file.write_bytes(data[:place])
+            try:
+                with open_log(file) as log:
+                    found = contents(log, instants)
+                    assert all(it in known for (_, part), told in found.items() if part == 0 for it in told)
+                    if log.indexed and not log.damaged:
+                        assert found == whole
+            except DamagedRecording:
+                assert place < len(data)
+            except BaseException as error:
+                error.add_note(f"seed {seed}, cut at {place}")
+                raise
+
+
+async def test_play_export_and_the_page_read_it_too(original, recorded, akvs, binterface, file, tmp_path):
+    source, instants, _ = original
+    file.write_bytes(rewritten(source, random.Random(1), lambda _: True, metadata=False))
+    texts, states, pages = [], [], []
+    for each in (recorded[0], file):
+        with open_log(each) as log:
+            target = tmp_path / "run.csv"
+            assert export(log, "csv", target, overwrite=True).unreadable == 0
+            texts.append(target.read_text())
+            status = await Replayer(binterface, log, rate=1000, end=instants[4]).play()
+            assert (status.refused, status.unreadable) == (0, 0)
+            states.append([await akvs[name].read() for name in log.names()])
+            for name in log.names():
+                await akvs[name].delete()
+        page = LogSource(each)
+        try:
+            value = await page.value((f"{recorded[1]}arm", "image"), instants[4])
+            pages.append((value, [await page.children((name,), 0, 10, instants[4]) for name in log.names()]))
+        finally:
+            await page.close()
+    assert texts[0] == texts[1]
+    assert plain(states[0]) == plain(states[1])
+    assert plain(pages[0]) == plain(pages[1])
