@@ -5,6 +5,7 @@ A generator draws the variants: all that MCAP leaves optional. A failure names i
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -14,11 +15,13 @@ import zlib
 import mcap.reader
 import mcap.writer
 import numpy as np
+import orjson
 import pytest
 from conftest import eventually
 
 import reem
 import reem.recording
+from reem_async.errors import BadData, MissingKey
 from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording import DamagedRecording, Replayer, open_log
 from reem_async.tools.recording.export import export
@@ -225,6 +228,92 @@ def test_cut_at_every_record_it_is_equal_or_reported(original, file):
             except BaseException as error:
                 error.add_note(f"seed {seed}, cut at {place}")
                 raise
+
+
+NOTES = [
+    [["a"], "stored", "numpy", ["k", ["x"]], 5, 5, "", "", None],
+    [["a"], "stored", "numpy", ["k", None], 5, 5, "", "", None],
+    [["a"], "stored", "list", [], 5, 5, "", "", [[1]]],
+    [["a"], "stored", "list", ["k", "a"], 10**17, 5, "x", "y", [-1]],
+    [["a", -1], "array", "<f8", [2**62], "AAAA"],
+    [["a"], "array", "<f99", [1], None],
+    [["a"], "int"],
+    [[], "stored", "numpy", [0], 5, 5, "", "", None],
+    5,
+]
+PLACES = [
+    '["k"]',
+    '["k","a"]',
+    '["k","l",0]',
+    '["k","l",-7]',
+    '["k","l",99999999]',
+    "[1]",
+    "[]",
+    '["k",true]',
+    "x",
+    '{"k":1}',
+]
+
+
+def made_up(rng):
+    """A recording of which most channels and messages are made up: its bytes. Each third update is sound."""
+    stream = io.BytesIO()
+    writer = mcap.writer.Writer(stream)
+    writer.start("", "")
+    json_schema = writer.register_schema("reem.event", "jsonschema", b"{}")
+    schemas = [
+        json_schema,
+        0,
+        *[writer.register_schema(name, "protobuf", b"") for name in ("reem.NdArray", "reem.Blob")],
+    ]
+    whole = {"reem.path": '["k"]', "reem.role": "update", "reem.kind": "pub"}
+    sound = writer.register_channel("/k", "json", json_schema, whole)
+    for number in range(30):
+        roles = ["update", "delete", "state", "keyframe", "gap", "skip", "part", "none"]
+        metadata = {"reem.path": rng.choice(PLACES), "reem.role": rng.choice(roles)}
+        metadata |= {"reem.kind": rng.choice(["pub", "stored", "kvs"])}
+        metadata |= {
+            key: rng.choice(["1", "list", "numpy"]) for key in ("reem.wrapped", "reem.ship") if rng.random() < 0.3
+        }
+        encoding = rng.choice(["json", "json", "protobuf", "cbor"])
+        channel = writer.register_channel("/x", encoding, rng.choice(schemas), metadata)
+        note = orjson.dumps(rng.sample(NOTES, rng.randint(1, 2))).decode()
+        value = rng.choice(
+            [{"l": [1, 2], "a": {"b": 1}}, [1], 5, None, {"a": 1, "$ship": note}, {"a": [1], "$ship": note}]
+        )
+        data = orjson.dumps(rng.choice([value, {"value": value, "key": "k"}]))
+        deep = b'{"a":' * rng.choice([200, 500, 900]) + b"1"
+        data = rng.choice([data, data, data, b"", b"\xff", data[:-1], deep + b"}" * deep.count(b"{")])
+        writer.add_message(channel, 10**18 + number * 10**9, data, 5, number)
+        if number % 3 == 0:
+            writer.add_message(sound, 10**18 + number * 10**9 + 1000, orjson.dumps({"n": number}), 5, number)
+    writer.add_metadata("reem", {"format": "1"})
+    for name in ("reem.totals", "reem.channels"):
+        text = rng.choice(["[]", "5", '{"a":1}', "[5]", "[[1]]", '[["x",1,null,"y",[]]]', "x"])
+        writer.add_metadata(name, {"channels": text, "crc32": str(zlib.crc32(text.encode()))})
+    writer.finish()
+    return stream.getvalue()
+
+
+def test_made_up_messages_are_left_out(file, tmp_path):
+    """What is beside them is read; the errors are REEM's."""
+    for seed in range(60):
+        file.write_bytes(made_up(random.Random(seed)))
+        try:
+            with open_log(file) as log:
+                read = [it.value for it in log.updates(patterns=["k"], partial=True)]
+                assert all({"n": number} in read for number in range(0, 30, 3))
+                log.gaps(), log.skipped(), log.verify()
+                contents(log, [log.start, log.end])
+                for instant in np.linspace(log.start, log.end, 7):
+                    for ask in (log.tree_at, log.outline_at, lambda it, log=log: log.value_at("k", it)):
+                        with contextlib.suppress(BadData, MissingKey):
+                            ask(instant)
+                for kind in ("csv", "npz"):
+                    export(log, kind, tmp_path / "out", overwrite=True)
+        except BaseException as error:
+            error.add_note(f"seed {seed}")
+            raise
 
 
 async def test_play_export_and_the_page_read_it_too(original, recorded, akvs, binterface, file, tmp_path):
