@@ -8,42 +8,24 @@ image = kvs["foo"]["image"].read()
 
 import warnings
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
 from reem_async._installation import CURE, original_reem
-from reem_async.concurrency.aside import ensure_imported
+from reem_async.concurrency.queues import Every, Last, Newest
+from reem_async.pubsub.updates import Origin, Update
 
 from .accessor import Accessor
 from .connection import RedisInterface
 from .errors import *
+from .publish import Publisher, PublishSpace
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 from .store import KeyValueStore, Reader, Writer
-
-if TYPE_CHECKING:
-    from reem_async.concurrency.queues import Every, Last, Newest
-    from reem_async.pubsub.updates import Origin, Update
-
-    from .publish import Publisher, PublishSpace
-    from .subscribe import CallbackSubscriber, SilentSubscriber
+from .subscribe import CallbackSubscriber, SilentSubscriber
 
 if clash := original_reem():
     warnings.warn(f"{clash}; run: {CURE}", RuntimeWarning, stacklevel=2)
-
-_LATER = {
-    "CallbackSubscriber": "reem.subscribe",
-    "Every": "reem_async.concurrency.queues",
-    "Last": "reem_async.concurrency.queues",
-    "Newest": "reem_async.concurrency.queues",
-    "Origin": "reem_async.pubsub.updates",
-    "PublishSpace": "reem.publish",
-    "Publisher": "reem.publish",
-    "SilentSubscriber": "reem.subscribe",
-    "TolerantKeyValueStore": "reem.legacy",  # of REEM 0.1.3
-    "Update": "reem_async.pubsub.updates",
-}
-"""Imported when first used: a program that only reads and writes starts sooner."""
 
 
 def load_ipython_extension(shell: Any) -> None:
@@ -51,7 +33,6 @@ def load_ipython_extension(shell: Any) -> None:
 
     Pictures are of arrays that were read and can be one; they need pillow. Nothing is read to show it.
     """
-    ensure_imported("reem_async.tools.notebook")
     from reem_async.tools.notebook import complete_below, load_ipython_extension
 
     complete_below(KeyValueStore, Accessor)
@@ -66,10 +47,9 @@ def unload_ipython_extension(shell: Any) -> None:
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name != "TolerantKeyValueStore":  # of REEM 0.1.3
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    ensure_imported(_LATER[name])
-    return getattr(import_module(_LATER[name]), name)
+    return import_module("reem.legacy").TolerantKeyValueStore
 
 
 __all__ = [

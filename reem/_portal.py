@@ -13,13 +13,19 @@ from __future__ import annotations
 import _thread
 import asyncio
 import contextlib
+import socket
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from reem_async.errors import InterfaceClosed, WrongLoop
 
-__all__ = ["Portal", "finish"]
+try:
+    import uvloop
+except ImportError:
+    uvloop = None  # type: ignore[assignment]
+
+__all__ = ["LastPortal", "Portal", "finish"]
 
 Result = TypeVar("Result")
 
@@ -45,11 +51,7 @@ def finish(coroutine: Coroutine[Any, Any, Result]) -> Result:
 
 
 def _new_loop() -> asyncio.AbstractEventLoop:
-    try:
-        import uvloop
-    except ImportError:
-        return asyncio.new_event_loop()
-    return uvloop.new_event_loop()
+    return asyncio.new_event_loop() if uvloop is None else uvloop.new_event_loop()
 
 
 class _Call(Generic[Result]):
@@ -126,7 +128,7 @@ def _closed_meanwhile() -> InterfaceClosed:
 
 
 class Portal:
-    """An event loop in a daemon thread, and the way into it; made aside."""
+    """An event loop in a daemon thread, and the way into it."""
 
     def __init__(self, name: str) -> None:
         self._loop = _new_loop()
@@ -134,7 +136,11 @@ class Portal:
         self._ident: int | None = None
         self._last: Callable[[], Coroutine[Any, Any, None]] | None = None
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except BaseException:  # Ctrl-C: the thread may run, and is nobody's
+            self._hand_over(self._loop.stop)
+            raise
 
     def _serve(self) -> None:
         self._ident = _thread.get_ident()
@@ -222,3 +228,24 @@ class Portal:
         # A finalizer, or a callback, may run on the loop's own thread, which cannot wait for itself.
         if not self.inside:
             self._thread.join(_LONGEST_STOP)
+
+
+class _LastLoop(asyncio.SelectorEventLoop):
+    """An event loop that needs no threads: asyncio looks names up in some, which cannot start any more."""
+
+    async def getaddrinfo(self, host: Any, port: Any, **how: Any) -> Any:
+        return socket.getaddrinfo(host, port, **how)
+
+
+class LastPortal:
+    """What takes the place of a Portal while the interpreter exits, when no thread can start any more."""
+
+    inside = False
+
+    def call(self, coroutine: Coroutine[Any, Any, Result], timeout: float | None = None) -> Result:
+        """Run `coroutine` on an event loop of this call."""
+        with asyncio.Runner(loop_factory=_LastLoop) as runner:
+            return runner.run(coroutine)
+
+    def stop(self, last: Callable[[], Coroutine[Any, Any, None]] | None = None) -> None:
+        """Return: the loop has ended with the call."""

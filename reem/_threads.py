@@ -6,8 +6,6 @@ import threading
 from collections.abc import Coroutine
 from typing import Any
 
-from reem_async.concurrency.aside import aside
-
 from ._portal import finish
 
 __all__ = ["Threads"]
@@ -24,15 +22,11 @@ class Threads:
 
     def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> None:
         """Run a coroutine of the core, which does all its waiting in system calls."""
-        # Starting a thread waits for an Event of `threading`: not on a thread that handlers of signals may interrupt.
-        aside(lambda: self._start(coroutine, name))
-
-    def _start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> None:
         thread = threading.Thread(target=self._run, args=(coroutine,), name=name, daemon=True)
         self._running.add(thread)
         try:
             thread.start()
-        except BaseException:  # there are too many threads: nobody is to wait for this one
+        except Exception:  # there are too many threads, or the interpreter is ending: nothing is to wait for this one
             self._running.discard(thread)
             coroutine.close()
             raise

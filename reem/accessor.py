@@ -6,24 +6,20 @@ import builtins
 import threading
 from collections.abc import Iterable, Iterator, Mapping
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
-from reem_async.concurrency.aside import ensure_imported
+from reem_async.concurrency.queues import Policy
 from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.handles import Handle
 from reem_async.plan.paths import Path, show
 from reem_async.store import accessor as core
+from reem_async.store.catalog import Outline
 
 from ._twin import documented_by
 from .connection import RedisInterface
 from .low_level import Publisher, Reader, Writer
-
-if TYPE_CHECKING:
-    from reem_async.concurrency.queues import Policy
-    from reem_async.store.catalog import Outline
-
-    from .mirror import Mirror
-    from .subscribe import Watch
+from .mirror import Mirror
+from .subscribe import Watch
 
 __all__ = ["Accessor", "Edit", "PublishAccessor"]
 
@@ -212,9 +208,6 @@ class Accessor(Handle):
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
         """Return an iterator over the value here and its changes."""
-        ensure_imported("reem.subscribe")
-        from .subscribe import Watch
-
         # What follows lives on the background loop: the connections of the caller's thread only ask and answer.
         kind, writer = type(self._core), self._core._writer.maker()
         followed = core.rebuilt(kind, writer, self._interface._followers.session, self._core.full_path)
@@ -222,9 +215,6 @@ class Accessor(Handle):
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
         """Return a local copy of what is here that follows every change: `with kvs["arm"].mirror() as arm:`."""
-        ensure_imported("reem.mirror")
-        from .mirror import Mirror
-
         return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest)
 
     def __enter__(self) -> Any:

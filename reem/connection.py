@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import sys
 import weakref
 from collections.abc import Callable, Coroutine, Sequence
 from importlib import import_module
-from threading import current_thread, get_ident, main_thread
+from threading import current_thread, main_thread
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 import reem_async
-from reem_async.concurrency.aside import aside
 from reem_async.concurrency.queues import Ended
 from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed
@@ -20,9 +20,9 @@ from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
 from reem_async.transport.addresses import NewTransport
 from reem_async.transport.blocking import BlockingTransport
-from reem_async.transport.state import State, StateChange, StateChanges, States
+from reem_async.transport.state import State, StateChange, StateChanges
 
-from ._portal import Portal, finish
+from ._portal import LastPortal, Portal, finish
 from ._threads import Threads
 from ._twin import documented_by
 
@@ -61,42 +61,30 @@ class _OnThread(reem_async.RedisInterface):
         self._client.close()
 
 
-class _States(States):
-    """The states of an interface whose main thread may be interrupted anywhere: all that takes the lock is aside."""
-
-    def apart(self, step: Callable[[], Result]) -> Result:
-        """Take a step that takes the lock."""
-        return aside(step)
-
-
 class _Background:
     """The event loop of an interface and the core's interface on it, made when first needed.
 
     Threads do not survive a fork, so each process has its own loop. There is no lock: who comes second finds what the
     first has made, and what is made while the interface is being closed is stopped by whoever sees it last.
+
+    While the interpreter exits there is no loop thread: each call runs an event loop of its own on the caller's thread.
     """
 
     def __init__(self, direct: reem_async.RedisInterface) -> None:
         self._direct = direct
-        self._made: dict[int, tuple[Portal, reem_async.RedisInterface]] = {}
+        self._made: dict[int, tuple[Portal | LastPortal, reem_async.RedisInterface]] = {}
 
-    @property
-    def inside(self) -> bool:
-        """Whether the caller is on the loop's own thread."""
-        made = self._made.get(os.getpid()) if self._made else None
-        return made is not None and made[0].inside
-
-    def started(self) -> tuple[Portal, reem_async.RedisInterface]:
+    def started(self) -> tuple[Portal | LastPortal, reem_async.RedisInterface]:
         """Return both, starting them if need be; raises InterfaceClosed."""
         # First, so that nothing is started for an interface that is closed.
         self._direct.session.transport.check()
-        return self._made.get(os.getpid()) or aside(self._begun)
+        return self._made.get(os.getpid()) or self._begun()
 
-    def _begun(self) -> tuple[Portal, reem_async.RedisInterface]:
+    def _begun(self) -> tuple[Portal | LastPortal, reem_async.RedisInterface]:
         # After a fork it is the parent's: what was made from it goes on here, and ends with the rest.
         before = [*self._made.values()]
         interface = before[0][1] if before else self._new_interface()
-        portal = Portal("reem-loop")
+        portal = LastPortal() if _exiting else Portal("reem-loop")
         # One step of C, so of two threads that come here at once the second finds what the first has made.
         made = self._made.setdefault(os.getpid(), (portal, interface))
         if made[0] is not portal:
@@ -105,7 +93,7 @@ class _Background:
             # It may have been closed while this was made: then nobody else would stop it.
             self._direct.session.transport.check()
         except InterfaceClosed:
-            self._stop()
+            self.stop()
             raise
         return made
 
@@ -117,26 +105,47 @@ class _Background:
         return interface
 
     def close(self) -> None:
-        """Close all connections and end the loop. Idempotent; goes on to its end if the caller is interrupted."""
-        aside(self._close)
-
-    def _close(self) -> None:
+        """Close all connections and end the loop. Idempotent; a caller that was interrupted may call it again."""
         # The connections of calling threads go first, so that their calls end while the loop still answers.
         finish(self._direct.close())
-        self._stop()
+        self.stop()
 
-    def _stop(self) -> None:
-        made = self._made.pop(os.getpid(), None)
-        if made is not None:
-            portal, interface = made
+    def stop(self) -> None:
+        """End the loop and what it follows. Idempotent."""
+        pid = os.getpid()
+        if pid in self._made:
+            portal, interface = self._made[pid]
             # Loops in other threads end at once: the event loop may be busy, and this may be a callback on its thread.
             if interface.session.subscriptions is not None:
                 interface.session.subscriptions.end_loops()
-            portal.stop(interface.close)
+            portal.stop(interface.session.release if _exiting else interface.close)
+            # Not before: an interrupted caller tries again.
+            if _exiting:
+                self._made[pid] = LastPortal(), interface
+            else:
+                self._made.pop(pid, None)
+
+
+_interfaces: weakref.WeakSet[RedisInterface] = weakref.WeakSet()
+_exiting = False
+
+
+@atexit.register
+def _end_loops() -> None:
+    """End the loop threads before the interpreter freezes them somewhere.
+
+    Connections of calling threads stay open: an exit function that was registered before REEM was imported, a log
+    handler that is flushed at exit and `__del__` come later, and may still write. The process closes them.
+    """
+    global _exiting
+    _exiting = True
+    for each in list(_interfaces):
+        each._background.stop()
+        each._closing.detach()  # it would keep a ship, and with it all that the ship's module has
 
 
 def _is_left_over() -> bool:
-    """Return whether this is a daemon thread that still runs while the interpreter ends, which closes interfaces."""
+    """Return whether this is a daemon thread that still runs while the interpreter ends."""
     return current_thread().daemon and not main_thread().is_alive()
 
 
@@ -163,7 +172,8 @@ class RedisInterface:
     Nothing is connected before the first call that needs it. Any number of threads may share it:
     reads and writes run on the caller's thread over a connection of their own. Subscriptions and
     ships with `async def` methods run on a background event loop, one daemon thread per interface,
-    started when first needed and ended by `close()` or at exit.
+    started when first needed and ended by `close()` or at exit. Calls work until the process ends, in functions of
+    `atexit`, log handlers and `__del__` too.
 
     Args:
         host: A host name, `host:port`, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`; if none is
@@ -216,11 +226,11 @@ class RedisInterface:
         settings = {"namespace": namespace, "timeout": timeout, "read_from_replicas": read_from_replicas, **options}
         settings |= {"local": local, "local_memory": local_memory}
         self._direct = _OnThread(host, ships, **settings)
-        self._direct.session.transport.states = _States()
         self._direct.session.tasks = Threads()
-        self._uneven: set[int] = set()  # threads in whose calls a handler's call ended in an error
         self._background = _Background(self._direct)
-        self._closing = weakref.finalize(self, self._background.close)  # when dropped, or at exit
+        self._closing = weakref.finalize(self, self._background.close)
+        self._closing.atexit = False
+        _interfaces.add(self)  # see `_end_loops`
 
     @property
     def hostname(self) -> str:
@@ -268,39 +278,23 @@ class RedisInterface:
     def _run(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run one of the core's coroutines on a store to its end and return the result."""
         try:
-            # Ships with `async def` methods need a loop. On the loop's own thread `_wait` refuses: the call would wait
-            # for itself.
-            if self._direct.session.ships.asynchronous or self._background.inside:
-                return self._wait(coroutine)
-            result = finish(coroutine)
+            # Ships with `async def` methods need a loop. Else the loop's own thread may call too, in a log handler or
+            # a `__del__`: the call waits for the server alone.
+            return self._wait(coroutine) if self._direct.session.ships.asynchronous else finish(coroutine)
         except SELF_EXPLANATORY as error:  # forty lines of ours between the caller's and the message would not help
             self._broken_off()
             raise error.with_traceback(None) from None
-        except BaseException as error:
+        except BaseException:
             self._broken_off()
-            if isinstance(error, InterfaceClosed) and _is_left_over():
-                raise SystemExit from None  # the thread is about to be stopped anyway, without a word
             raise
-        # A call of a handler of signals, inside of one of this thread's calls, has ended in an error and could give
-        # nothing back.
-        if self._uneven:
-            self._broken_off()
-        return result
 
     def _broken_off(self) -> None:
-        """Give back what this thread holds, at the end of the first of its calls that are under way.
-
-        There are several only where a handler of signals calls: what it came into still needs what it has.
-        """
-        me, frame = get_ident(), sys._getframe(1).f_back
-        # Looks for another `_run` of this interface below on the stack: then this call came out of a handler of
-        # signals.
+        """Give back what this thread holds, unless this call came out of another one, by way of a ship or `__del__`."""
+        frame = sys._getframe(1).f_back
         while frame is not None:
             if frame.f_code is RedisInterface._run.__code__ and frame.f_locals.get("self") is self:
-                self._uneven.add(me)
                 return
             frame = frame.f_back
-        self._uneven.discard(me)
         self._direct.session.transport.broken_off()
 
     def _wait(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
@@ -310,7 +304,12 @@ class RedisInterface:
         except BaseException:
             coroutine.close()
             raise
-        return portal.call(coroutine)
+        try:
+            return portal.call(coroutine)
+        except InterfaceClosed:
+            if _is_left_over():
+                raise SystemExit from None  # the thread is about to be stopped anyway, without a word
+            raise
 
     def initialize(self) -> None:
         """Connect now and check the server."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from reem_async.concurrency.aside import ensure_imported
+from reem_async.concurrency.queues import Policy
 from reem_async.errors import RedisError, ReemError
 from reem_async.store import store as core
 
@@ -13,11 +13,7 @@ from ._twin import documented_by
 from .accessor import Accessor
 from .connection import RedisInterface
 from .low_level import Reader, Writer
-
-if TYPE_CHECKING:
-    from reem_async.concurrency.queues import Policy
-
-    from .subscribe import PatternWatch
+from .subscribe import PatternWatch
 
 __all__ = ["KeyValueStore", "Reader", "Writer"]
 
@@ -105,9 +101,6 @@ class KeyValueStore:
 
     def watch(self, *patterns: str, policy: Policy | None = None, largest: int | None = None) -> PatternWatch:
         """Return an iterator over every change of all keys that some patterns name."""
-        ensure_imported("reem.subscribe")
-        from .subscribe import PatternWatch
-
         return PatternWatch(self.interface, patterns, policy, largest=largest)
 
     def track_schema_changes(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, Self
 
-from reem_async.concurrency.aside import aside
+from reem_async.concurrency.locks import ProcessLock
 from reem_async.concurrency.queues import EMPTY, Ended, Policy
 from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.errors import BadType, InterfaceClosed
@@ -74,7 +74,7 @@ class Watch(Following):
         try:
             self._interface._wait(self._core.close())
         except InterfaceClosed:  # the event loop that would do it has ended, or is too busy for that
-            aside(self._core.queue.close)
+            self._core.queue.close()
 
     def __iter__(self) -> Self:
         return self
@@ -219,17 +219,17 @@ class CallbackSubscriber(SilentSubscriber):
         # What answers `value()` is what calls are made of, so a callback never sees a copy older than its update.
         self._core = self._calls
         self._thread: threading.Thread | None = None
-        self._starting = threading.Lock()  # taken aside only
+        self._starting = ProcessLock()
         if inspect.iscoroutinefunction(callback_function):
             raise BadType("callback_function is a coroutine function, which a thread cannot call; use reem_async")
 
     def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
         self.interface._wait(self._calls._updates.listen())
-        aside(self._start)
+        self._start()
 
     def _start(self) -> None:
-        with self._starting:
+        with self._starting.here():
             # Again after a fork, which leaves the child without it.
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)

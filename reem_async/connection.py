@@ -11,6 +11,7 @@ from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport.addresses import NewTransport, ToOneServer
+from .transport.aio import AsyncTransport
 from .transport.options import Options
 from .transport.state import State, StateChange, StateChanges
 
@@ -18,9 +19,7 @@ __all__ = ["RedisInterface"]
 
 
 def _on_event_loop(options: Options) -> ToOneServer:
-    """Return a transport for event loops; imported here, so that blocking programs start without it."""
-    from .transport.aio import AsyncTransport
-
+    """Return a transport for event loops."""
     return AsyncTransport(options)
 
 

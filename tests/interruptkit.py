@@ -1,6 +1,6 @@
-"""Signals at random instants in every blocking call: handlers that raise, that call REEM, and that close it.
+"""Signals at random instants in every blocking call: handlers that raise, as Ctrl-C does, and that close the interface.
 
-python tests/interruptkit.py [--seed N] [--seconds N] [--mode raise|call|close|mixed] [--calls NAME,NAME] [--url URL]
+python tests/interruptkit.py [--seed N] [--seconds N] [--mode raise|close|mixed] [--calls NAME,NAME] [--url URL]
 
 What must hold: each call ends, with what it is for, or with what the handler did to it; calls of other threads go on;
 no reply meets another call; nothing crashes. A call that has not ended in 15 s is shown with the stacks of all
@@ -40,46 +40,6 @@ from reem_async.plan.slots import Slot
 STUCK = 15.0
 """Seconds after which a call has not ended: all limits of the calls below are far shorter."""
 ARRAY = np.arange(20_000, dtype=float)
-
-
-def at_step(place, action, call):
-    """Make a call, and take an action before its step of this number, as a handler of signals might.
-
-    A step is one instruction of Python on this thread, wherever it is. In a finalizer the action waits for the
-    first step behind it: Python keeps from the call what is raised there. Returns whether it was taken.
-    """
-    left, taken = place, False
-
-    def local(frame, event, arg):
-        nonlocal left, taken
-        if event == "opcode":
-            left -= 1
-            if left <= 0 and not taken and not in_finalizer(frame):
-                taken = True
-                sys.settrace(None)
-                action()
-        return local
-
-    def begin(frame, event, arg):
-        frame.f_trace = local  # Python 3.13 takes no heed of the next line if nothing traces the frame yet
-        frame.f_trace_opcodes = True
-        return local
-
-    sys._getframe().f_trace_opcodes = True  # Python 3.12 looks, as tracing begins, whether anybody has ever wanted it
-    before = sys.gettrace()
-    sys.settrace(begin)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-    return taken
-
-
-def in_finalizer(frame):
-    """Tell whether a frame, or one that called it, is an object's `__del__`."""
-    while frame is not None and frame.f_code.co_name != "__del__":
-        frame = frame.f_back
-    return frame is not None
 
 
 class Work:
@@ -241,7 +201,7 @@ class Stress:
 
     def __init__(self, work, mode, calls, seed):
         self.work, self.calls = work, calls
-        self.modes = ["raise", "call", "close"] if mode == "mixed" else [mode]
+        self.modes = ["raise", "close"] if mode == "mixed" else [mode]
         self.random = random.Random(seed)
         self.armed = ""
         self.hits, self.problems = Counter(), []
@@ -256,12 +216,6 @@ class Stress:
             raise KeyboardInterrupt
         if mode == "close":
             self.work.interface.close()
-        if mode == "call":
-            name = self.random.choice(QUICK)
-            try:
-                getattr(self.work, name)()
-            except BaseException as error:
-                self.problems.append(f"{name} in a handler during {self.call}: {error!r}")
 
     def step(self):
         self.call, mode = self.random.choice(self.calls), self.random.choice(self.modes)
@@ -321,7 +275,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=time.time_ns() % 10**6)
     parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--mode", choices=("raise", "call", "close", "mixed"), default="mixed")
+    parser.add_argument("--mode", choices=("raise", "close", "mixed"), default="mixed")
     parser.add_argument("--calls", default=",".join(CALLS))
     parser.add_argument("--url")
     parser.add_argument("--prefix", default="interrupts:")

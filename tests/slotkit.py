@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -23,3 +24,43 @@ def shared_in(value: Any) -> int:
     if isinstance(value, dict):
         return sum(map(shared_in, value.values()))
     return int(in_slot(value))
+
+
+def at_step(place, action, call):
+    """Make a call, and take an action before its step of this number, as a handler of signals might.
+
+    A step is one instruction of Python on this thread, wherever it is. In a finalizer the action waits for the
+    first step behind it: Python keeps from the call what is raised there. Returns whether it was taken.
+    """
+    left, taken = place, False
+
+    def local(frame, event, arg):
+        nonlocal left, taken
+        if event == "opcode":
+            left -= 1
+            if left <= 0 and not taken and not in_finalizer(frame):
+                taken = True
+                sys.settrace(None)
+                action()
+        return local
+
+    def begin(frame, event, arg):
+        frame.f_trace = local  # Python 3.13 takes no heed of the next line if nothing traces the frame yet
+        frame.f_trace_opcodes = True
+        return local
+
+    sys._getframe().f_trace_opcodes = True  # Python 3.12 looks, as tracing begins, whether anybody has ever wanted it
+    before = sys.gettrace()
+    sys.settrace(begin)
+    try:
+        call()
+    finally:
+        sys.settrace(before)
+    return taken
+
+
+def in_finalizer(frame):
+    """Tell whether a frame, or one that called it, is an object's `__del__`."""
+    while frame is not None and frame.f_code.co_name != "__del__":
+        frame = frame.f_back
+    return frame is not None

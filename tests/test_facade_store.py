@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import logging
 import pickle
 import signal
 import threading
@@ -220,7 +221,7 @@ def test_it_works_inside_a_running_event_loop(server_url, key):
 
 
 def test_a_blocking_call_on_the_loop_thread_is_an_error_not_a_deadlock(kvs, interface, key):
-    """Found the hard way: whatever loop REEM runs is asked to make a blocking call."""
+    """Whatever loop REEM runs is asked to follow, which would wait for itself. A read only waits for the server."""
     kvs[key()] = 1
     subscriber = reem.SilentSubscriber(key(), interface)
     subscriber.listen()
@@ -229,8 +230,9 @@ def test_a_blocking_call_on_the_loop_thread_is_an_error_not_a_deadlock(kvs, inte
     outcomes = []
 
     def misuse():
+        assert kvs[key()].read() == 1
         try:
-            outcomes.append(kvs[key()].read())
+            outcomes.append(kvs[key()].watch().listen())
         except BaseException as error:
             outcomes.append(error)
 
@@ -239,6 +241,69 @@ def test_a_blocking_call_on_the_loop_thread_is_an_error_not_a_deadlock(kvs, inte
     eventually(lambda: len(outcomes) == len(loops))
     assert any(isinstance(outcome, reem.WrongLoop) for outcome in outcomes), outcomes
     assert kvs[key()].read() == 1
+
+
+def test_log_handlers_and_finalizers_may_write_on_the_loop_thread(server_url, key, raw):
+    """A log in the store has REEM's own warnings, and what a `__del__` writes arrives wherever garbage is collected."""
+    errors, threads, logger = [], set(), logging.getLogger("reem")
+    interface = reem.RedisInterface(server_url)
+    log, motor = (reem.KeyValueStore(interface)[key(name)] for name in ("log", "motor"))
+    log.write([])
+
+    def guarded(call, value):
+        try:
+            threads.add(threading.current_thread().name)
+            call(value)
+        except Exception as error:
+            errors.append(error)
+
+    class ToStore(logging.Handler):
+        def emit(self, record):
+            guarded(log.append, record.getMessage())
+
+    class Motor:
+        def __init__(self):
+            self.me = self  # only the garbage collector ends it
+
+        def __del__(self):
+            guarded(motor.write, "off")
+
+    handler = ToStore()
+    logger.addHandler(handler)
+    portal = interface._background.started()[0]
+    try:
+        with reem.SilentSubscriber(key("followed"), interface):
+            wire = next(iter(interface._followers.session.subscriptions._wires.values()))
+            wire.abort_soon(reem.ConnectionLost("cut"))
+            eventually(lambda: any("cut" in line for line in log.read()))
+            Motor()
+            portal._loop.call_soon_threadsafe(gc.collect)
+            eventually(lambda: motor.read() == "off")
+    finally:
+        logger.removeHandler(handler)
+        interface.close()
+    assert errors == []
+    assert "reem-loop" in threads
+
+
+def test_a_log_handler_may_publish_the_warning_of_its_own_outage(caplog):
+    """It is dropped like everything else then, and not warned of in turn without end."""
+    interface = reem.RedisInterface("127.0.0.1:1")
+    space = reem.PublishSpace(interface, outage="drop")
+
+    class ToSpace(logging.Handler):
+        def emit(self, record):
+            space["log"] = record.getMessage()
+
+    handler = ToSpace()
+    logging.getLogger("reem").addHandler(handler)
+    try:
+        space["arm"] = 1
+    finally:
+        logging.getLogger("reem").removeHandler(handler)
+        interface.close()
+    assert space.dropped == 2
+    assert len([each for each in caplog.records if "until the server is back" in each.message]) == 1
 
 
 def test_threads_are_named_daemons_and_gone_after_close(server_url, key):

@@ -13,7 +13,7 @@ import threading
 import numpy as np
 import orjson
 import pytest
-from interruptkit import at_step
+from slotkit import at_step
 
 from reem_async.local import host as local_host
 from reem_async.local import path as local_path

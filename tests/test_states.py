@@ -81,8 +81,8 @@ def test_an_interrupt_on_the_way_to_a_callback_leaves_the_change_to_the_next():
     class Interrupted(States):
         """Ctrl-C comes once as the step that asks for the next change is done."""
 
-        def apart(self, step):
-            result = step()
+        def _next(self, turn):
+            result = super()._next(turn)
             if isinstance(result, StateChange) and not interrupted:
                 interrupted.append(result)
                 raise KeyboardInterrupt

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import weakref
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Locks", "ThreadLock"]
+__all__ = ["Locks", "ProcessLock", "ThreadLock"]
 
 Lock = TypeVar("Lock", bound=Any)
 
@@ -58,6 +59,21 @@ class Locks(Generic[Lock]):
         """Forget them: they belong to another event loop."""
         self._recent.clear()
         self._older.clear()
+
+
+class ProcessLock:
+    """A lock of threads that is free in a forked child, where a thread that holds it may not exist.
+
+    A signal handler may take it again on the same thread.
+    """
+
+    def __init__(self) -> None:
+        self._locks: dict[int, threading.RLock] = {}
+
+    def here(self) -> threading.RLock:
+        """Return this process's lock; `with` takes it in one step, which Ctrl-C cannot divide."""
+        pid = os.getpid()
+        return self._locks.get(pid) or self._locks.setdefault(pid, threading.RLock())
 
 
 class ThreadLock:

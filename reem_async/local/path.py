@@ -1,6 +1,6 @@
 """What an interface has of the local path: the segments of its publishers, and who near them listens.
 
-What shares memory is imported when first needed: not every system has it, and not every program large values.
+What shares memory is imported only where the system has it.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..concurrency.aside import ensure_imported
 from ..errors import BadValue
 from ..plan.keys import Keys
 from ..plan.slots import Slot, starts
 
-if TYPE_CHECKING:
+if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
+    from .host import host
     from .reader import LocalReader
-    from .segment import Segment
+    from .segment import HEAD, SLOTS, Segment
 
 __all__ = ["LEAST", "MEMORY", "LocalPath"]
 
@@ -74,9 +74,6 @@ class LocalPath:
     def reader(self) -> LocalReader:
         """What looks into the memory of publishers near by; only where there is a `host`."""
         if self._reader is None:
-            ensure_imported("reem_async.local.reader")
-            from .reader import LocalReader
-
             self._reader = LocalReader()
         return self._reader
 
@@ -85,9 +82,6 @@ class LocalPath:
         """What names the processes near by; empty if this is switched off, or cannot be."""
         if self._off or not hasattr(os, "memfd_create"):
             return ""
-        ensure_imported("reem_async.local.host")
-        from .host import host
-
         return host()
 
     def channel(self, keys: Keys) -> str:
@@ -140,9 +134,6 @@ class LocalPath:
         """
         if self._pid != os.getpid():  # those are the parent's: a forked child has its own
             self._pid, self._segments = os.getpid(), {}
-        ensure_imported("reem_async.local.segment")
-        from .segment import HEAD, SLOTS, Segment
-
         now = time.monotonic()
         segment = self._segments.get(channel)
         if segment is None or segment.shape.room < room:

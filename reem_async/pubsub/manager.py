@@ -29,12 +29,12 @@ from ..transport.wire import Wire, close_all
 from .heartbeats import Heartbeats
 from .inbox import Inbox
 from .invalidations import Invalidations
+from .key_watcher import KeyWatcher
 from .listeners import NOBODY, Beginning, Listener, ListenerGroup, Topic
 from .subscribing import Subscribing
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport
-    from .key_watcher import KeyWatcher
 
 __all__ = ["Listener", "SubscriptionManager", "Topic", "manager_of"]
 
@@ -224,8 +224,6 @@ class SubscriptionManager:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
         if self._key_watcher is None:
-            from .key_watcher import KeyWatcher
-
             self._key_watcher = KeyWatcher(self)
         return self._key_watcher
 

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 
-from ..concurrency.aside import aside
 from ..errors import BadValue, ServerFailed
 from .process import HOST, PortTaken, ServerProcess, ServerProgram
 from .programs import find_program
@@ -113,7 +112,7 @@ class EmbeddedCluster(Startable):
         self._replicas = replicas
         self._node_timeout = node_timeout
         self._json = json
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._owner: int | None = None
         self._finalizer: weakref.finalize[[], EmbeddedCluster] | None = None
         self.nodes: list[ClusterNode] = []
@@ -126,7 +125,7 @@ class EmbeddedCluster(Startable):
             ServerFailed: A node ended, or they did not find each other; nothing is left behind.
         """
         if not self._is_in_fork() and not self.nodes:
-            self._start_aside()
+            self._start_or_stop()
 
     def _start(self) -> None:
         with self._lock:
@@ -153,7 +152,7 @@ class EmbeddedCluster(Startable):
     def stop(self) -> None:
         """Stop all nodes and wait until they are gone; nothing if they do not run."""
         if not self._is_in_fork():
-            aside(self._stop)
+            self._stop()
 
     def _stop(self) -> None:
         with self._lock:

@@ -17,8 +17,6 @@ from reem_async.server.process import HOST, PortTaken, ServerProcess, has_data
 from reem_async.server.programs import find_program
 from reem_async.server.startable import Startable
 
-from ..concurrency.aside import aside
-
 __all__ = ["EmbeddedServer"]
 
 ATTEMPTS = 10  # to find a port that nobody takes in the moment before the server does
@@ -84,7 +82,7 @@ class EmbeddedServer(Startable):
         self._password = password
         self._snapshot = None if snapshot is None else Path(snapshot).absolute()
         self._json = json
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._owner: int | None = None
         self._process: ServerProcess | None = None
         self._finalizer: weakref.finalize[[], EmbeddedServer] | None = None
@@ -101,7 +99,7 @@ class EmbeddedServer(Startable):
             FileNotFoundError: the snapshot is not there.
         """
         if not self._is_in_fork() and not self.running:
-            self._start_aside()
+            self._start_or_stop()
 
     def _start(self) -> None:
         with self._lock:
@@ -119,7 +117,7 @@ class EmbeddedServer(Startable):
         With a directory, everything written is on disk afterwards.
         """
         if not self._is_in_fork():
-            aside(self._stop)
+            self._stop()
 
     def _stop(self) -> None:
         with self._lock:

@@ -10,8 +10,6 @@ from typing import Self
 import anyio
 import anyio.to_thread
 
-from ..concurrency.aside import aside
-
 __all__ = ["Startable"]
 
 
@@ -31,15 +29,15 @@ class Startable(ABC):
 
     @abstractmethod
     def _start(self) -> None:
-        """Do what `start` does, where no signal interrupts."""
+        """Do what `start` does; may be interrupted anywhere."""
 
     def _is_in_fork(self) -> bool:
         # Asked before a lock is touched: a thread that the fork has left behind may hold it.
         return self._owner is not None and self._owner != os.getpid()
 
-    def _start_aside(self) -> None:
+    def _start_or_stop(self) -> None:
         try:
-            aside(self._start)
+            self._start()
         except BaseException:  # whoever is interrupted leaves nothing running that would be nobody's
             self.stop()
             raise

@@ -9,22 +9,21 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
-from ..concurrency.aside import ensure_imported
+from ..concurrency.queues import Newest, Policy, chosen
 from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey
 from ..plan.documents import number_text
 from ..plan.handles import Handle
 from ..plan.paths import Path, check_element, check_name, show
+from ..pubsub.mirror import Mirror
+from ..pubsub.subscribers import Watch
+from .catalog import Outline, outline_at
 from .document import DocumentWriter
 from .edit import Edit
 from .low_level import Reader, Writer
 from .reader import DocumentReader, opened
 
 if TYPE_CHECKING:
-    from ..concurrency.queues import Policy
-    from ..pubsub.mirror import Mirror
-    from ..pubsub.subscribers import Watch
     from ..session import Session
-    from .catalog import Outline
 
 __all__ = ["Accessor", "Edit"]
 
@@ -209,9 +208,6 @@ class Accessor(Handle):
             MissingKey: Nothing is here.
             BadData: What is here was not written by REEM.
         """
-        ensure_imported("reem_async.store.catalog")
-        from .catalog import outline_at
-
         return await outline_at(self._reader.session, self.full_path)
 
     async def pop(self, key: str | int = -1, *default: Any) -> Any:
@@ -418,9 +414,6 @@ class Accessor(Handle):
             stored: Yield what is only stored, too. It needs the right to use CLIENT TRACKING; without, a warning is
                 logged, and what is published is told.
         """
-        from ..concurrency.queues import Newest, chosen
-        from ..pubsub.subscribers import Watch
-
         return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
@@ -434,9 +427,6 @@ class Accessor(Handle):
             largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
                 is told in its place. `kvs["arm"]["image"].read()` fetches it.
         """
-        ensure_imported("reem_async.pubsub.mirror")
-        from ..pubsub.mirror import Mirror
-
         return Mirror(self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..concurrency.aside import ensure_imported
 from ..errors import SELF_EXPLANATORY, BadKey, BadType, BadValue, ConnectionLost, MissingKey, MissingTop, ReemError
 from ..plan import Plan
+from ..plan.arithmetic import Operation, calculate, compute
 from ..plan.changes import SILENT, Change, EncodedAttachment, Telling
 from ..plan.documents import number_text
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
@@ -31,9 +31,6 @@ from ..plan.writes import (
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail
 from .tracking import ALWAYS_TRACKED, saw_shape
-
-if TYPE_CHECKING:
-    from ..plan.arithmetic import Operation
 
 __all__ = ["Assignment", "DocumentWriter", "Notifier", "Outages", "Turn"]
 
@@ -263,9 +260,6 @@ class DocumentWriter:
 
     async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
         """Apply a JSON arithmetic command; returns the new number."""
-        ensure_imported("reem_async.plan.arithmetic")
-        from ..plan.arithmetic import calculate
-
         text = number_text(operand, (self.name, *path))
         if isinstance(operand, np.generic):
             operand = operand.item()
@@ -277,8 +271,6 @@ class DocumentWriter:
 
     async def compute(self, path: Path, function: Any) -> Any:
         """Replace the number at `path` by a function of it; returns the new number."""
-        ensure_imported("reem_async.plan.arithmetic")
-        from ..plan.arithmetic import compute
 
         def plan(telling: Telling) -> Plan:
             return compute(self.keys, path, function, telling, self.session.cache)

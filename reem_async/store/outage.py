@@ -215,12 +215,13 @@ class Outage:
         self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float, error: ReemError
     ) -> None:
         """Note that a key is out of reach, and do with the updates that met this as the policy says."""
-        if not self._out:
+        is_first = not self._out
+        self._away = True
+        self._out.setdefault(writer.keys.document, _Out(writer))
+        if is_first:  # noted before it is logged: a log handler may publish, too
             self._told = self.dropped
             what = "dropped" if self.policy == "drop" else "kept, the newest of each place,"
             logger.warning("what is published is %s until the server is back: %s", what, error)
-        self._away = True
-        self._out.setdefault(writer.keys.document, _Out(writer))
         if isinstance(error, ConnectionLost):  # it was applied or not: sent again, it could be applied twice
             self._count(writer.keys, len(assignments))
         else:

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
-from ..concurrency.aside import ensure_imported
+from ..concurrency.queues import Policy
 from ..connection import RedisInterface
 from ..errors import BadType, MissingKey
 from ..plan.paths import parse
+from ..pubsub.pattern_watch import PatternWatch
 from ..session import Session
 from .accessor import _NOTHING as _NOTHING
 from .accessor import Accessor
+from .catalog import names
 from .document import DocumentWriter
 from .reader import DocumentReader
 from .tracking import Tracking
-
-if TYPE_CHECKING:
-    from ..concurrency.queues import Policy
-    from ..pubsub.pattern_watch import PatternWatch
 
 _MOST_TOPS = 1000
 """Accessors of top-level keys that are kept: only to be quick, any is made anew when it is asked for."""
@@ -124,9 +122,6 @@ class KeyValueStore:
         One round trip for about 1000 keys of the server. Not atomic: a key that is written or deleted
         meanwhile may or may not be among them.
         """
-        ensure_imported("reem_async.store.catalog")
-        from .catalog import names
-
         return sorted([name async for name in names(self.interface, pattern)])
 
     async def pop(self, key: str, *default: Any) -> Any:
@@ -167,9 +162,6 @@ class KeyValueStore:
         Raises:
             BadKey: Not a pattern.
         """
-        ensure_imported("reem_async.pubsub.pattern_watch")
-        from ..pubsub.pattern_watch import PatternWatch
-
         return PatternWatch(self.interface.session, patterns, policy, largest=largest)
 
     async def setdefault(self, key: str, default: Any = None) -> Any:

@@ -18,7 +18,6 @@ from functools import partial
 
 import redis.exceptions
 
-from ..concurrency.aside import aside
 from ..concurrency.locks import Locks, ThreadLock
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, patience, unsent
@@ -54,7 +53,6 @@ class _Line:
 
     def __init__(self, options: Options, states: States, lines: list[weakref.ref[_Line]]) -> None:
         self._states, self._lines = states, lines
-        self._is_made = False
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
@@ -62,8 +60,10 @@ class _Line:
             self._tls = hasattr(self._socket, "context")
             # Python asks whether a socket with a time limit is ready before it sends, too. This one has none.
             self._out = self._socket if self._tls else self._socket.dup()
-        except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
+        except BaseException as error:  # redis-py lets pass what a peer's nonsense makes of its parser
             self._connection.disconnect()
+            if not isinstance(error, Exception):  # Ctrl-C
+                raise
             raise options.refused(error) from error
         if not self._tls:
             self._out.settimeout(0.0)
@@ -85,8 +85,7 @@ class _Line:
         except ConnectionLost as error:
             raise unanswered(options.address, error) from error
         self.plain = bool(probed) and is_plain(probed[0])
-        self._states.opened(options.address, who([self.introduction]), tell=False)
-        self._is_made = True
+        self._states.opened(options.address, who([self.introduction]))
         lines.append(weakref.ref(self, lines.remove))
 
     def _set_limit(self, limit: float) -> None:
@@ -216,7 +215,7 @@ class _Line:
         """Close the connection and return the error that says why."""
         self.close()
         error = ConnectionLost(reason)
-        self._states.lost(error, tell=self._is_made)  # else whoever has it made tells
+        self._states.lost(error)
         return error
 
     def close(self) -> None:
@@ -272,10 +271,7 @@ class BlockingTransport:
             except IndexError:
                 if stale is not None:  # there was none left
                     stale.lost("the server closed an idle connection")
-                try:
-                    return aside(self._opened)
-                finally:
-                    self.states.tell()  # here: what is called back may need a lock that this thread has
+                return self._opened()
             if line.fresh():
                 return line
             line.close()

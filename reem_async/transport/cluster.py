@@ -398,18 +398,18 @@ class ClusterTransport(Rooted):
                 else:
                     await route.refused(problem)
 
-    def lost(self, address: Address, reason: Exception, *, tell: bool) -> bool:
+    def lost(self, address: Address, reason: Exception) -> bool:
         """Note that the connections to a node broke; return whether it is missed."""
         if not isinstance(reason, InterfaceClosed):
             self._gone.add(address)
-        self.states.lost(reason, tell=tell)
+        self.states.lost(reason)
         return address in self._gone and self.states.last.state != "closed"
 
-    def opened(self, address: Address, server: str | None, *, tell: bool) -> None:
+    def opened(self, address: Address, server: str | None) -> None:
         """Note a connection to a node; all is well when no node is missed any more."""
         self._gone.discard(address)
         if not self._gone:
-            self.states.opened(f"{address[0]}:{address[1]}", server, tell=tell)
+            self.states.opened(f"{address[0]}:{address[1]}", server)
 
 
 def _address(host: bytes | str | None, port: Any, asked: str) -> Address:
@@ -426,14 +426,14 @@ class _NodeStates(States):
         self._cluster = cluster
         self._node = address
 
-    def opened(self, address: str, server: str | None, *, tell: bool = True) -> None:
+    def opened(self, address: str, server: str | None) -> None:
         """Pass it on."""
-        self._cluster.opened(self._node, server, tell=tell)
+        self._cluster.opened(self._node, server)
 
     def tell(self) -> None:
         """Pass it on."""
         self._cluster.states.tell()
 
-    def lost(self, reason: Exception, *, tell: bool = True) -> bool:
+    def lost(self, reason: Exception) -> bool:
         """Pass it on."""
-        return self._cluster.lost(self._node, reason, tell=tell)
+        return self._cluster.lost(self._node, reason)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..concurrency.aside import ensure_imported
 from ..errors import BadType, BadValue
 from . import Transport
 from .addresses import NewTransport
@@ -35,14 +34,12 @@ def way_to(
     url = host if isinstance(host, str) else getattr(host, "url", "")
     if url.startswith(_CLUSTER):
         # Imported only where an address asks for it: a program for one server starts without it.
-        ensure_imported("reem_async.transport.cluster")
         from .cluster import ClusterOptions, ClusterTransport
 
         cluster = ClusterOptions(url, timeout, options)
         nodes = ClusterTransport(cluster, new_transport)
         return cluster, nodes, _readers(nodes, cluster, new_transport) if replicas else nodes
     if url.startswith(_SENTINEL):
-        ensure_imported("reem_async.transport.sentinel")
         from .sentinel import SentinelOptions, SentinelTransport
 
         watched = SentinelOptions(url, timeout, options)
@@ -61,7 +58,6 @@ def way_to(
 
 
 def _readers(primaries: Replicated, options: Options, new_transport: NewTransport) -> Transport:
-    ensure_imported("reem_async.transport.replicas")
     from .replicas import Readers
 
     return Readers(primaries, options, new_transport)

@@ -6,6 +6,7 @@ transports of this package take the socket over, since its reading and writing a
 
 from __future__ import annotations
 
+import codecs
 import ipaddress
 import os
 import ssl
@@ -31,6 +32,10 @@ __all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machin
 
 Address = tuple[str, int]
 """Host and port."""
+
+codecs.lookup("idna")
+"""What a socket needs of a host's name: imported by a first connection it may be too late, while Python is shutting
+down, or in the middle of a fork."""
 
 _SCHEMES = ("redis://", "rediss://", "unix://")
 _LEAST = 1 << 20
@@ -95,7 +100,8 @@ class Options:
         try:
             # Made only to have redis-py refuse wrong options now, and not at the first call; nothing is connected.
             self.asynchronous_connection()
-            self.blocking_connection()
+            # Its `driver_info` serves all later ones: making one imports, which fails once Python is shutting down.
+            self.settings.setdefault("driver_info", self.blocking_connection().driver_info)
         except TypeError as error:
             hint = "; TLS is asked for by rediss:// or ssl=True" if "ssl_" in str(error) and not self.tls else ""
             raise BadType(f"RedisInterface: {error}; see redis-py's connection options{hint}") from None

@@ -15,12 +15,10 @@ import time
 import weakref
 from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
-from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import redis.exceptions
 
-from ..concurrency.aside import aside
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
@@ -254,7 +252,7 @@ class SentinelTransport(Standing):
     def _current(self) -> ToOneServer:
         """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
-            self._lookout = aside(partial(_Lookout, self._options, self, SentinelTransport._on_moved))
+            self._lookout = _Lookout(self._options, self, SentinelTransport._on_moved)
             self._options.changed = self._lookout.tell
         if self._moved:
             self._moved = False

@@ -10,8 +10,7 @@ import time
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
@@ -20,8 +19,6 @@ from ..errors import InterfaceClosed
 __all__ = ["State", "StateChange", "StateChanges", "States"]
 
 logger = logging.getLogger("reem.connection")
-
-Result = TypeVar("Result")
 
 State = Literal["idle", "connected", "lost", "reconnecting", "closed"]
 """idle: nothing was connected yet. lost: a connection broke and none is left that answers; the next call makes a
@@ -96,51 +93,38 @@ class States:
         self._servers: dict[str, str] = {}
         _all.append(weakref.ref(self, _all.remove))
 
-    def apart(self, step: Callable[[], Result]) -> Result:
-        """Take a step that takes the lock."""
-        return step()
-
     def changes(self) -> StateChanges:
         """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
-        return self.apart(self._changes)
+        return self._changes()
 
     def call(self, callback: Callable[[StateChange], object]) -> None:
         """Call `callback` with each change from now on; it must not block. What it raises is logged."""
         self._callbacks.append(callback)
 
-    def opened(self, address: str, server: str | None, *, tell: bool = True) -> None:
-        """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so).
+    def opened(self, address: str, server: str | None) -> None:
+        """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so)."""
+        self._opened(address, server)
+        self.tell()
 
-        Without `tell`, nobody is called back before `tell` is called: on a thread that works for another one, which
-        waits for it.
-        """
-        self.apart(partial(self._opened, address, server))
-        if tell:
-            self.tell()
-
-    def lost(self, reason: Exception, *, tell: bool = True) -> bool:
-        """Note that a connection broke, unless it was closed on purpose; return whether there is none now.
-
-        For `tell` see `opened`.
-        """
-        is_lost = self.apart(partial(self._lost, reason))
-        if tell:
-            self.tell()
+    def lost(self, reason: Exception) -> bool:
+        """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
+        is_lost = self._lost(reason)
+        self.tell()
         return is_lost
 
     def answered(self) -> None:
         """Note that the server answers over another connection than the one that was lost."""
-        self.apart(self._answered)
+        self._answered()
         self.tell()
 
     def retrying(self) -> None:
         """Note that a connection is made again."""
-        self.apart(self._retrying)
+        self._retrying()
         self.tell()
 
     def closed(self) -> None:
         """Note the end, which ends all iterators."""
-        self.apart(self._closed)
+        self._closed()
         self.tell()
 
     def tell(self) -> None:
@@ -149,7 +133,7 @@ class States:
             return
         turn = _Turn()
         try:
-            while (change := self.apart(partial(self._next, turn))) is not None:
+            while (change := self._next(turn)) is not None:
                 self._untold.popleft()  # not before: whoever is interrupted on the way to here leaves it to the next
                 for callback in tuple(self._callbacks):
                     try:

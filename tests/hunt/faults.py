@@ -1,4 +1,4 @@
-"""What breaks calls off: interrupts, cancels, cut connections, forks, and signal handlers that call or close REEM."""
+"""What breaks calls off: interrupts, cancels, cut connections, forks, and signal handlers that close REEM."""
 
 from __future__ import annotations
 
@@ -12,17 +12,13 @@ from collections.abc import Callable
 from typing import Any
 
 from chaos.proxy import Proxy
-from interruptkit import at_step
 
 from .clients import LIMIT, Asyncio, Blocking
 from .model import Op
 
-STEPS = 4000
-"""Instructions of Python that a call takes, at most, in the usual cases."""
-
 
 def interrupted(rng: random.Random, call: Callable[[], Any]) -> Any:
-    """Make a call with Ctrl-C, which raises KeyboardInterrupt, before one of its steps or a moment after it began."""
+    """Make a call with Ctrl-C, which raises KeyboardInterrupt, some time after it began."""
 
     def stop(*_: Any) -> None:
         raise KeyboardInterrupt
@@ -31,15 +27,11 @@ def interrupted(rng: random.Random, call: Callable[[], Any]) -> Any:
 
 
 def handled(rng: random.Random, call: Callable[[], Any], action: Callable[[], None]) -> Any:
-    """Make a call, and take an action before one of its steps, or a moment after it began, if it has not ended."""
+    """Make a call, and take an action some time after it began, if it has not ended."""
     return _handled(rng, call, lambda *_: action())
 
 
 def _handled(rng: random.Random, call: Callable[[], Any], handler: Callable[..., None]) -> Any:
-    result: list[Any] = []
-    if rng.random() < 0.6:  # anywhere, in equal parts between few and many steps
-        at_step(int(STEPS ** rng.random()), handler, lambda: result.append(call()))
-        return result[0]
     seconds = 10 ** rng.uniform(-5, -2.5)
     armed = [True]
 

@@ -271,7 +271,7 @@ class Hunter:
 
     def _fault(self) -> None:
         usual = [self._interrupt, self._cancel, self._cut]
-        fault = self.rng.choice([*usual, *usual, self._call, self._close])
+        fault = self.rng.choice([*usual, *usual, self._close])
         if self.rng.random() < 0.03:
             fault = self._fork
         self.counts[fault.__name__[1:]] += 1
@@ -361,28 +361,6 @@ class Hunter:
     def _stored(self, full: str) -> Any:
         kvs = self.ears[0].kvs
         return kvs[full].read() if full in kvs else ABSENT
-
-    def _call(self) -> None:
-        """Let a handler call, during a call: both come to their ends."""
-        client = self.rng.choice(self.blocking)
-        op, full = self._choose(client)
-        other, name = self._choose(client)
-        if name == full:
-            return
-        wrong: list[BaseException] = []
-
-        def action() -> None:
-            try:
-                self._take(client, other, name, " in a handler")
-            except BaseException as error:
-                wrong.append(error)
-
-        due = self._expect(client, op, full)
-        self._note(full, f"{client.label}, with a call in a handler: {op!r}")
-        faults.handled(self.rng, lambda: self._perform(client, op, full, due), action)
-        self._became(full, due.after)
-        if wrong:
-            raise wrong[0]
 
     def _fork(self) -> None:
         """Let a forked child call, and this process meanwhile."""
