@@ -20,7 +20,6 @@ from reem_async.transport.packing import Packer
 
 SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**6))
 PATIENCE = 30.0
-EVERY = sized(29, 7)
 
 
 def elsewhere(work):
