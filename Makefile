@@ -7,7 +7,7 @@ TOGETHER := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots mcap recording bench bench-recorder scale clean docs
+.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots week mcap recording bench bench-recorder scale clean docs
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -67,6 +67,9 @@ watching: $(VENV)/ready  ## 100,000 random changes by four processes beside watc
 
 slots: $(VENV)/ready  ## a million uses of slots of shared memory by processes that are killed; SLOTS="--seed 7 --uses 50000"
 	$(BIN)/python tests/slots.py $(SLOTS)
+
+week: $(VENV)/ready  ## a robot's week in an hour: programs, recorder, page and server fail at random; WEEK="--seed 7 --events 100"
+	$(BIN)/python tests/robotweek.py $(WEEK)
 
 mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCAP that Foxglove uses; needs npm
 	npm install --silent --no-fund --no-audit --no-package-lock --prefix tests/mcapcheck
