@@ -22,7 +22,6 @@ CONTENDERS = {
     "reem": Contender("REEM, blocking", "reem_blocking", "#0b5fa5"),
     "async": Contender("REEM, asyncio", "reem_asyncio", "#19a0a0"),
     "reem-local": Contender("REEM, blocking, at localhost", "reem_blocking", "#6fa8dc", host="localhost"),
-    "reem-static": Contender("REEM, blocking, static schema", "reem_static", "#2f3f8f"),
     "async-local": Contender("REEM, asyncio, at localhost", "reem_asyncio", "#8fd6d6", host="localhost"),
     "reem-off": Contender(
         "REEM, blocking, without shared memory", "reem_blocking", "#9db8d2", options={"local": "off"}

@@ -69,11 +69,6 @@ def strings_and_arrays(grown: Grown) -> list[Case]:
     for count in grown(ARRAYS):
         more = NEARBY if count == ARRAYS[-1] else ()
         cases += _both(f"arrays.{count}", (*FRONTS, "original", *more), {"kind": "arrays", "count": count})
-    both = ("reem", "reem-static")
-    cases.append(
-        CallCase("static.small", both, operation="set", value={"kind": "small"}, count=4000, limit=1.0, one_core=True)
-    )
-    cases.append(CallCase("static.arrays", both, operation="set", value={"kind": "arrays", "count": 10}, one_core=True))
     return cases
 
 

@@ -105,12 +105,6 @@ _EITHER = [
 ]
 
 
-_STATIC = [
-    Row(f"static schema, set of {text} / tracked", (case, "reem-static"), (case, "reem"), 1.0, 0.95)
-    for text, case in (("a small dict", "static.small"), ("10 arrays", "static.arrays"))
-]
-
-
 _FRAME, _IMAGE, _SMALL = "publish.frame", "publish.image", "publish.small"
 # The same, told to tell programs near by first.
 _EARLY = [("frame", _FRAME, "original", 0.15, 0.1), ("frame", _FRAME, "zenoh", 0.6, 0.35)]
@@ -179,7 +173,6 @@ def rows() -> list[Row]:
             for front, ours in FRONTS.items()
         ]
     found += _shared_memory()
-    found += _STATIC
     found.append(
         Row(
             "100 concurrent async reads, throughput / redis.asyncio",
@@ -248,7 +241,7 @@ _BARE = {
 def bare(row: Row) -> Row | None:
     """Return the row with a client in REEM's place that only moves the bytes; None where that says nothing."""
     client = "redis-py" if row.theirs[1] == row.ours[1] else _BARE.get(row.theirs[1])
-    if client is None or row.throughput or row.ours[0] == "import" or "static" in row.ours[0]:
+    if client is None or row.throughput or row.ours[0] == "import":
         return None
     theirs = (row.theirs[0], client) if row.theirs[1] == row.ours[1] else row.theirs
     return dataclasses.replace(row, ours=(row.ours[0], client), theirs=theirs)

@@ -106,7 +106,7 @@ class KeyValueStore:
     def track_schema_changes(
         self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
     ) -> None:
-        """Say whether the shape of what is written may change."""
+        """Do nothing: a switch of the first REEM."""
         self._core.track_schema_changes(set_value, keys, track=track)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -9,7 +9,6 @@ import os
 import random
 import time
 
-import numpy as np
 import pytest
 from conftest import PATIENCE
 
@@ -126,23 +125,14 @@ def test_a_dropped_watch_of_the_blocking_front_is_unsubscribed(server_url, key):
 
 
 async def test_a_store_and_its_transport_keep_a_bounded_number_of_keys(server_url, key):
-    """Whatever they keep for a key is made anew when it is gone; what was said of shapes stays."""
+    """Whatever they keep for a key is made anew when it is gone."""
     async with reem_async.RedisInterface(server_url) as interface:
         pspace = reem_async.PublishSpace(interface)
-        steady = key()
-        pspace.track_schema_changes(False, [steady])
-        held = pspace[steady]["x"]
         for number in range(2100):
             pspace[f"{key.prefix}:{number}"]
             interface.session.transport.ordered(f"{number}")
         assert len(pspace._tops) <= 1000
         assert len(interface.session.transport._orders.all()) <= 1000
-        await pspace[steady].write({"x": np.zeros(3)})
-        with pytest.raises(TypeError, match="track_schema_changes"):
-            await pspace[steady].write({"x": 1})
-        assert held._writer.tracking.by_key.get(held._writer.name)
-        pspace.track_schema_changes(True)
-        assert not held._writer.tracking.by_key.get(held._writer.name)
 
 
 class FailingShip(reem_async.BytesShip):
@@ -221,10 +211,9 @@ def test_what_is_remembered_of_documents_is_bounded():
         memory.saw_members(document, frozenset([b"x"]))
         memory.broke_off(document)
         memory.saw_layout(document, (), ())
-        memory.saw_shape(document, (), frozenset())
         memory.saw_number(document, (), 1.0)
         memory.saw_number("one", (document,), 1.0)
-    kept = (memory._members, memory._broken_off, memory._layouts, memory._shapes, memory._numbers)
+    kept = (memory._members, memory._broken_off, memory._layouts, memory._numbers)
     sizes = [len(each) for each in kept]
     assert max(sizes) <= 10_001
     assert len(memory._numbers["one"]) <= 100

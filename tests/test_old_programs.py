@@ -337,18 +337,6 @@ def test_a_subscribers_local_copy(interface, pspace, key):
         eventually(lambda: mirror.local_copy == {"a": 1})
 
 
-def test_track_schema_changes_by_its_other_name(kvs, key):
-    kvs[key()] = {"a": 1}
-    kvs.track_schema_changes(track=False)
-    kvs[key()]["a"] = 2
-    with pytest.raises(TypeError):
-        kvs[key()]["a"] = np.arange(3)
-    kvs.track_schema_changes(track=True, keys=[key()])
-    kvs[key()]["a"] = np.arange(3)
-    with pytest.raises(TypeError):
-        kvs.track_schema_changes()
-
-
 class Mode(enum.IntEnum):
     IDLE = 3
 

@@ -32,7 +32,6 @@ def full_cache():
     cache = ShapeCache()
     cache.saw_members("a", frozenset([b".x.image", b".y"]))
     cache.saw_number("a", ("n",), 5)
-    cache.saw_shape("a", ("x",), frozenset([".x.image"]))
     cache.saw_new("a")
     return cache
 

@@ -15,11 +15,11 @@ import zlib
 
 import numpy as np
 import pytest
-from conftest import assert_no_orphans, assert_same, keys_of, nothing_sent, url_of_user
+from conftest import assert_no_orphans, assert_same, nothing_sent, url_of_user
 
 import reem
 import reem_async
-from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, PathRefused, WrongLoop
+from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, WrongLoop
 
 A = np.arange(3.0)
 
@@ -41,64 +41,6 @@ class SetShip(reem.SpecialDatatypeShip):
 
     def get_label(self):
         return "set"
-
-
-# --- track_schema_changes(False) ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
-def test_a_static_write_removes_arrays_that_another_static_write_put_below_or_above(open_front, key, raw, space):
-    front = open_front(space)
-    front.kvs.track_schema_changes(False)
-    for parent in ({"a": {}}, {"a": {"b": {"image": np.arange(3)}}}):
-        for inner, child in ((["a"], {"b": {"image": np.arange(4)}}), (["a", "b"], {}), (["a", "b"], {"x": b"1"})):
-            front.write([key()], {"a": {"b": 0}})
-            for place, value in (([key()], parent), ([key(), *inner], child)) * 2:
-                with contextlib.suppress(BadType, PathRefused):  # of another shape than it had
-                    front.write(place, value)
-                assert_no_orphans(raw, key())
-            front.delete([key()])
-            assert keys_of(raw, key()) <= {f"{{{key()}}}:last"}
-
-
-@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
-def test_a_static_write_after_a_delete_is_registered(open_front, key, raw, space):
-    """The delete has removed the registry's entries with the arrays."""
-    front = open_front(space)
-    front.kvs.track_schema_changes(False)
-    for _ in range(2):
-        front.write([key()], {"img": A, "n": 1})
-        front.write([key()], {"img": A, "n": 1})
-        front.delete([key()])
-        assert_no_orphans(raw, key())
-        front.write([key()], {"img": A, "n": 1})
-        assert_no_orphans(raw, key())
-    front.delete([key()])
-    assert_no_orphans(raw, key())
-    assert not raw.exists(key())
-
-
-@pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
-def test_a_refused_static_write_leaves_nothing(open_front, front, key, raw, space):
-    """Somebody else took the parent away."""
-    static = open_front(space)
-    static.kvs.track_schema_changes(False)
-    static.write([key()], {"m": {}})
-    static.write([key(), "m"], {"img": A})
-    front.write([key()], 5)
-    with pytest.raises(reem.PathRefused):
-        static.write([key(), "m"], {"img": A})
-    assert_no_orphans(raw, key())
-    assert front.read([key()]) == 5
-
-
-def test_a_static_write_by_a_ship_that_appends_is_not_doubled(open_front, key):
-    """What was under the ship's key is removed first."""
-    front = open_front(ships=[SetShip()])
-    front.kvs.track_schema_changes(False)
-    for _ in range(3):
-        front.write([key()], {"s": {1, 2}})
-        assert front.read([key()]) == {"s": [1, 2]}
 
 
 # --- rights, numbers, keys ------------------------------------------------------------------------
@@ -439,25 +381,3 @@ def test_a_publish_from_another_event_loop_is_refused_though_one_is_under_way(se
         enough.set()
         thread.join()
     assert len(refused) == 30
-
-
-class Prefixed(reem_async.KeyValueStore):
-    """What a program may do to the names of its keys."""
-
-    def __getitem__(self, key):
-        return super().__getitem__("pre_" + key)
-
-
-async def test_a_store_with_its_own_names_still_vouches_for_shapes(server_url, key):
-    """`track_schema_changes` means keys that the store has met, whatever a subclass makes of names."""
-    async with reem_async.RedisInterface(server_url) as interface:
-        store = Prefixed(interface)
-        await store[key()].write({"a": A})
-        store.track_schema_changes(False)
-        try:
-            await store[key()].write({"a": A})
-            with pytest.raises(BadType, match="never changes"):
-                await store[key()].write({"a": 1})
-            assert store.at(key("b")).full_path == (key("b"),)
-        finally:
-            await store[key()].delete()

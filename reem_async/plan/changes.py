@@ -76,23 +76,20 @@ class Change(NamedTuple):
         judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
         attachments: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
-        looks: Whether to look for ships' keys that it replaces; if not, somebody vouches for there being none.
         gone: The suffixes of those that it replaces, if this is known for certain: the document is watched.
         notices: What tells subscribers.
         absent: What to raise if a list on the way has no such item from its end.
     """
 
     # What becomes of ships' keys that the change leaves without a placeholder:
-    #   looks, gone is None    the registry comes back in the same transaction, and what is too much is removed after it
-    #   looks, gone is known   the document is watched, so exactly these are removed in the transaction
-    #   not looks              nothing is looked for
+    #   gone is None    the registry comes back in the same transaction, and what is too much is removed after it
+    #   gone is known   the document is watched, so exactly these are removed in the transaction
     keys: Keys
     path: Path
     command: Command
     judge: Callable[[Reply], Any]
     attachments: tuple[EncodedAttachment, ...] = ()
     replaces: bool = True
-    looks: bool = True
     gone: tuple[bytes, ...] | None = None
     notices: Telling = SILENT
     absent: type[Exception] = MissingKey

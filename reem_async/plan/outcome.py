@@ -54,8 +54,6 @@ class Outcome:
 
     def _members(self) -> frozenset[bytes]:
         """Return what the registry held right after the change, as far as the server tells."""
-        if not self.it.looks:
-            return frozenset()
         # In the order in which `writes._change` sends: the command, SADD if there are attachments, then SMEMBERS.
         reply = self.replies[self.main + (2 if self.it.attachments else 1)]
         if isinstance(reply, Exception):

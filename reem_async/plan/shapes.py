@@ -1,7 +1,6 @@
 """What an interface remembers of the server, to need one round trip instead of two or three.
 
-All of it is only a guess: every use is checked against a reply of the same round trip, except under
-`track_schema_changes(False)`, where the user vouches for it.
+All of it is only a guess: every use is checked against a reply of the same round trip.
 """
 
 from __future__ import annotations
@@ -31,7 +30,6 @@ class ShapeCache:
         self._members: dict[str, frozenset[bytes]] = {}
         self._broken_off: set[str] = set()
         self._layouts: dict[tuple[str, Path], tuple[Placeholder, ...]] = {}
-        self._shapes: dict[tuple[str, Path], frozenset[str]] = {}
         self._numbers: dict[str, dict[Path, float]] = {}
         self._looked: dict[str, bool] = {}
         self.new: dict[str, None] = {}
@@ -96,20 +94,6 @@ class ShapeCache:
         """Remember the placeholders that a read met."""
         if placeholders or (document, path) in self._layouts:
             _put(self._layouts, (document, path), placeholders)
-
-    def shape(self, document: str, path: Path) -> frozenset[str] | None:
-        """Return the suffixes of arrays of the last full write at `path`, None if there was none."""
-        return self._shapes.get((document, path))
-
-    def forget_shapes(self, document: str) -> None:
-        """Forget the shapes of one document: a part of it was deleted."""
-        # A copy, made in one step of C: another thread may add entries meanwhile.
-        for place in [place for place in list(self._shapes) if place[0] == document]:
-            self._shapes.pop(place, None)
-
-    def saw_shape(self, document: str, path: Path, suffixes: frozenset[str]) -> None:
-        """Remember where the arrays of a full write were."""
-        _put(self._shapes, (document, path), suffixes)
 
     def number(self, document: str, path: Path) -> float | None:
         """Return the last result of a calculation at `path`, None if anything else was done to the document since."""

@@ -42,9 +42,9 @@ __all__ = [
 
 
 _NO_MEMBERS: frozenset[bytes] = frozenset()
-_STORED: tuple[list[Reply], ...] = ([b"OK"], [b"OK", []])
-_TOLD: tuple[list[Reply], ...] = ([b"OK", b"OK"], [b"OK", [], b"OK"])
-"""The usual replies to a write without arrays, without a look at the registry and with: there is nothing more to do.
+_STORED: list[Reply] = [b"OK", []]
+_TOLD: list[Reply] = [b"OK", [], b"OK"]
+"""The usual replies to a write without arrays: there is nothing more to do.
 
 Where subscribers are told, behind that are the note of the update and how many they are; the latter is left out."""
 
@@ -54,12 +54,11 @@ def set_change(
     path: Path,
     text: bytes,
     attachments: tuple[EncodedAttachment, ...],
-    looks: bool = True,
     notices: Telling = SILENT,
 ) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
     command = ("JSON.SET", keys.document, to_jsonpath(path), text)
-    return Change(keys, path, command, _judged_set, attachments, True, looks, None, notices, PathRefused)
+    return Change(keys, path, command, _judged_set, attachments, True, None, notices, PathRefused)
 
 
 def _judged_set(reply: Reply) -> Any:
@@ -156,13 +155,12 @@ def _change(it: Change, cache: ShapeCache, *, held: bool = False, given_up: Call
         commands.extend(command for each in it.attachments for command in each.commands)
     if it.attachments:
         after.append(("SADD", it.keys.registry, *(each.suffix for each in it.attachments)))
-    if it.looks:
-        after.append(("SMEMBERS", it.keys.registry))
+    after.append(("SMEMBERS", it.keys.registry))
     main = len(commands)
     told = it.notices.make(it.path)
     commands += (it.command, *after, *told)
     # Most writes are small, without arrays, and nothing is special about the replies: one comparison tells.
-    usual = None if main else (_TOLD if told else _STORED)[it.looks]
+    usual = None if main else _TOLD if told else _STORED
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         # EXEC was answered with nil: somebody wrote to the document after the look.
@@ -173,12 +171,11 @@ def _change(it: Change, cache: ShapeCache, *, held: bool = False, given_up: Call
         # Any write may have replaced the number that a calculation left.
         cache.forget_numbers(it.keys.document)
         if (replies if not told else replies[:-1]) == usual and (not told or type(replies[-1]) is int):
-            if it.looks:
-                cache.saw_members(it.keys.document, _NO_MEMBERS)
+            cache.saw_members(it.keys.document, _NO_MEMBERS)
             return None
         return Outcome(it, cache, commands, replies, main).next()
 
-    whole = held or len(commands) > (2 if it.looks else 1) or _is_tried(it, cache)
+    whole = held or len(commands) > 2 or _is_tried(it, cache)
     return Plan(commands, decode, whole, held)
 
 
@@ -189,7 +186,7 @@ def _is_tried(it: Change, cache: ShapeCache) -> bool:
     right. It takes time, hence only until a look was seen to succeed. Not where it would fail for other reasons:
     deletions, which Redis without memory takes alone only, and clusters, where it would wait while its slot moves.
     """
-    if not it.looks or cache.may_look(it.keys.document):
+    if cache.may_look(it.keys.document):
         return False
     return it.command[0] != "JSON.DEL" and not it.keys.sharded
 
@@ -197,7 +194,7 @@ def _is_tried(it: Change, cache: ShapeCache) -> bool:
 def _moves(it: Change, cache: ShapeCache) -> bool:
     """Return whether it, in a list, may replace something that has moved from the place after which it is named."""
     known = cache.members(it.keys.document)
-    return it.replaces and it.looks and any(may_hold(it.path, place_of(member)) for member in known)
+    return it.replaces and any(may_hold(it.path, place_of(member)) for member in known)
 
 
 def _change_watched(it: Change, cache: ShapeCache, coming: Sequence[Staged] = ()) -> Plan:
@@ -252,7 +249,7 @@ def _send(it: Change, coming: Sequence[Staged], then: Callable[[], Plan]) -> Pla
 
 def _stale(it: Change, known: frozenset[bytes]) -> list[bytes]:
     """Return the known keys that only what is replaced can refer to, and that are not written again."""
-    if not it.replaces or not it.looks:
+    if not it.replaces:
         return []
     written = {each.suffix.encode() for each in it.attachments}
     if it.gone is not None:

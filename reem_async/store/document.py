@@ -13,6 +13,7 @@ from ..plan import Plan
 from ..plan.arithmetic import Operation, calculate, compute
 from ..plan.changes import SILENT, Change, EncodedAttachment, Telling
 from ..plan.documents import number_text
+from ..plan.olddata import is_new
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
 from ..plan.reads import RawRead, nothing
 from ..plan.sizes import has_large
@@ -30,7 +31,6 @@ from ..plan.writes import (
 )
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail
-from .tracking import ALWAYS_TRACKED, saw_shape
 
 __all__ = ["Assignment", "DocumentWriter", "Notifier", "Outages", "Turn"]
 
@@ -165,7 +165,6 @@ class DocumentWriter:
         outages: What is done in an outage; None if calls raise.
 
     Attributes:
-        tracking: What the store that it belongs to vouches for.
         encoder: Encodes the values.
     """
 
@@ -175,7 +174,6 @@ class DocumentWriter:
         self.session = session
         self.keys = session.keys(name)
         self.name = self.keys.name
-        self.tracking = ALWAYS_TRACKED
         self.encoder = Encoder(session, self.keys)
         self._notifier: Notifier = notifier or _Silent()
         self._outages = outages
@@ -345,12 +343,16 @@ class DocumentWriter:
             if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
                 raise
         else:
-            saw_shape(self.session.cache, self.keys, path, attachments)
+            self._saw_new(path)
             return
         turn.settle()  # that it was refused was told, with numbers of its own
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
-        saw_shape(self.session.cache, self.keys, path, attachments)
+
+    def _saw_new(self, path: Path) -> None:
+        """Note that nothing that an old version stored is left, if the whole document was written."""
+        if not path and not is_new(self.keys, path, self.session.cache):
+            self.session.cache.saw_new(self.keys.document)
 
     async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
         shipped = next((each for each in assignments if each.attachments), None)
@@ -361,8 +363,6 @@ class DocumentWriter:
             for each in changes:
                 await turn.share(each.notices, each.path)
         await self.session.run(together(changes, self.session.cache))
-        for path, _, attachments, _ in assignments:
-            saw_shape(self.session.cache, self.keys, path, attachments)
 
     async def _put_instead(
         self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...], before: RawRead
@@ -377,7 +377,6 @@ class DocumentWriter:
 
     async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
         await self._if_still(before, delete_change(self.keys, path, notices=turn.without_value(deleted=True)))
-        self.session.cache.forget_shapes(self.keys.document)
 
     async def _if_still(self, before: RawRead, it: Change) -> None:
         # What was read names its arrays, and the transaction fails if anything is not as it was read: these are all.
@@ -387,7 +386,6 @@ class DocumentWriter:
     async def _remove(self, turn: Turn, path: Path) -> None:
         it = delete_change(self.keys, path, notices=turn.without_value(deleted=True))
         await self.session.run(change(it, self.session.cache))
-        self.session.cache.forget_shapes(self.keys.document)
 
     async def _append(
         self, turn: Turn, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...]
@@ -407,5 +405,4 @@ class DocumentWriter:
             await self.session.run(plan)
 
     def _setting(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Change:
-        looks = self.tracking.looks(self.session.cache, self.keys, path, attachments)
-        return set_change(self.keys, path, text, attachments, looks, turn.with_value(text, attachments))
+        return set_change(self.keys, path, text, attachments, turn.with_value(text, attachments))

@@ -16,7 +16,6 @@ from .accessor import Accessor
 from .catalog import names
 from .document import DocumentWriter
 from .reader import DocumentReader
-from .tracking import Tracking
 
 _MOST_TOPS = 1000
 """Accessors of top-level keys that are kept: only to be quick, any is made anew when it is asked for."""
@@ -56,7 +55,6 @@ class KeyValueStore:
             else RedisInterface(interface, **options)
         )
         self._tops: dict[str, Accessor] = {}
-        self._tracking = Tracking()
 
     def __getitem__(self, key: str) -> Accessor:
         return self._top(key)
@@ -68,7 +66,6 @@ class KeyValueStore:
         session = self.interface.session
         name = session.keys(key).name
         writer = self._writer(session, name)
-        writer.tracking = self._tracking
         if len(self._tops) >= _MOST_TOPS:
             self._tops.clear()
         # Another thread may have made one meanwhile: all use the same.
@@ -178,26 +175,15 @@ class KeyValueStore:
     def track_schema_changes(
         self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
     ) -> None:
-        """Say whether the shape of what is written may change (True, the default) or never does.
-
-        With False, a write no longer looks for arrays that it replaces: the places of the arrays at
-        a path must be those of the first write there; others are refused with a TypeError.
+        """Do nothing: a switch of the first REEM, which old programs set to be quicker. Writes are quick without it.
 
         Args:
             set_value: Whether shapes may change.
-            keys: The top-level keys meant; None for all, present and future.
+            keys: The top-level keys meant; None for all.
             track: Another name of `set_value`.
         """
-        set_value = track if set_value is None else set_value
-        if set_value is None:
+        if set_value is None and track is None:
             raise BadType("track_schema_changes() takes True or False")
-        if keys is None:
-            self._tracking.static = not set_value
-            # "For all keys" also overrules what was said of single ones before.
-            self._tracking.by_key.clear()
-            return
-        for key in keys:
-            self._tracking.by_key[self._top(key)._writer.name] = not set_value
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface,)

@@ -27,8 +27,6 @@ Address = tuple[str, dict[str, Any]]
 class Client:
     """One interface with its two stores."""
 
-    static = False
-
     def __init__(self, label: str, address: Address, namespace: str) -> None:
         self.label, self.address, self.namespace = label, address, namespace
 
@@ -52,9 +50,8 @@ class Client:
 class Blocking(Client):
     """The blocking front, on the thread that calls it."""
 
-    def __init__(self, label: str, address: Address, namespace: str, *, static: bool = False) -> None:
+    def __init__(self, label: str, address: Address, namespace: str) -> None:
         super().__init__(label, address, namespace)
-        self.static = static
         self.open()
 
     def open(self) -> None:
@@ -62,9 +59,6 @@ class Blocking(Client):
         url, options = self.address
         self.interface = reem.RedisInterface(url, namespace=self.namespace, timeout=5, **options)
         self.kvs, self.space = reem.KeyValueStore(self.interface), reem.PublishSpace(self.interface)
-        if self.static:
-            self.kvs.track_schema_changes(False)
-            self.space.track_schema_changes(False)
 
     def perform(self, op: Op, published: bool) -> Any:
         """Make a call, by a method or by Python's own syntax: the length of the path says which."""

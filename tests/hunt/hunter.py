@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from chaos.proxy import Proxy
 
-from reem_async.errors import BadType, ConnectionLost, InterfaceClosed, NotConnected, PathRefused, ReemError
+from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError
 from reem_async.server import EmbeddedServer
 
 from . import faults
@@ -52,7 +52,6 @@ class Hunter:
         self.rng = random.Random(seed)
         self.inputs = Inputs(self.rng)
         self.documents: dict[str, Any] = {}
-        self.shapes: dict[tuple[str, tuple[Any, ...]], frozenset[tuple[Any, ...]]] = {}
         self.history: dict[str, collections.deque[str]] = {}
         self.counts: collections.Counter[str] = collections.Counter()
         self.broken: set[str] = set()
@@ -84,7 +83,6 @@ class Hunter:
         self.here, self.there = (Server(server.url, json=server.json) for server in made)
         at = secured(stack, self.here) if self.secured else (self.here.url, {})
         main, spaced = Blocking("blocking", at, ""), Blocking("blocking r:", at, NAMESPACES[1])
-        self.static = Blocking("static", at, "", static=True)
         self.blocking: list[Blocking] = [main, spaced, Blocking("blocking r:一.", at, NAMESPACES[2])]
         self.asyncio = [Asyncio("asyncio", at, ""), Asyncio("asyncio r:", at, NAMESPACES[1])]
         self.clients: list[Client] = [*self.blocking, Elsewhere(main), Elsewhere(spaced), *self.asyncio]
@@ -92,7 +90,7 @@ class Hunter:
         self.proxy = stack.enter_context(Proxy(int(self.here.url.rpartition(":")[2])))
         far = (self.proxy.url, {})
         self.far: list[Client] = [Blocking("far", far, ""), Asyncio("far asyncio", far, "")]
-        for client in (*self.ears, self.static, *self.clients, *self.far):
+        for client in (*self.ears, *self.clients, *self.far):
             stack.callback(client.close)
 
     # --- steps ---
@@ -115,15 +113,14 @@ class Hunter:
         elif kind < self.share + 0.03:
             self._list_keys()
         else:
-            client = self.static if self.rng.random() < 0.1 else self.rng.choice(self.clients)
+            client = self.rng.choice(self.clients)
             self._take(client, *self._choose(client))
 
     def _choose(self, client: Client, names: tuple[str, ...] = READS + CHANGES + ("write",) * 5) -> tuple[Op, str]:
         """Return a call, and the whole name of its key."""
-        if self.rng.random() < 0.01 and not client.static:
+        if self.rng.random() < 0.01:
             return self.inputs.op(self.rng.choice(BAD_TOPS), ABSENT, names), ""
         top = self.rng.choice(TOPS[:4] if self.rng.random() < 0.3 else TOPS)
-        top = f"static {top}"[:500] if client.static else top
         full = client.namespace + top
         document = self.documents.get(full, ABSENT)
         op = self.inputs.op(top, document, names)
@@ -137,23 +134,7 @@ class Hunter:
 
     def _expect(self, client: Client, op: Op, full: str) -> Expected:
         write_only = self._publishes(full, op)
-        due = expected(self.documents.get(full, ABSENT), op, client.namespace, write_only=write_only)
-        return self._vouched(op, full, due) if client.static and due.error in (None, PathRefused) else due
-
-    def _vouched(self, op: Op, full: str, due: Expected) -> Expected:
-        """Return what comes of it where shapes may not change, and note the shape."""
-        if op.name in ("delete", "pop") and due.error is None:
-            self.shapes = {known: shape for known, shape in self.shapes.items() if known[0] != full}
-        if op.name not in ("write", "set_dotted", "update") or any(not isinstance(key, str) for key in op.path[1:]):
-            return due
-        inner = op.value if op.name == "update" else None
-        values = {op.path[1:]: op.value} if inner is None else {(*op.path[1:], key): inner[key] for key in inner}
-        shapes = {(full, path): frozenset(_arrays(value)) for path, value in values.items()}
-        if any(self.shapes.get(place, shape) != shape for place, shape in shapes.items()):
-            return Expected(self.documents.get(full, ABSENT), error=(BadType, PathRefused)[: 2 if due.error else 1])
-        if due.error is None:
-            self.shapes |= shapes
-        return due
+        return expected(self.documents.get(full, ABSENT), op, client.namespace, write_only=write_only)
 
     def _take(self, client: Client, op: Op, full: str, how: str = "") -> None:
         """Make a call with both, and compare what comes of it."""
@@ -452,11 +433,3 @@ def _size(tree: Any) -> int:
     """Return how many values a document holds."""
     items = tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
     return 1 + sum(map(_size, items))
-
-
-def _arrays(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths to what goes by ship."""
-    if isinstance(value, np.ndarray | bytes):
-        return [path]
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list | tuple) else ()
-    return [place for key, item in pairs for place in _arrays(item, (*path, key))]

@@ -298,7 +298,6 @@ class _Converter:
             await self.session.run(exchange(it, reads, seen, self.session.cache))
 
         await self._writer.in_turn(send, *encoded)
-        self.session.cache.forget_shapes(self.keys.document)
 
     async def _remove(self, gone: list[str]) -> None:
         """Remove what is old and was not removed with the write; where it is on one server, it is one command."""

@@ -63,7 +63,6 @@ class TextConverter:
             BadData: It is no JSON, or the server's JSON does not take it. It is left as it is.
         """
         await self._writer.in_turn(self._send, dry_run)
-        self.session.cache.forget_shapes(self.keys.document)
 
     async def _send(self, turn: Turn, dry_run: bool) -> None:
         await self.session.run(self._look(turn.without_value(), dry_run, _TRIES))

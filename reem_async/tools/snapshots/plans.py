@@ -267,6 +267,5 @@ class _Put:
                 )
         # What readers and writers of this interface believed of the key no longer holds.
         self._memory.saw_members(self._keys.document, frozenset(suffix.encode() for suffix in self._registry))
-        self._memory.forget_shapes(self._keys.document)
         self._memory.forget_numbers(self._keys.document)
         return None
