@@ -10,7 +10,7 @@ import redis
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import environment, figures, page, report, results, targets
+from . import environment, figures, page, report, results, summary, targets
 from .measure import Bench, Case
 from .process import Workers
 from .results import Results
@@ -117,6 +117,7 @@ def main() -> None:
         found = Results.load(results.FULL)
         figures.draw_all(found, FIGURES)
         page.rewrite(found)
+        summary.rewrite(found)
         report.show(found, console, options.all)
         return
     cases = chosen(options.only, options.quick)
@@ -132,6 +133,7 @@ def main() -> None:
     figures.draw_all(found, folder)
     if found.mode == "full":
         page.rewrite(found)
+        summary.rewrite(found)
     report.show(found, console, options.all or bool(options.only))
     console.print(f"kept in {path} and {folder}", highlight=False)
 

@@ -28,6 +28,9 @@ from conftest import ROOT, SLOW_MACHINE, eventually, python
 from test_cli import REEM
 
 import reem
+import reem_async.errors
+from benchmarks import summary
+from benchmarks.results import FULL, Results
 from reem_async.server import EmbeddedServer
 
 DOCS = ROOT / "docs"
@@ -246,3 +249,22 @@ def test_recordings_say_what_to_install():
     for module in ("reem.recording", "reem_async.recording"):
         done = python(f"import sys; sys.modules['mcap'] = None; import {module}")
         assert "ModuleNotFoundError: recordings need mcap: pip install " in done.stderr
+
+
+def test_every_error_and_variable_is_in_the_reference():
+    errors = (DOCS / "reference" / "errors.md").read_text(encoding="utf-8")
+    listed = set(re.findall(r"^\| `(\w+)`", errors, re.MULTILINE))
+    assert listed == set(reem_async.errors.__all__) - {"ReemError"}
+    environment = (DOCS / "reference" / "environment.md").read_text(encoding="utf-8")
+    source = "".join(
+        path.read_text(encoding="utf-8") for front in ("reem", "reem_async") for path in (ROOT / front).rglob("*.py")
+    )
+    assert set(re.findall(r"\bREEM_[A-Z_]+\b", source)) <= set(re.findall(r"`(REEM_\w+)`", environment))
+
+
+def test_the_figures_are_those_of_the_last_whole_run(tmp_path):
+    page, image = tmp_path / "page.md", tmp_path / "chart.svg"
+    page.write_text(summary.PAGE.read_text())
+    summary.rewrite(Results.load(FULL), page, image)
+    assert page.read_text() == summary.PAGE.read_text()
+    assert image.read_text() == summary.CHART.read_text()
