@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import sys
 import weakref
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from importlib import import_module
 from threading import current_thread, main_thread
 from types import TracebackType
@@ -15,7 +16,7 @@ from typing import Any, Literal, Self, TypeVar
 import reem_async
 from reem_async.concurrency.queues import Ended
 from reem_async.connection import rebuilt
-from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed
+from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
 from reem_async.transport.addresses import NewTransport
@@ -147,6 +148,17 @@ def _end_loops() -> None:
 def _is_left_over() -> bool:
     """Return whether this is a daemon thread that still runs while the interpreter ends."""
     return current_thread().daemon and not main_thread().is_alive()
+
+
+@contextlib.contextmanager
+def quiet_at_exit() -> Iterator[None]:
+    """End a daemon thread without a message if what it follows has ended with the program."""
+    try:
+        yield
+    except (InterfaceClosed, Stale):
+        if _is_left_over():
+            raise SystemExit from None
+        raise
 
 
 class StateIterator:

@@ -13,6 +13,7 @@ from reem_async.plan.paths import Path
 from reem_async.pubsub import mirror as core
 
 from ._twin import documented_by
+from .connection import quiet_at_exit
 from .subscribe import Following
 
 if TYPE_CHECKING:
@@ -63,19 +64,21 @@ class Mirror(Following):
 
     def value(self) -> Any:
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call."""
-        return self._core.value()
+        with quiet_at_exit():
+            return self._core.value()
 
     def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
         """Wait until the value is as wanted; returns it. No round trip."""
         core._check_wait(predicate, timeout)
         end = math.inf if timeout is None else time.monotonic() + timeout
-        while not (tried := self._core._tried(predicate)).fits:
-            # States: tried on the copy as it is -> waits for the next change, at most what is left -> tried again.
-            left = end - time.monotonic()
-            if left <= 0:
-                self._core._give_up(timeout)
+        with quiet_at_exit(), self._core._wait() as wait:
+            # First the states that wait are tried. Then the caller waits for the next one, at most what is left.
             # The predicate is called here, on the caller's thread, since it may block or use REEM; the loop only waits.
-            self._interface._wait(self._core._later(tried, left))
+            while not (tried := self._core._tried(predicate, wait)).fits:
+                left = end - time.monotonic()
+                if left <= 0:
+                    self._core._give_up(timeout)
+                self._interface._wait(self._core._later(wait, min(left, tried.again)))
         return tried.value
 
     def __getitem__(self, key: str | int) -> core.MirrorAccessor:

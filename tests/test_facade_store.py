@@ -354,7 +354,9 @@ LEAVING = {
         "def work(call):\n"
         "    while True: call()\n"
         "space = reem.PublishSpace(interface)\n"
-        "for call in (kvs[key].read, lambda: space[key].write({'n': 1})):\n"
+        "mirror = kvs[key].mirror(); mirror.listen()\n"
+        "until = lambda: mirror.wait_until(lambda value: False)\n"
+        "for call in (kvs[key].read, lambda: space[key].write({'n': 1}), until, mirror.value):\n"
         "    threading.Thread(target=work, args=[call], daemon=True).start()"
     ),
 }

@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -106,6 +107,63 @@ def test_waiting_ends_at_once_later_or_in_vain(mirrored, kvs, key):
     later.start()
     assert it.until(lambda value: value == 5) == 5
     later.join()
+
+
+def test_a_predicate_sees_each_published_state(mirrored, pspace, key):
+    """Also one that the next one follows at once, as of a button that is pressed for a moment."""
+    pspace[key()] = {"pressed": False}
+    it = mirrored((key(),))
+
+    def press():
+        time.sleep(0.01)
+        pspace[key()]["pressed"] = True
+        pspace[key()]["pressed"] = False
+
+    for _ in range(20):
+        thread = threading.Thread(target=press)
+        thread.start()
+        assert it.until(lambda value: value["pressed"])["pressed"] is True
+        thread.join()
+        it.until(lambda value: not value["pressed"])
+
+
+class Pose:
+    """Something of a user's own that can be changed."""
+
+    def __init__(self, x):
+        self.x = x
+
+
+class PoseShip(reem.SpecialDatatypeShip):
+    """Carries it."""
+
+    def get_label(self):
+        return "pose"
+
+    def check_fit(self, value):
+        return isinstance(value, Pose)
+
+    def write(self, key, value, client):
+        client.set(key, str(value.x))
+
+    def read(self, key, client):
+        client.get(key)
+
+    def interpret_read(self, responses):
+        return Pose(float(responses[0]))
+
+
+def test_objects_of_a_users_own_ship_are_copied_too(server_url, key):
+    """A reader that changes one changes it in no mirror and for no other subscriber."""
+    with reem.RedisInterface(server_url, ships=[PoseShip(), reem.NumpyShip()]) as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs[key()] = {"pose": Pose(1.0), "image": np.zeros(3)}
+        with kvs[key()].mirror() as mirror, kvs[key()].watch() as watch:
+            for pose in (mirror.value()["pose"], mirror["pose"].read(), next(watch).data["pose"]):
+                assert pose.x == 1.0
+                pose.x = 9.0
+            assert mirror["pose"].read().x == mirror.value()["pose"].x == 1.0
+            assert mirror["image"].read() is mirror["image"].read()  # read-only
 
 
 def test_a_predicate_of_the_blocking_front_may_call_reem(kvs, key):

@@ -7,7 +7,10 @@ every update stays equal to the document.
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any, Final
+
+import numpy as np
 
 from .paths import Path
 
@@ -22,7 +25,8 @@ class _Missing:
 MISSING: Final = _Missing()
 """Stands for a tree or a value that is not there."""
 
-_CONTAINERS = dict, list
+_SHARED = frozenset({str, int, float, bool, type(None), bytes, np.ndarray})
+"""Types of leaves that are never changed in place: arrays of a copy are read-only."""
 
 
 class CannotApply(Exception):
@@ -69,10 +73,19 @@ def removed(tree: Any, path: Path) -> Any:
 
 
 def copied(tree: Any) -> Any:
-    """Return `tree` with containers of its own, for a user to keep; leaves (arrays too) are shared."""
+    """Return `tree` with containers of its own, for a user to keep.
+
+    Leaves that cannot be changed are shared, arrays too. Objects that a user's own ship has made are copied by
+    `copy.deepcopy`; those that it cannot copy are shared.
+    """
     kind = type(tree)
     if kind is dict:
-        return {key: copied(value) if type(value) in _CONTAINERS else value for key, value in tree.items()}
+        return {key: value if type(value) in _SHARED else copied(value) for key, value in tree.items()}
     if kind is list:
-        return [copied(item) if type(item) in _CONTAINERS else item for item in tree]
-    return tree
+        return [item if type(item) in _SHARED else copied(item) for item in tree]
+    if kind in _SHARED or isinstance(tree, np.ndarray | np.generic) or kind.__module__.startswith("reem_async."):
+        return tree
+    try:
+        return deepcopy(tree)
+    except Exception:
+        return tree

@@ -14,7 +14,7 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
-from ..concurrency.queues import BoundedQueue, unheard
+from ..concurrency.queues import BoundedQueue
 from ..concurrency.tasks import is_being_cancelled
 from ..errors import BadData, ClusterNode, Stale, is_of_command
 from ..plan import Reply, wire_commands
@@ -62,7 +62,7 @@ class Follower:
         born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
         failure: The exception that has ended it, None while it follows.
         down: There is no connection, or it is new and what is there was not read yet.
-        told: Called after each step that may have changed the copy.
+        told: Called with each state of the copy in order, and with the present one after each step, if `stored`.
     """
 
     def __init__(
@@ -100,7 +100,7 @@ class Follower:
         self.born: list[Notice] | None = None
         self.failure: Exception | None = None
         self.down = True
-        self.told: Callable[[], None] = unheard
+        self.told: Callable[[Any], None] = unnoticed
 
     @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
@@ -128,7 +128,7 @@ class Follower:
         self._looks.cancel()
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(reason)
-        self.told()
+        self.told(self._replica.at())
 
     @contained
     def doubt(self, channel: bytes) -> None:
@@ -193,7 +193,7 @@ class Follower:
 
     def value(self) -> Any:
         """Return a copy of what is followed, None if nothing is there. Any thread may."""
-        return _own(self.at())
+        return own(self.at())
 
     def age(self) -> float:
         """Return the seconds for which the server may have had something else than the copy. Any thread may.
@@ -244,13 +244,15 @@ class Follower:
                 self._tell(output)
             else:
                 self._do(output)
+            if self.stored and isinstance(output, Updated | Stored | Snapshot):
+                self.told(output.data)
         if self.stored:
             self._note_age()
 
     def _note_age(self) -> None:
         if self._replica.is_current:
             self._valid_at = max(self._valid_at, self._asked)  # it is from the last read, or newer
-        self.told()
+        self.told(self._replica.at())
 
     def _do(self, output: Output) -> None:
         if isinstance(output, Read):
@@ -374,8 +376,8 @@ class Follower:
         publisher, sequence, time, inner = notice[:4]
         path = show((self.keys.name, *inner))
         for queue in self.queues:
-            data = _own(tree)
-            value = data if written is tree else _own(written)
+            data = own(tree)
+            value = data if written is tree else own(written)
             gone = notice.deleted or tree is MISSING
             how = Origin.PUBLISHED, gone, notice.early
             queue.put(Update(path, data, value, False, time, publisher, sequence, missed != 0, missed, *how))
@@ -383,14 +385,14 @@ class Follower:
     def _tell_stored(self, event: Stored) -> None:
         path = self._path(event.path)
         for queue in self.queues:
-            data = _own(event.data)
-            value = data if event.value is event.data else _own(event.value)
+            data = own(event.data)
+            value = data if event.value is event.data else own(event.value)
             queue.put(Update(path, data, value, origin=Origin.STORED, deleted=event.value is MISSING))
 
     def _tell_snapshot(self, event: Snapshot) -> None:
         path, gone = self._path(()), event.data is MISSING
         for queue in self.queues:
-            data = _own(event.data)
+            data = own(event.data)
             queue.put(
                 Update(
                     path,
@@ -412,7 +414,7 @@ class Follower:
         notice = event.notice
         path, stamp = show((self.keys.name, *notice.path)), (notice.time, notice.publisher, notice.sequence)
         for queue in self.queues:
-            queue.overtaken(Update(path, _own(event.data), None, False, *stamp) if event.newest else None)
+            queue.overtaken(Update(path, own(event.data), None, False, *stamp) if event.newest else None)
 
     def _report(self, event: Failed) -> None:
         """Say that a snapshot could not be taken."""
@@ -433,6 +435,10 @@ def checked_largest(largest: float | None) -> float:
     return largest
 
 
-def _own(tree: Any) -> Any:
+def unnoticed(tree: Any) -> None:
+    """Take no notice of a state."""
+
+
+def own(tree: Any) -> Any:
     """Return a tree for a user to keep: its containers are his, and None stands for what is not there."""
     return None if tree is MISSING else copied(tree)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import collections
+import contextlib
 import math
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, NoReturn
 
 from ..concurrency.streams import Following
@@ -14,7 +16,7 @@ from ..plan.arguments import check_number
 from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, shorten, show
 from ..session import Session
-from .follower import Follower, checked_largest
+from .follower import Follower, checked_largest, own
 from .subscribers import Link, LocalAccessor
 
 __all__ = ["Mirror", "MirrorAccessor", "Tried"]
@@ -25,22 +27,46 @@ _SHORTEST = 0.005
 """Seconds that `max_age` has at least: probes are a load too."""
 _RETRY = 0.02
 """Seconds after which a waiting caller looks again at a copy that was too old."""
+_MOST_STATES = 1000
+"""States of the copy that wait for a predicate; of more, the oldest are dropped."""
+_NO_STATE: Any = object()
 
 
 class Tried(NamedTuple):
-    """What came of asking whether a copy is as somebody wants it.
+    """The result of a call of a predicate.
 
     Attributes:
-        fits: It is.
-        value: The value that was looked at.
-        seen: How many steps may have changed the copy until then.
-        again: Seconds after which to ask again even if nothing changes.
+        fits: The predicate is fulfilled.
+        value: The value that it was called with.
+        again: Seconds after which to try again even if nothing changes.
     """
 
     fits: bool
-    value: Any
-    seen: int
-    again: float
+    value: Any = None
+    again: float = math.inf
+
+
+class Wait:
+    """One call of `wait_until`, and the states of the copy that it has not seen yet.
+
+    The event loop adds states, the caller takes them out, perhaps on another thread; each step is one of C.
+
+    Attributes:
+        states: Trees, the oldest first. They are never changed in place.
+        seen: The tree that the predicate was called with last.
+        waiter: Done when there is something to look at; on the event loop only.
+    """
+
+    def __init__(self) -> None:
+        self.states: collections.deque[Any] = collections.deque(maxlen=_MOST_STATES)
+        self.seen: Any = _NO_STATE
+        self.waiter: asyncio.Future[None] | None = None
+
+    def wake(self) -> None:
+        """Let the caller look."""
+        waiter = self.waiter
+        if waiter is not None and not waiter.done() and not waiter.get_loop().is_closed():
+            waiter.set_result(None)
 
 
 class Mirror(Following):
@@ -68,7 +94,6 @@ class Mirror(Following):
             check_number("max_age", max_age, f"use {_SHORTEST} seconds or more, or None", least=_SHORTEST)
         self.channel = show((keys.name, *path))
         self.max_age = max_age
-        self._seen = 0
         self._full_path: Path = (keys.name, *path)
         self._link = Link(
             session,
@@ -80,7 +105,7 @@ class Mirror(Following):
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
         )
         self._link.told = _waking(self)
-        self._waiting: set[asyncio.Future[None]] = set()
+        self._waiting: set[Wait] = set()
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, the copy is there. Idempotent; two or three round trips.
@@ -157,7 +182,9 @@ class Mirror(Following):
         """Wait until the value is as wanted; returns it. No round trip.
 
         Args:
-            predicate: Called with a copy of the value at once, and again after each change; returns whether it is so.
+            predicate: Called with a copy of the value at once, and with each published state after that, also if the
+                next one follows at once. States that are only stored may be merged into the last one. Of more
+                than 1,000 states that wait for a slow predicate, the oldest are skipped.
             timeout: Seconds after which to give up.
 
         Raises:
@@ -170,40 +197,51 @@ class Mirror(Following):
         limit = asyncio.timeout(timeout)
         try:
             async with limit:
-                while not (tried := self._tried(predicate)).fits:
-                    await self._later(tried)
+                with self._wait() as wait:
+                    while not (tried := self._tried(predicate, wait)).fits:
+                        await self._later(wait, tried.again)
         except TimeoutError:
             if not limit.expired():  # the predicate's own
                 raise
             self._give_up(timeout)
         return tried.value
 
-    def _tried(self, predicate: Callable[[Any], Any]) -> Tried:
-        """Return whether the value is as wanted now; not where the copy must not be relied on."""
+    @contextlib.contextmanager
+    def _wait(self) -> Iterator[Wait]:
+        """Keep the states of the copy for a call of `wait_until`. Any thread may."""
+        wait = Wait()
+        self._waiting.add(wait)
+        try:
+            yield wait
+        finally:
+            self._waiting.discard(wait)
+
+    def _tried(self, predicate: Callable[[Any], Any], wait: Wait) -> Tried:
+        """Call the predicate with the states that wait, then with the present one unless it is too old."""
         if self._link.closed:
             raise InterfaceClosed(f"{self.channel}: this mirror was closed")
         if self._link.interface_closed:
             raise InterfaceClosed(f"{self.channel}: the RedisInterface of this mirror was closed")
-        self._check_begun()
-        # Before the copy is looked at: a change in between is then no reason to wait.
-        seen = self._seen
-        try:
-            value = self.value()
-        except Stale:
-            return Tried(False, None, seen, _RETRY)
-        return Tried(bool(predicate(value)), value, seen, math.inf)
+        follower = self._check_begun()
+        while wait.states:
+            wait.seen = wait.states.popleft()
+            if predicate(value := own(wait.seen)):
+                return Tried(True, value)
+        if self._stale(follower):
+            return Tried(False, again=_RETRY)
+        # The first state of all, or one that was too old when it came.
+        if (tree := follower.at()) is not wait.seen:
+            wait.seen = tree
+            if predicate(value := own(tree)):
+                return Tried(True, value)
+        return Tried(False)
 
-    async def _later(self, tried: Tried, most: float = math.inf) -> None:
-        """Return when the copy may have changed since it was looked at, or it is time to look again."""
-        if self._seen != tried.seen:
+    async def _later(self, wait: Wait, seconds: float) -> None:
+        """Return when there may be something to look at, or after some seconds."""
+        if wait.states:
             return
-        waiter = asyncio.get_running_loop().create_future()
-        self._waiting.add(waiter)
-        seconds = min(most, tried.again)
-        try:
-            await asyncio.wait([waiter], timeout=None if seconds == math.inf else seconds)
-        finally:
-            self._waiting.discard(waiter)
+        wait.waiter = asyncio.get_running_loop().create_future()
+        await asyncio.wait([wait.waiter], timeout=None if seconds == math.inf else seconds)
 
     def _give_up(self, timeout: float | None) -> NoReturn:
         """Raise TimeoutError."""
@@ -212,11 +250,13 @@ class Mirror(Following):
         why = f"; {reason}" if reason else ""
         raise TimeoutError(f"{self.channel}: did not come true within {timeout:g} s{why}") from None
 
-    def _wake(self) -> None:
-        self._seen += 1
-        for waiter in self._waiting:
-            if not waiter.done() and not waiter.get_loop().is_closed():
-                waiter.set_result(None)
+    def _take(self, tree: Any) -> None:
+        """Hand a state of the copy to those who wait."""
+        follower = self._link.follower
+        for wait in tuple(self._waiting):  # another thread may add one meanwhile
+            if (wait.states[-1] if wait.states else wait.seen) is not tree and follower and not self._stale(follower):
+                wait.states.append(tree)
+            wait.wake()
 
     def __getitem__(self, key: str | int) -> MirrorAccessor:
         return MirrorAccessor(self, (check_element(key, self._full_path),))
@@ -239,13 +279,13 @@ def _check_wait(predicate: Any, timeout: Any) -> None:
         check_number("timeout", timeout, "use seconds, 0 or more, or None for no limit")
 
 
-def _waking(mirror: Mirror) -> Callable[[], None]:
-    """Return what wakes those who wait for a mirror; a reference back would keep a mirror that was dropped."""
+def _waking(mirror: Mirror) -> Callable[[Any], None]:
+    """Return what hands states to a mirror; a reference back would keep a mirror that was dropped."""
     reference = weakref.ref(mirror)
 
-    def told() -> None:
-        if (there := reference()) is not None:
-            there._wake()
+    def told(tree: Any) -> None:
+        if (there := reference()) is not None and there._waiting:
+            there._take(tree)
 
     return told
 

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
-from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, chosen, unheard
+from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, chosen
 from ..concurrency.streams import Following, Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed, MissingKey, ReadOnly
@@ -19,7 +19,7 @@ from ..plan.paths import Path, check_element, parse, show
 from ..plan.trees import MISSING, copied
 from ..session import Session
 from .callbacks import Caller, Calls, arranged
-from .follower import Follower
+from .follower import Follower, unnoticed
 from .manager import SubscriptionManager, manager_of
 from .updates import Update
 
@@ -30,7 +30,7 @@ class Link:
     """A follower and the manager it is at: made by the first `follow`, anew after a fork or in another loop.
 
     Attributes:
-        told: Called after each step that may have changed the copy.
+        told: Called with each state of the copy; see `Follower`.
         closed: It was closed, and does not begin anew.
         follower: Who follows, or has followed elsewhere; None before it has begun.
     """
@@ -53,7 +53,7 @@ class Link:
         self._stored = stored
         self._largest = largest
         self._heartbeat = heartbeat
-        self.told: Callable[[], None] = unheard
+        self.told: Callable[[Any], None] = unnoticed
         self._manager: SubscriptionManager | None = None
         self._following: asyncio.Lock | None = None
         self.closed = False
