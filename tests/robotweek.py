@@ -116,11 +116,11 @@ class Observers:
             tuple[int, float], int
         ] = {}  # of each frame: its publisher's number and time, its own number
         self.twice: list[str] = []
+        self.watches = {name: self.kvs[name].watch(reem.Last(1000)) for name in KEYS}
         self.mirrors = {name: self.kvs[name].mirror() for name in KEYS}
         self.subscribers = {name: reem.SilentSubscriber(name, self.interface, stored=True) for name in KEYS}
-        for follower in (*self.mirrors.values(), *self.subscribers.values()):
+        for follower in (*self.watches.values(), *self.mirrors.values(), *self.subscribers.values()):
             follower.listen()
-        self.watches = {name: self.kvs[name].watch(reem.Last(1000)) for name in KEYS}
         self.threads = [threading.Thread(target=self._follow, args=(name,), daemon=True) for name in KEYS]
         for thread in self.threads:
             thread.start()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import redis
 import yaml
-from conftest import FRONTS, PLAIN, ROOT, aeventually, assert_same, eventually
+from conftest import FRONTS, PLAIN, ROOT, assert_same, eventually
 from own_servers import connect, own_server
 
 import reem
@@ -99,127 +99,6 @@ def test_the_user_may_not_script_nor_administer(guarded):
         with pytest.raises(redis.exceptions.NoPermissionError):
             client.publish("elsewhere", 1)
     admin.execute_command("ACL", "LOG", "RESET")
-
-
-@pytest.mark.parametrize("name", list(FRONTS))
-def test_the_store_needs_no_more(guarded, name):
-    """Every operation of an accessor, in both fronts."""
-    url, admin = guarded
-    with contextlib.closing(FRONTS[name](url, namespace="robot1:")) as front:
-        document = {"n": 5, "x": 0.9374604873776271, "l": [1, np.arange(3)], "image": np.arange(6), "b": b"x"}
-        front.write(["foo"], document)
-        assert_same(front.read(["foo"]), document)
-        assert_same(front.read(["foo"]), document)
-        front.write(["foo", "image"], np.zeros((2, 2)))
-        front.write(["foo", "l", 1], "plain")
-        front.increment(["foo", "n"], 2)
-        front.multiply(["foo", "n"], 3)
-        front.divide(["foo", "n"], 2)
-        front.append(["foo", "l"], np.arange(2))
-        front.extend(["foo", "l"], [1, b"y"])
-        assert front.length(["foo"]) == 5
-        assert (front.length(["foo", "l"]), front.length(["foo", "image"])) == (5, 2)
-        assert front.type(["foo", "image"]) is np.ndarray
-        front.set("foo.d", {"e": "text"})
-        assert (front.get("foo.d.e"), front.length(["foo", "d", "e"])) == ("text", 4)
-        with pytest.raises(KeyError):
-            front.read(["foo", "absent"])
-        with pytest.raises(reem.PathRefused):
-            front.write(["foo", "n", "below"], np.arange(3))
-        front.write(["foo", "big"], 2**63 - 1)
-        with pytest.raises(OverflowError):
-            front.increment(["foo", "big"], 1)
-        front.delete(["foo", "image"])
-        front.write(["foo"], 1)
-        front.delete(["foo"])
-        assert admin.dbsize() == 0
-
-
-@pytest.mark.parametrize("user", ["robot", "watcher"])
-def test_keys_and_lengths_need_no_more_whatever_the_path(guarded, urls, user):
-    """Also where JSON.OBJKEYS stands in for JSON.OBJLEN, of which servers may end."""
-    with reem.RedisInterface(guarded[0], namespace="robot1:") as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs["foo"] = {"一": {"é": 1, "b": 2}}
-        kvs["foo"].update(c=np.arange(2))
-        assert (kvs["foo"].pop("c").size, kvs["foo"].setdefault("d", 4)) == (2, 4)
-        with reem.RedisInterface(urls[user], namespace="robot1:") as other:
-            handle = reem.KeyValueStore(other)["foo"]
-            assert (len(handle["一"]), sorted(handle["一"].keys()), "一" in handle) == (2, ["b", "é"], True)
-        del kvs["foo"]
-
-
-def test_editing_needs_no_more(guarded):
-    """In the blocking front."""
-    url, _ = guarded
-    with reem.RedisInterface(url, namespace="robot1:") as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs["foo"] = {"image": np.zeros(3)}
-        with kvs["foo"] as value:
-            value["image"] += 1
-        assert_same(kvs["foo"].read(), {"image": np.ones(3)})
-        del kvs["foo"]
-
-
-def test_a_conflict_and_a_foreign_key_are_told_without_more(guarded):
-    """The errors need no further rights either."""
-    url, admin = guarded
-    with reem.RedisInterface(url, namespace="robot1:") as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs["foo"] = {"n": 1, "image": np.zeros(3)}
-        with pytest.raises(reem.Conflict), kvs["foo"] as value:  # noqa: PT012
-            value["n"] = 2
-            kvs["foo"]["image"] = np.ones(3)
-        del kvs["foo"]
-        admin.lpush("robot1:foreign", "x")
-        for call in (lambda: kvs["foreign"].read(), lambda: kvs["foreign"].write(np.arange(2))):
-            with pytest.raises(reem.WrongKind, match="list"):
-                call()
-        admin.unlink("robot1:foreign")
-
-
-def test_subscribing_needs_no_more(guarded):
-    """Mirrors, callbacks and loops of the blocking front, small values and large ones."""
-    url, _ = guarded
-    with reem.RedisInterface(url, namespace="robot1:") as interface:
-        space = reem.PublishSpace(interface)
-        heard = []
-        callback = reem.CallbackSubscriber("c", interface, lambda data, updated_path: heard.append(updated_path), {})
-        with reem.SilentSubscriber("c", interface) as mirror, callback:
-            space["c"] = {"n": 1, "image": np.zeros((640, 480, 3))}
-            eventually(lambda: mirror.value() and heard == ["c"])
-            space["c"]["n"] = 2
-            eventually(lambda: mirror["n"].read() == 2 and heard == ["c", "c.n"])
-            assert next(iter(reem.KeyValueStore(interface)["c"].watch())).initial
-        del reem.KeyValueStore(interface)["c"]
-
-
-async def test_the_async_front_needs_no_more(guarded):
-    """Edit, subscribe and loop."""
-    url, _ = guarded
-    async with reem_async.RedisInterface(url, namespace="robot1:") as interface:
-        space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
-        await space["c"].write({"n": 1, "image": np.zeros(3)})
-        async with kvs["c"].edit() as value:
-            value["n"] = 2
-        async with reem_async.SilentSubscriber("c", interface) as mirror:
-            assert mirror["n"].read() == 2
-            await space["c"]["n"].write(3)
-            await aeventually(lambda: mirror["n"].read() == 3)
-        assert (await anext(kvs["c"].watch())).data["n"] == 3
-        await kvs["c"].delete()
-
-
-async def test_listing_and_monitoring_need_no_more(guarded):
-    """Keys of the namespace, and every update in it."""
-    url, _ = guarded
-    async with reem_async.RedisInterface(url, namespace="robot1:") as interface:
-        space, kvs = reem_async.PublishSpace(interface), reem_async.KeyValueStore(interface)
-        async with Monitor(interface) as heard:
-            await space["c"].write({"n": 1, "image": np.zeros(3)})
-            assert (await anext(heard)).path == ("c",)
-        assert [name async for name in names(interface)] == ["c"]
-        await kvs["c"].delete()
 
 
 # --- those who only read -------------------------------------------------------------------------------

@@ -10,13 +10,18 @@ from conftest import ROOT, sized
 
 
 @pytest.mark.parametrize(
-    ("seed", "steps", "faults"),
-    [(7, sized(1500, 6000), 0.0), (25, sized(1500, 4000), 0.3), pytest.param(47, 4000, 0.2, marks=pytest.mark.long)],
-    ids=["whole", "broken off", "some broken off"],
+    ("seed", "steps", "faults", "options"),
+    [
+        (7, sized(1500, 6000), 0.0, []),
+        (25, sized(1500, 4000), 0.3, []),
+        (47, sized(1000, 4000), 0.15, ["--plain"]),
+        (61, sized(600, 3000), 0.1, ["--secured"]),
+    ],
+    ids=["whole", "broken off", "without the module", "with TLS and few rights"],
 )
-def test_random_calls_do_what_a_dict_does(seed, steps, faults):
+def test_random_calls_do_what_a_dict_does(seed, steps, faults, options):
     """Also interrupted, cancelled, cut off, forked, or with handlers of signals that call and close."""
-    words = ("--seed", str(seed), "--steps", str(steps), "--faults", str(faults))
+    words = ("--seed", str(seed), "--steps", str(steps), "--faults", str(faults), *options)
     done = subprocess.run(
         [sys.executable, "-m", "tests.hunt", *words],
         cwd=ROOT, capture_output=True, text=True, timeout=300, check=False,

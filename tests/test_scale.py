@@ -21,14 +21,12 @@ from benchmarks.scale.model import (
     Figures,
     Load,
     Node,
-    Robot,
     Topic,
     Value,
     bottleneck,
     carried,
     most_followers,
     on_the_line,
-    robot_load,
     topic_load,
     use,
 )
@@ -36,7 +34,6 @@ from benchmarks.scale.servers import running
 from benchmarks.scale.slots import (
     SLOTS,
     balance,
-    dealt,
     fits,
     loads,
     most_robots,
@@ -46,7 +43,6 @@ from benchmarks.scale.slots import (
     slot_of,
     weigh,
 )
-from benchmarks.scale.text import bits, number, size, times
 
 # --- the kept page -------------------------------------------------
 
@@ -64,22 +60,6 @@ def test_each_table_of_the_page_is_what_the_kept_figures_give(kept, name):
 def test_the_page_is_of_a_whole_run(kept):
     assert kept["mode"] == "full"
     assert kept["seconds"] < 240
-
-
-def test_other_figures_give_another_page(kept, tmp_path):
-    copy = tmp_path / "scale.md"
-    copy.write_text(page.PAGE.read_text(encoding="utf-8"), encoding="utf-8")
-    page.rewrite({**kept, "rounds": 99}, copy)
-    assert "medians of 99 rounds" in copy.read_text(encoding="utf-8")
-    page.rewrite(kept, copy)
-    assert copy.read_text(encoding="utf-8") == page.PAGE.read_text(encoding="utf-8")
-
-
-def test_a_page_without_a_place_for_a_table_is_refused(kept, tmp_path):
-    copy = tmp_path / "scale.md"
-    copy.write_text("nothing\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="0 places for the table 'where'"):
-        page.rewrite(kept, copy)
 
 
 def test_the_page_states_the_budgets_it_uses(kept):
@@ -116,12 +96,6 @@ def test_what_goes_to_replicas_is_sent_too():
     assert load.line_out == pytest.approx(on_the_line(100) + on_the_line(900_000))
 
 
-def test_a_robot_is_the_sum_of_its_topics():
-    one, other = Topic("a", "point", 10, 1), Topic("b", "frame", 2, 3)
-    both = robot_load(Robot("r", (one, other)), FIGURES)
-    assert both == topic_load(one, FIGURES) + topic_load(other, FIGURES)
-
-
 def test_what_is_used_up_first_decides_how_many_are_carried():
     node = Node(core=0.6, line_in=100, line_out=100, memory=1000, connections=10)
     load = Load(core=0.1, line_in=30, line_out=10, memory=10, connections=1)
@@ -150,37 +124,12 @@ def test_costs_lie_on_straight_lines_between_what_was_measured():
         Value(((1, Cost()), (2, Cost())), 0).publish(1)
 
 
-def test_bytes_too_few_for_a_message_are_noise():
-    noisy = Value(((0, Cost(20, 800, 60)), (10, Cost(40, 890, 60))), memory=0)
-    assert noisy.following(10).bytes_in == 0
-    assert Value(((0, Cost(20, 800, 60)), (10, Cost(40, 910, 60))), memory=0).following(10).bytes_in == 11
-
-
 def test_the_kept_figures_are_what_the_model_works_with(kept):
     given = results.figures(kept, "six")
     case = kept["settings"]["six"]["cases"]["frame.publish.10"]
     assert given.values["frame"].publish(10).core_us == case["core_us"]
     assert given.values["frame"].publish(10).bytes_replica == case["bytes_replica"]
     assert given.heartbeat.core_us == kept["settings"]["six"]["heartbeat"]["core_us"]
-
-
-@pytest.mark.parametrize(
-    ("shown", "expected"),
-    [
-        (number(0.01234), "0.0123"),
-        (number(12_345), "12,300"),
-        (number(99.96), "100"),
-        (size(921_737), "922 kB"),
-        (size(9_220_000), "9.22 MB"),
-        (size(823.4), "823 B"),
-        (bits(1.18e9), "1.18 Gbit/s"),
-        (bits(7.7e6), "7.7 Mbit/s"),
-        (times(1.299), "1.30"),
-        (times(24.94), "24.9"),
-    ],
-)
-def test_numbers_for_people(shown, expected):
-    assert shown == expected
 
 
 # --- the simulation -------------------------------------------------
@@ -197,23 +146,6 @@ def test_slots_are_the_servers(server_url):
     assert slot_of("camera", "robots/r7:") == theirs
 
 
-def test_slots_are_dealt_in_equal_ranges():
-    for nodes in (1, 3, 7, 50):
-        owners = shared_out(nodes)
-        counts = np.bincount(owners)
-        assert len(counts) == nodes
-        assert counts.sum() == SLOTS
-        assert counts.max() - counts.min() <= 1
-        assert (np.diff(owners) >= 0).all()
-
-
-def test_weights_land_in_their_keys_slots():
-    weights = weigh(["robots/r1:", "robots/r2:"], {"pose": 2.0, "camera": 3.0})
-    assert weights.sum() == 10
-    assert weights[slot_of("pose", "robots/r1:")] >= 2
-    assert weights[slot_of("camera", "robots/r2:")] >= 3
-
-
 def test_balance_by_hand():
     slots = np.zeros(SLOTS)
     slots[0], slots[1], slots[SLOTS - 1] = 4.0, 2.0, 2.0
@@ -225,14 +157,6 @@ def test_balance_by_hand():
     assert moved == 1
 
 
-def test_a_hot_key_cannot_be_resharded_away():
-    slots = np.ones(SLOTS)
-    slots[5] = 10 * SLOTS
-    after, _ = reshard(slots, shared_out(4), 4)
-    assert loads(slots, after, 4).max() == 10 * SLOTS  # alone on its node
-    assert balance(loads(slots, after, 4)) == pytest.approx(10 * SLOTS / (11 * SLOTS - 1) * 4)
-
-
 def test_moving_slots_by_weight_makes_fleets_even():
     slots, owners = weigh(numbered(1000), {"pose": 1.0, "camera": 2.0}), shared_out(50)
     before = balance(loads(slots, owners, 50))
@@ -242,14 +166,6 @@ def test_moving_slots_by_weight_makes_fleets_even():
     assert moved == np.count_nonzero(after != owners) < 200
 
 
-def test_dealing_anew_by_hand():
-    slots = np.zeros(SLOTS)
-    slots[[3, 4, 5, 6]] = [1.0, 5.0, 3.0, 2.0]
-    owners = dealt(slots, 2)
-    assert loads(slots, owners, 2).tolist() == [6.0, 5.0]  # 5; 3; then 2 to the 3; then 1, both have 5
-    assert owners[[4, 5, 6]].tolist() == [0, 1, 1]
-
-
 def test_as_many_robots_fit_as_no_node_has_too_much():
     demands = {"core": {"a": 0.05, "b": 0.02}, "memory": {"a": 0.001, "b": 0.0}}
     most = most_robots(demands, 3, moving=False)
@@ -257,11 +173,6 @@ def test_as_many_robots_fit_as_no_node_has_too_much():
     assert not fits(most + 1, demands, 3)
     moved = most_robots(demands, 3, moving=True)
     assert most < moved <= int(3 / 0.07)
-
-
-def test_a_key_too_heavy_for_a_node_fits_on_no_cluster():
-    assert most_robots({"line_out": {"camera": 1.1}}, 50, moving=True) == 0
-    assert most_robots({"line_out": {"camera": 1.1}}, 50, moving=False) == 0
 
 
 def test_a_key_that_all_follow_grows_with_the_fleet(kept):

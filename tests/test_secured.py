@@ -194,22 +194,6 @@ def full_options(certificates):
 
 
 @both
-def test_everything_works_over_tls_with_certificates_on_both_sides(guarded, certificates, name):
-    """Values, arrays of 8 MB and small ones, arithmetic, deleting."""
-    with contextlib.closing(FRONTS[name](url_of(guarded), **full_options(certificates))) as front:
-        image = np.random.default_rng(1).random(LARGE)
-        document = {"n": 1, "l": [1, np.arange(3)], "b": b"x" * 100_000, "image": image}
-        front.write(["foo"], document)
-        for _ in range(2):
-            assert_same(front.read(["foo"]), document)
-        front.increment(["foo", "n"], 2)
-        front.append(["foo", "l"], np.arange(4.0))
-        assert (front.read(["foo", "n"]), front.length(["foo", "l"])) == (3, 3)
-        front.delete(["foo"])
-        assert front.get("foo", None) is None
-
-
-@both
 def test_the_name_is_checked_against_the_address_too(shielded, certificates, name):
     """localhost and 127.0.0.1 are both in the certificate; options instead of a URL."""
     for host in ("localhost", HOST):
@@ -217,19 +201,6 @@ def test_the_name_is_checked_against_the_address_too(shielded, certificates, nam
         with contextlib.closing(FRONTS[name](host, **options)) as front:
             front.write(["foo"], 1)
             assert front.read(["foo"]) == 1
-
-
-def test_publishing_and_subscribing_over_tls(guarded, certificates):
-    """In the blocking front, whose subscriptions run on an event loop of its own, with small and large updates."""
-    with reem.RedisInterface(url_of(guarded), **full_options(certificates)) as interface:
-        space = reem.PublishSpace(interface)
-        with reem.SilentSubscriber("c", interface) as mirror:
-            space["c"] = {"n": 0, "image": np.zeros(LARGE)}
-            for number in range(1, 4):
-                space["c"]["image"] = np.full(LARGE, number)
-                space["c"]["n"] = number
-            eventually(lambda: mirror.value() and mirror["n"].read() == 3 and mirror["image"].read()[-1] == 3)
-        del reem.KeyValueStore(interface)["c"]
 
 
 @pytest.mark.parametrize("loop", ["asyncio", "uvloop"])

@@ -4,8 +4,5 @@ from . import (  # noqa: F401
     calls,
     frames,
     outages,
-    recorder,
-    refusals,
     restarts,
-    soak,
 )

@@ -375,6 +375,9 @@ class Hunter:
         self.doing = ""
         self.here.settle()
         self.here.check(self.documents)
+        if self.secured:
+            denied = [(row["reason"], row["object"]) for row in self.here.raw.acl_log()]
+            assert not denied, f"the server refused {denied}"
         for name, document in self.documents.items():
             compare(self._stored(name), document, f"{name!r}")
         for follower in self.followers:
