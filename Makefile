@@ -7,7 +7,7 @@ TOGETHER := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots week mcap recording bench bench-recorder scale clean docs
+.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots week mcap recording bench bench-recorder scale clean docs dist floors
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -30,6 +30,24 @@ modes: $(VENV)/ready  ## tests once in Python's development mode and once withou
 	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_connection.py tests/test_facade_store.py
 	$(BIN)/python -O -m pytest -q -W "ignore:assertions not in test modules" \
 		tests/test_bad_input.py tests/test_store.py tests/test_pure.py tests/test_regressions.py
+
+floors: .venv-floors/ready  ## the fast run's core on the lowest versions of dependencies that pyproject.toml allows
+	.venv-floors/bin/python -m pytest -q $(TOGETHER) tests/test_package.py tests/test_store.py tests/test_subscribe.py \
+		tests/test_cli.py tests/test_pytest_plugin.py tests/test_recording*.py tests/test_browser*.py
+
+.venv-floors/ready: pyproject.toml $(VENV)/ready
+	$(BIN)/uv venv -q --clear --python $(BIN)/python .venv-floors
+	$(BIN)/uv pip install -q --python .venv-floors --resolution lowest-direct -e '.[server,tools,parquet,fast]'
+	$(BIN)/uv pip install -q --python .venv-floors pytest pytest-asyncio pytest-xdist hypothesis httpx playwright trustme
+	touch $@
+
+dist: $(VENV)/ready  ## sdist and wheel in dist/, checked; then the README, followed with nothing but the wheel installed
+	rm -rf dist out/wheel
+	$(BIN)/uv build -q
+	$(BIN)/uvx -q twine check --strict dist/*.whl dist/*.tar.gz
+	$(BIN)/uv venv -q --python $(BIN)/python out/wheel
+	$(BIN)/uv pip install -q --python out/wheel "$$(ls dist/*.whl)[server,tools]"
+	REEM_TEST_PYTHON=$(CURDIR)/out/wheel/bin/python $(BIN)/python -m pytest -q tests/test_docs.py -k "followed and README"
 
 fuzz: $(VENV)/ready  ## random bytes against everything that decodes, for a minute each
 	$(BIN)/python -m tests.fuzz
@@ -90,4 +108,4 @@ scale: .venv-bench/ready  ## cost per operation, and docs/lab/scale.md from it, 
 	touch $@
 
 clean:  ## remove the virtual environment and caches
-	rm -rf $(VENV) .venv-bench .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-bench .venv-floors dist out .mypy_cache .pytest_cache .ruff_cache .hypothesis

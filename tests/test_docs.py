@@ -21,11 +21,11 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import redis
 from conftest import ROOT, SLOW_MACHINE, eventually, python
-from test_cli import REEM
 
 import reem
 import reem_async.errors
@@ -33,6 +33,8 @@ from benchmarks import summary
 from benchmarks.results import FULL, Results
 from reem_async.server import EmbeddedServer
 
+PYTHON = os.environ.get("REEM_TEST_PYTHON", sys.executable)
+"""`make dist` names the one of an environment that has the wheel alone."""
 DOCS = ROOT / "docs"
 PAGES = [
     ROOT / "README.md",
@@ -109,7 +111,7 @@ class Reader:
         if name := re.match(r"# (\w+\.py)\n", code):
             (self.folder / name[1]).write_text(code, encoding="utf-8")
             return
-        done = self.run([sys.executable, "-X", "dev", "-W", "error", "-c", code])
+        done = self.run([PYTHON, "-X", "dev", "-W", "error", "-c", code])
         assert (done.returncode, SLOW_MACHINE.sub("", done.stderr)) == (0, ""), done.stderr
         expected = "\n".join(re.findall(r"^ *print\(.*\)  # (.*)$", code, re.MULTILINE))
         assert shaped(expected).fullmatch(done.stdout), f"{done.stdout}\nis not\n{expected}"
@@ -139,8 +141,8 @@ class Reader:
             return
         flags = ["-X", "dev", "-W", "error"]
         start = {
-            "reem": [REEM],
-            "python": [sys.executable, *flags],
+            "reem": [str(Path(PYTHON).parent / "reem")],
+            "python": [PYTHON, *flags],
             "pytest": [sys.executable, "-m", "pytest", "-p", "no:cacheprovider"],
         }
         bounded = any(word in words for word in ("--duration", "--count", "--timeout", "-n"))
