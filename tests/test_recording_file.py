@@ -178,7 +178,7 @@ def test_the_library_s_own_reader_and_foxglove_s_classes(names, file_and_values)
             assert abs(message.publish_time - message.log_time) < 10**9
             assert image.timestamp.seconds == message.publish_time // 10**9
         names = {record.name for record in reader.iter_metadata()}
-        assert names == {"reem", "reem.channels", "reem.totals"}
+        assert names == {"reem", "reem.channels"}
     with file.open("rb") as stream:  # and record by record, every checksum verified
         assert list(mcap.reader.NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False))
 
@@ -272,24 +272,6 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
         assert is_whole or count or found == len(seen)
     assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
     assert noticed > 40
-
-
-def test_the_times_of_a_chunk_are_not_believed(names, file_and_values, tmp_path):
-    """Of a file without a summary; an end in the year 2500 was taken for that of the recording."""
-    file, seen = file_and_values
-    with open_log(file) as log:
-        chunks, end = log._container.chunks, log.end
-    whole, damaged = file.read_bytes()[:-20], tmp_path / "damaged.mcap"
-    for info in chunks[1:-1]:
-        for field in (9, 17):
-            data = bytearray(whole)
-            data[info.offset + field + 7] ^= 0x40
-            damaged.write_bytes(data)
-            found, count = check(damaged, names, seen)
-            assert count > 0
-            assert found >= len(seen) // 2
-            with open_log(damaged) as log:
-                assert log.end == end
 
 
 def mutated(data, rng):

@@ -7,19 +7,16 @@ damaged is left out and counted: a whole chunk, or all that follows a damaged re
 
 from __future__ import annotations
 
-import contextlib
 import io
 import struct
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
-import orjson
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -42,9 +39,8 @@ from .mcap_reader import (
     read_summary,
     record_starts,
 )  # fmt: skip
-from .sink import CHANNELS, TOTALS
 
-__all__ = ["Container", "Message", "Progress", "noted"]
+__all__ = ["Container", "Message", "Progress"]
 
 # Unpacked chunks that are kept: neighbours in time are asked for together.
 _CACHED_BYTES = 96 << 20
@@ -93,7 +89,9 @@ def _unpacked(source: Source, info: ChunkInfo) -> bytes | None:
 
 def _take_records(content: bytes, contents: Contents) -> Index | None:
     """Take the schemas and channels out of a chunk; return the index of its messages, None if it is damaged."""
-    places: dict[int, list[tuple[int, int]]] = {}
+    channels: list[int] = []
+    times: list[int] = []
+    offsets: list[int] = []
     position = 0
     try:
         while position < len(content):
@@ -103,7 +101,9 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
                 return None
             if opcode == Opcode.MESSAGE:
                 _, _, channel_id, _, log_time, _ = _MESSAGE.unpack_from(content, position)
-                places.setdefault(channel_id, []).append((log_time, position))
+                channels.append(channel_id)
+                times.append(log_time)
+                offsets.append(position)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 stream = ReadDataStream(io.BytesIO(content[start:end]))
                 record, known = (
@@ -117,7 +117,7 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
             position = end
     except (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError):
         return None
-    return index_of(places)
+    return index_of(channels, times, offsets)
 
 
 class _Scan:
@@ -320,7 +320,7 @@ class Container:
             index = self._read_index(info)
             if index is None:
                 self._discard(info)
-                index = index_of({})
+                index = index_of((), (), ())
             self._indexes[info.number] = index
             self._entries += len(index.times)
             while self._entries > _CACHED_ENTRIES and len(self._indexes) > 1:
@@ -336,9 +336,7 @@ class Container:
             text = self._source.read(info.index, info.index_length)
             starts = index_places(self._source, info) if info.map else record_starts(text)
             index = parse_index(text, starts, info.start, info.end)
-        if index is None or not np.array_equal(np.sort(index.channels), np.sort(info.channels)):
-            return None
-        return index
+        return index if index is not None and np.isin(index.channels, info.channels).all() else None
 
     def message(self, info: ChunkInfo, channel: int, offset: int, log_time: int) -> Message | None:
         """Return a message that the index of a chunk names; None, and the chunk is left out, if that is damaged."""
@@ -360,27 +358,6 @@ class Container:
         # Behind the head and two times: the size of the content.
         (size,) = struct.unpack("<Q", self._source.read(info.offset + HEAD.size + 16, 8))
         return int(size)
-
-    def totals(self) -> dict[int, list[int]] | None:
-        """Return how many messages each channel has, their bytes, and the first and last log time.
-
-        The recorder notes that at the end. None if it has not, or if its notes do not agree with the channels, the
-        statistics and the chunks of the file: another tool has renumbered, filtered or damaged it.
-        """
-        notes = noted(self.metadata, TOTALS)
-        if self.damaged or not notes or not self.every_chunk:
-            return None
-        try:
-            listed = {row[0]: (row[1], row[2], row[4]) for row in noted(self.metadata, CHANNELS)}
-            channels = {it.id: (it.topic, it.message_encoding, it.metadata) for it in self.channels.values()}
-            known = all(len(row) == 5 and all(type(each) is int and each >= 0 for each in row) for row in notes)
-            counts = {row[0]: row[1] for row in notes}
-            span = min(row[3] for row in notes), max(row[4] for row in notes)
-        except (IndexError, TypeError, KeyError):
-            return None
-        chunks = self.every_chunk[0].start, max(info.end for info in self.every_chunk)
-        agrees = known and (listed, counts, span) == (channels, self._contents.counts, chunks)
-        return {row[0]: row[1:] for row in notes} if agrees else None
 
     def verify(self, progress: Progress | None = None) -> int:
         """Read every chunk; return how many records of the file are damaged."""
@@ -410,20 +387,3 @@ class Container:
         for start in range(0, end, _BARE_BYTES):
             found = zlib.crc32(self._source.read(start, min(_BARE_BYTES, end - start)), found)
         return bool(found == checksum)
-
-
-def noted(metadata: Iterable[Metadata], name: str) -> list[Any]:
-    """Return the rows of the recorder's notes of one name, without what is damaged.
-
-    Other tools copy these notes as they are into files with other channels: they are only to be believed where they
-    agree with the rest of the file.
-    """
-    rows: list[Any] = []
-    for record in metadata:
-        if record.name == name:
-            with contextlib.suppress(ValueError, KeyError):
-                text = record.metadata["channels"].encode()
-                found = orjson.loads(text)
-                if type(found) is list and zlib.crc32(text) == int(record.metadata["crc32"]):
-                    rows += found
-    return rows

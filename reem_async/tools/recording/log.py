@@ -388,8 +388,8 @@ class Log:
     def channels(self, progress: Callable[[int, int], None] | None = None) -> list[ChannelSummary]:
         """Return what each channel of the file holds, by topic.
 
-        The recorder writes that down at the end. Where it was killed, or something is damaged, the indexes of all
-        chunks are read, and `progress` is told the chunks done and all of them.
+        The indexes of all chunks are read: about a second for half an hour of 1,000 keys. `progress` is called with the
+        chunks done and all of them.
         """
         found, totals = [], self._past.totals(progress)
         for channel, stream, schema in self._past.channels():

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import orjson
-from mcap.records import Channel
+from mcap.records import Channel, Metadata
 
 from ...errors import BadData
 from ...plan.differences import same
@@ -19,7 +19,7 @@ from ...plan.patterns import Pattern
 from ...plan.trees import MISSING, get
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .container import Container, Progress, noted
+from .container import Container, Progress
 from .errors import DamagedRecording
 from .layout import from_json
 from .mcap_reader import Numbers
@@ -104,13 +104,9 @@ class Past:
         if not is_described:  # nor are the notes on channels there; but each recording has topics of its own
             return int(not any(channel.topic.startswith("/_reem/") for channel in channels))
         names = {stream.path[0] for stream in self._of_channel.values()}
-        missing: Counter[str] = Counter()
-        for row in noted(self._container.metadata, CHANNELS):
-            place = _place(row[4]) if type(row) is list and len(row) == 5 and type(row[4]) is dict else None
-            if place is not None and place[0][0] in names:
-                missing[str(sorted(row[4].items()))] += 1
-        missing.subtract(str(sorted(channel.metadata.items())) for channel in channels)
-        return sum(count for count in missing.values() if count > 0)
+        listed = Counter(_listed(self._container.metadata, names))
+        listed.subtract(str(sorted(channel.metadata.items())) for channel in channels)
+        return sum(count for count in listed.values() if count > 0)
 
     def tree(self, path: Path, until: int) -> Any:
         """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
@@ -362,6 +358,19 @@ class Past:
         for channel in list(self._container.channels.values()):  # reading an index may find more of them
             schema = self._container.schemas.get(channel.schema_id)
             yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
+
+
+def _listed(metadata: Iterable[Metadata], names: set[str | int]) -> Iterator[str]:
+    """Yield the metadata of the channels that the recorder has listed for some top-level keys, as text.
+
+    Other tools copy these lists as they are. So they say which channels there were, and nothing else.
+    """
+    for record in metadata:
+        with contextlib.suppress(ValueError, KeyError, TypeError, IndexError):
+            for row in orjson.loads(record.metadata["channels"]) if record.name == CHANNELS else ():
+                place = _place(row[4])
+                if place is not None and place[0][0] in names:
+                    yield str(sorted(row[4].items()))
 
 
 def _place(metadata: Mapping[str, str]) -> tuple[Path, Role, Kind] | None:

@@ -12,7 +12,7 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, MetadataIndex, Schema, Statistics
+from mcap.records import Channel, Metadata, MetadataIndex, Schema
 
 __all__ = [
     "HEAD", "MAGIC", "ChunkInfo", "Contents", "Footer", "Index", "Numbers", "Source", "index_of", "index_places",
@@ -128,10 +128,8 @@ class Index(NamedTuple):
 
     def same(self, other: Index) -> bool:
         """Return whether both list the same messages; the channels may be in any order."""
-        mine, its = ({int(channel): it.of(channel) for channel in it.channels} for it in (self, other))
-        return mine.keys() == its.keys() and all(
-            np.array_equal(one, two) for channel in mine for one, two in zip(mine[channel], its[channel], strict=True)
-        )
+        pair = [index_of(it.entries(), it.times, it.offsets) for it in (self, other)]
+        return all(np.array_equal(one, two) for one, two in zip(*pair, strict=True))
 
     def span(self) -> tuple[int, int]:
         """Return the first and the last log time."""
@@ -169,17 +167,12 @@ class ChunkInfo:
 
 @dataclass(slots=True)
 class Contents:
-    """What a file has: channels and schemas by number, chunks, metadata in the order of the file.
-
-    Attributes:
-        counts: How many messages each channel has, by the statistics of the summary; None if there are none.
-    """
+    """What a file has: channels and schemas by number, chunks, metadata in the order of the file."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: list[ChunkInfo] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
-    counts: dict[int, int] | None = None
 
     def unknown(self) -> int:
         """Return how many channels with messages, or their schemas, the file does not describe."""
@@ -258,8 +251,6 @@ def _parsed(source: Source, footer: Footer) -> tuple[Contents, dict[int, int]]:
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
             contents.channels[channel.id] = channel
-        elif opcode == Opcode.STATISTICS:
-            contents.counts = dict(Statistics.read(stream).channel_message_counts)
         elif opcode == Opcode.METADATA_INDEX:
             metadata.append(MetadataIndex.read(stream))
     metadata.sort(key=lambda it: it.offset)
@@ -310,11 +301,12 @@ def index_places(source: Source, info: ChunkInfo) -> Numbers:
     return np.sort(np.frombuffer(text, _PLACE)["offset"].astype(np.int64)) - info.index
 
 
-def index_of(places: Mapping[int, Iterable[tuple[int, int]]]) -> Index:
-    """Return the index with these log times and places of each channel's messages."""
-    pairs = np.array([pair for each in places.values() for pair in each], np.uint64).reshape(-1, 2)
-    bounds = np.cumsum([0, *[len(list(each)) for each in places.values()]])
-    return _in_order(Index(np.array(list(places), np.uint16), bounds, pairs[:, 0], pairs[:, 1]))
+def index_of(channels: Any, times: Any, offsets: Any) -> Index:
+    """Return the index of messages, given the channel, the log time and the place of each, in any order."""
+    numbers, stamps, places = np.array(channels, np.uint16), np.array(times, np.uint64), np.array(offsets, np.uint64)
+    order = np.lexsort((places, stamps, numbers))
+    known, starts = np.unique(numbers[order], return_index=True)
+    return Index(known, np.append(starts, len(order)), stamps[order], places[order])
 
 
 def record_starts(text: bytes) -> Numbers:
@@ -350,7 +342,12 @@ def parse_index(text: bytes, starts: Numbers, first: int, last: int) -> Index | 
     bounds = np.append(0, np.cumsum(sizes // 16))
     index = Index(heads["channel"].copy(), bounds, pairs[:, 0].copy(), pairs[:, 1].copy())
     begin, end = index.span()
-    return _in_order(index) if not len(index.times) or (begin >= first and end <= last) else None
+    if len(index.times) and (begin < first or end > last):
+        return None
+    rises = index.times[1:] >= index.times[:-1]
+    rises[bounds[(bounds > 0) & (bounds < len(pairs))] - 1] = True  # another channel begins
+    # Other writers need not sort the messages of a channel.
+    return index if rises.all() else index_of(index.entries(), index.times, index.offsets)
 
 
 def _parted(raw: Numbers, starts: Numbers, ends: Numbers) -> tuple[Numbers, Numbers]:
@@ -363,14 +360,3 @@ def _parted(raw: Numbers, starts: Numbers, ends: Numbers) -> tuple[Numbers, Numb
     is_body = np.ones(len(raw), bool)
     is_body[places] = False
     return raw[places].view(_INDEX_HEAD).reshape(-1), raw[is_body]
-
-
-def _in_order(index: Index) -> Index:
-    """Return an index with the messages of each channel in order of their log times: other writers need not sort."""
-    times = index.times
-    rises = times[1:] >= times[:-1]
-    rises[index.bounds[(index.bounds > 0) & (index.bounds < len(times))] - 1] = True  # another channel begins
-    if rises.all():
-        return index
-    order = np.lexsort((times, np.repeat(np.arange(len(index.channels)), np.diff(index.bounds))))
-    return index._replace(times=times[order], offsets=index.offsets[order])

@@ -37,7 +37,7 @@ from mcap.records import (
 from .output import Output
 from .yielding import slices
 
-__all__ = ["COMPRESSIONS", "MESSAGE_HEAD", "Writer"]
+__all__ = ["COMPRESSIONS", "Writer"]
 
 _MAGIC = b"\x89MCAP0\r\n"
 # Bytes after which a chunk is closed: large enough to compress well, small enough to be unpacked for one message.
@@ -47,8 +47,6 @@ _INDEX_BYTES = 1 << 20
 # Opcode, length, channel, sequence, log time, publish time; the data follow.
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIELDS = _MESSAGE.size - 9
-MESSAGE_HEAD = _MESSAGE.size
-"""Bytes of a message's record before its data."""
 # Opcode, length, first and last log time, size and CRC-32 of the content; compression and content follow.
 _CHUNK = struct.Struct("<BQQQQI")
 _CHUNK_FIELDS = _CHUNK.size - 9

@@ -24,13 +24,13 @@ from ...errors import BadValue
 from ...plan.paths import Path, show
 from .errors import RecordingFailed
 from .layout import Document, topic_of
-from .mcap_writer import COMPRESSIONS, MESSAGE_HEAD, Writer
+from .mcap_writer import COMPRESSIONS, Writer
 from .messages import Encoded, schema_bytes
 from .output import Output
 from .roles import Kind, Role
 from .schema import OPEN, Signature, fits, schema_text, signature
 
-__all__ = ["CHANNELS", "FLUSH_SECONDS", "FORMAT", "TOTALS", "FullError", "Sink"]
+__all__ = ["CHANNELS", "FLUSH_SECONDS", "FORMAT", "FullError", "Sink"]
 
 FORMAT = "1"
 FLUSH_SECONDS = 0.25
@@ -46,9 +46,6 @@ OPERATIONS = "/_reem/ops"
 STATISTICS = "/_reem/stats"
 CHANNELS = "reem.channels"
 """The name of the metadata records that list channels."""
-TOTALS = "reem.totals"
-"""The name of the metadata record at the end that says of each channel how many messages it has, their bytes (with
-a few of framing), and the first and last log time: to count them by the indexes would take minutes."""
 _SHARED_TOPICS = {
     **dict.fromkeys((Role.STATE, Role.KEYFRAME), KEYFRAMES),
     **dict.fromkeys((Role.DELETE, Role.GAP, Role.SKIP), OPERATIONS),
@@ -93,7 +90,6 @@ class Sink:
         self._known: dict[Any, list[tuple[Signature, int]]] = {}
         self._count = 0
         self._new: list[Any] = []
-        self._totals: dict[int, list[int]] = {}
         # When the last chunk was closed, and how many messages wait in the open one.
         self._closed_at = time.monotonic()
         self._open = 0
@@ -176,15 +172,7 @@ class Sink:
     def _message(self, channel: int, pieces: list[Any], stamp: tuple[int, int, int]) -> int:
         log_time, publish_time, number = stamp
         self._open += 1
-        size = self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
-        totals = self._totals.get(channel)
-        if totals is None:
-            totals = self._totals[channel] = [0, 0, log_time, log_time]
-        totals[0] += 1
-        # As a reader counts them by the index: from one message to the next.
-        totals[1] += size + MESSAGE_HEAD
-        totals[3] = log_time
-        return size
+        return self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
 
     def tick(self, *, now: bool = False) -> None:
         """Close the chunk if it is time, so that it can be read whatever happens."""
@@ -194,25 +182,20 @@ class Sink:
             if self._open:
                 self._open = 0
                 self._writer.flush()
-                self._tell_channels()
+                self._list_channels()
 
-    def _tell_channels(self) -> None:
-        """Say outside of the chunks too what new channels are for: the chunk that says so may be damaged."""
+    def _list_channels(self) -> None:
+        """List new channels outside of the chunks: readers tell by it whether a filter has left some out."""
         if self._new:
-            self._about_channels(CHANNELS, self._new)
+            text = orjson.dumps(self._new)
+            self._writer.add_metadata(CHANNELS, {"channels": text.decode(), "crc32": str(zlib.crc32(text))})
             self._new = []
             self.output.flush()
-
-    def _about_channels(self, name: str, rows: list[list[Any]]) -> None:
-        text = orjson.dumps(rows)
-        self._writer.add_metadata(name, {"channels": text.decode(), "crc32": str(zlib.crc32(text))})
 
     def finish(self, metadata: Mapping[str, str]) -> None:
         """Write the last chunk, what is said of the recording at its end, and the index; close the file."""
         self._writer.flush()
-        self._tell_channels()
-        # Only when it is complete: readers take a second record of totals for damage.
-        self._about_channels(TOTALS, [[channel, *figures] for channel, figures in self._totals.items()])
+        self._list_channels()
         self._writer.add_metadata("reem", dict(metadata))
         self._writer.finish()
         self.close()

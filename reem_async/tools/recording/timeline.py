@@ -144,11 +144,7 @@ class Timeline:
         return found if found is not None and found.time == time else None
 
     def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
-        """Return what each channel has: as the recorder says, or else by the indexes of all chunks."""
-        said = self._container.totals()
-        return self._counted(progress) if said is None else {number: Totals(*each) for number, each in said.items()}
-
-    def _counted(self, progress: Progress | None) -> dict[int, Totals]:
+        """Return what each channel has, by the indexes of all chunks."""
         messages, sizes, lasts = np.zeros((3, _CHANNELS), np.int64)
         firsts = np.full(_CHANNELS, _END)
         for info in self._chunks:
