@@ -141,7 +141,7 @@ def test_what_is_forbidden_would_be_found(tmp_path, monkeypatch):
 # --- the order of the folders, and no import circles -------------------------------------------------
 
 ORDER = [
-    {"errors", "_moved"},
+    {"errors", "_moved", "_installation"},
     {"plan", "ships"},
     {"plain"},
     {"concurrency"},
