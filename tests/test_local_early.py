@@ -81,14 +81,14 @@ async def test_early_what_another_publisher_overtook_is_put_right(server_url, ke
     async with parties(server_url, key("cam")) as ((one, other), kvs, told, _):
         await one[key("cam")].write({"n": 2, "image": IMAGE})
         assert (await next_of(told)).data["n"] == 2
-        share, waiting = publish._Setting.share, [other]
+        share, waiting = publish.ValueAnnouncement.share, [other]
 
         async def overtaken(self, path):
             await share(self, path)
             if waiting:
                 await waiting.pop()[key("cam")].write({"n": 4, "image": IMAGE})
 
-        monkeypatch.setattr(publish._Setting, "share", overtaken)
+        monkeypatch.setattr(publish.ValueAnnouncement, "share", overtaken)
         await one[key("cam")].write({"n": 3, "image": IMAGE})
         updates = [await next_of(told)]
         assert updates[0].early

@@ -350,7 +350,7 @@ def test_a_number_is_not_used_again_if_the_server_goes_away_between_two_kept_upd
             await look(self, *what)
 
         async def send_noting(self, turn, assignments):
-            held.append(len(turn._tellings))
+            held.append(len(turn._announcements))
             await send(self, turn, assignments)
 
         monkeypatch.setattr(DocumentWriter, "_check_place", look_without_server)

@@ -20,7 +20,7 @@ from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.together import together
 from reem_async.plan.writes import append_change, change, delete_change, set_change, takes
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.store.publish import UpdateNotifier
+from reem_async.store.publish import PublishTurn
 from reem_async.transport.recorder import CommandRecorder
 
 KEYS = keys_of("a", "", 0, False)
@@ -37,11 +37,11 @@ def full_cache():
 
 
 WRITES = {
-    "set": lambda telling, cache: change(set_change(KEYS, ("x",), b"1", IMAGE, notices=telling), cache),
-    "set in a list": lambda telling, cache: change(set_change(KEYS, ("l", -1), b"1", (), notices=telling), cache),
-    "delete": lambda telling, cache: change(delete_change(KEYS, (), notices=telling), cache),
-    "append": lambda telling, cache: change(append_change(KEYS, ("l",), [b"1"], IMAGE, notices=telling), cache),
-    "update": lambda telling, cache: together([set_change(KEYS, ("y",), b"1", (), notices=telling)], cache),
+    "set": lambda telling, cache: change(set_change(KEYS, ("x",), b"1", IMAGE, announcement=telling), cache),
+    "set in a list": lambda telling, cache: change(set_change(KEYS, ("l", -1), b"1", (), announcement=telling), cache),
+    "delete": lambda telling, cache: change(delete_change(KEYS, (), announcement=telling), cache),
+    "append": lambda telling, cache: change(append_change(KEYS, ("l",), [b"1"], IMAGE, announcement=telling), cache),
+    "update": lambda telling, cache: together([set_change(KEYS, ("y",), b"1", (), announcement=telling)], cache),
     "increment": lambda telling, cache: calculate(
         KEYS, ("n",), "JSON.NUMINCRBY", operator.add, 1, b"1", telling, cache
     ),
@@ -57,8 +57,8 @@ async def test_plans_change_nothing_while_they_are_built(known, kind):
     """Neither what is known of documents nor a publisher's numbers: a plan may be built and never sent."""
     session = reem_async.RedisInterface("127.0.0.1").session  # never connected
     cache = full_cache() if known else ShapeCache()
-    turn = UpdateNotifier(session, KEYS).turn
-    for telling in (turn().with_value(b"1", IMAGE), turn().without_value(), turn().without_value(deleted=True)):
+    turn = PublishTurn(session, KEYS)
+    for telling in (turn.reserve(b"1", IMAGE), turn.reserve(), turn.reserve(deleted=True)):
         before = copy.deepcopy(vars(cache)), copy.deepcopy(session._numbers._last)
         plan = WRITES[kind](telling, cache)
         assert plan is None or plan.commands

@@ -24,7 +24,7 @@ from reem_async.plan.keys import keys_of
 from reem_async.plan.reads import read
 from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.writes import change, set_change
-from reem_async.store.publish import DocumentPublisher, UpdateNotifier
+from reem_async.store.publish import DocumentPublisher, PublishTurn
 from reem_async.transport.packing import pack
 from reem_async.transport.redirects import keys_in
 
@@ -72,8 +72,8 @@ async def script(topic: Topic, namespace: str, sharded: bool) -> Script:
     writer = DocumentPublisher(session, topic.name)
     text, loaded = await writer.encoder.encoded((), VALUES[topic.value](1))
     keys = keys_of(topic.name, namespace, 0, sharded)
-    telling = UpdateNotifier(session, keys).turn().with_value(text, loaded)
-    commands = wire_commands(change(set_change(keys, (), text, loaded, notices=telling), ShapeCache()))
+    announcement = PublishTurn(session, keys).reserve(text, loaded)
+    commands = wire_commands(change(set_change(keys, (), text, loaded, announcement=announcement), ShapeCache()))
     watch = bytes_of([("WATCH", *keys_in(commands))]) if sharded else b""
     fetch = b""
     if loaded:  # too large for the notice

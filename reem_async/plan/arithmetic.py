@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import MissingKey, Overflow, PartialWrite, WrongType
 from . import Plan, Reply
-from .changes import Telling
+from .changes import Announcement
 from .documents import encode
 from .indexes import from_front, lengths
 from .keys import Keys
@@ -43,7 +43,7 @@ def calculate(
     operation: Operation,
     operand: float,
     text: bytes,
-    notices: Telling,
+    announcement: Announcement,
     cache: ShapeCache,
 ) -> Plan:
     """Plan `command` (JSON.NUMINCRBY, JSON.NUMMULTBY) with `operand`, in one transaction; returns the new number.
@@ -59,11 +59,11 @@ def calculate(
         # transaction reads the number before and after, so whatever somebody else made of it meanwhile shows.
         if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
             return computed()
-        return _on_server(keys, path, command, operation, operand, text, notices, cache, computed)
+        return _on_server(keys, path, command, operation, operand, text, announcement, cache, computed)
 
     def computed() -> Plan:
         # If others were faster, the number that was seen is such a guess, and nobody can be faster than the server.
-        return compute(keys, path, lambda number: operation(number, operand), notices, cache, attempt)
+        return compute(keys, path, lambda number: operation(number, operand), announcement, cache, attempt)
 
     return attempt(cache.number(keys.document, path))
 
@@ -75,7 +75,7 @@ def _on_server(
     operation: Operation,
     operand: float,
     text: bytes,
-    notices: Telling,
+    announcement: Announcement,
     cache: ShapeCache,
     computed: Callable[[], Plan],
 ) -> Plan:
@@ -85,7 +85,7 @@ def _on_server(
         get_command(keys, path),
         (command, keys.document, place, text),
         get_command(keys, path),
-        *notices.make(path),
+        *announcement.commands(path),
     ]
 
     def decode(replies: Sequence[Reply]) -> Any:
@@ -102,7 +102,7 @@ def _on_server(
         if type(new) is type(due) and new == due:
             cache.saw_number(keys.document, path, new)
             return new
-        return _put_right(keys, path, text, old, due, notices)
+        return _put_right(keys, path, text, old, due, announcement)
 
     return Plan(commands, decode, atomic=True)
 
@@ -111,7 +111,7 @@ def compute(
     keys: Keys,
     path: Path,
     function: Callable[[Any], Any],
-    notices: Telling,
+    announcement: Announcement,
     cache: ShapeCache,
     otherwise: Callable[[Any], Plan] | None = None,
 ) -> Plan:
@@ -126,10 +126,10 @@ def compute(
         # Refused here, so that nothing is sent that the server would wrap around.
         new = _in_range(function(old), keys, path, old)
         place = from_front(replies[2:], keys, path, MissingKey)
-        return _guarded(keys, place, new, notices, lambda: again(old), lambda: finish(new))
+        return _guarded(keys, place, new, announcement, lambda: again(old), lambda: finish(new))
 
     def again(old: Any) -> Plan:
-        return compute(keys, path, function, notices, cache) if otherwise is None else otherwise(old)
+        return compute(keys, path, function, announcement, cache) if otherwise is None else otherwise(old)
 
     def finish(new: Any) -> Any:
         cache.saw_number(keys.document, path, new)
@@ -138,7 +138,7 @@ def compute(
     return Plan([("WATCH", keys.document), get_command(keys, path), *lengths(keys, path)], look, held=True)
 
 
-def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices: Telling) -> Plan:
+def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, announcement: Announcement) -> Plan:
     """Plan to replace a wrapped result by the right one, or by the old value if that is out of range."""
     fits = _fits(due)
 
@@ -150,10 +150,10 @@ def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, notices
                 f"{show(full(keys, path))}: the result left the range of 64 bits and was wrapped around by the server; "
                 "somebody else changed it before it could be put right: write it again"
             )
-        return _guarded(keys, path, due if fits else old, notices, again, finish, unfinished)
+        return _guarded(keys, path, due if fits else old, announcement, again, finish, unfinished)
 
     def again() -> Plan:
-        return _put_right(keys, path, wrong, old, due, notices)
+        return _put_right(keys, path, wrong, old, due, announcement)
 
     def finish() -> Any:
         if not fits:
@@ -173,18 +173,18 @@ def _guarded(
     keys: Keys,
     path: Path,
     value: Any,
-    notices: Telling,
+    announcement: Announcement,
     again: Callable[[], Plan],
     then: Callable[[], Any],
     unfinished: Callable[[Exception], Exception] | None = None,
 ) -> Plan:
     """Plan to set a number on the watched connection; `again` is what to do if somebody else was faster."""
     text = encode(value, full(keys, path), lambda _: None, lambda _: "").text
-    commands = [("JSON.SET", keys.document, to_jsonpath(path), text), *notices.make(path)]
+    commands = [("JSON.SET", keys.document, to_jsonpath(path), text), *announcement.commands(path)]
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         if replies is None:
-            notices.take_back()
+            announcement.unsent()
             return again()
         checked(replies[0], keys, path)
         return then()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from ..errors import MissingKey
 from . import Command, Reply
 from .keys import Keys
 from .paths import Path
 
-__all__ = ["REFUSED", "SILENT", "Change", "EncodedAttachment", "Telling"]
+__all__ = ["REFUSED", "SILENT", "Announcement", "Change", "EncodedAttachment"]
 
 REFUSED = object()
 """Judging a reply: the server did nothing and did not say why."""
@@ -32,38 +32,40 @@ class EncodedAttachment(NamedTuple):
     blob: tuple[Any, ...] | None = None
 
 
-class Telling(Protocol):
-    """How subscribers are told of one change, in the same transaction.
+class Announcement:
+    """What notifies subscribers of one change, in the transaction that makes it. This one notifies no one.
 
     Its number is reserved before the change is planned, so that planning uses up nothing.
     """
 
-    def make(self, path: Path) -> Sequence[Command]:
-        """Return the commands that tell of a change at `path`, under a number of their own."""
-        ...
+    __slots__ = ()
 
-    def take_back(self) -> None:
-        """Note that what was made last was not sent: its number is free for what is made next."""
-        ...
-
-    def retract(self, path: Path) -> Sequence[Command]:
-        """Return what tells that the server has refused the change after all; nothing if that shows by itself."""
-        ...
-
-
-class _Silent:
-    def make(self, path: Path) -> Sequence[Command]:
+    def commands(self, path: Path) -> Sequence[Command]:
+        """Return the commands that announce a change at `path`, under a number of their own."""
         return ()
 
-    def take_back(self) -> None:
-        return
+    def unsent(self) -> None:
+        """Note that the last commands were not sent: their number is free for the next ones."""
 
     def retract(self, path: Path) -> Sequence[Command]:
+        """Return what announces that the server has refused the change after all; nothing if that shows by itself."""
         return ()
 
+    async def share(self, path: Path) -> None:
+        """Put a large value that is about to be set where subscribers of the same host find it.
 
-SILENT: Telling = _Silent()
-"""Tells nobody."""
+        Raises:
+            NotConnected: The server is out of reach; nothing was set.
+        """
+
+    def release(self) -> None:
+        """Give back a number that was not used: nothing is to come any more of the change."""
+
+    def not_applied(self) -> None:
+        """Note that the change was sent and not applied: its number is free from now on."""
+
+
+SILENT = Announcement()
 
 
 class Change(NamedTuple):
@@ -77,7 +79,7 @@ class Change(NamedTuple):
         attachments: What goes by ship.
         replaces: Whether what was at `path` is gone afterwards.
         gone: The suffixes of those that it replaces, if this is known for certain: the document is watched.
-        notices: What tells subscribers.
+        announcement: What notifies subscribers.
         absent: What to raise if a list on the way has no such item from its end.
     """
 
@@ -91,5 +93,5 @@ class Change(NamedTuple):
     attachments: tuple[EncodedAttachment, ...] = ()
     replaces: bool = True
     gone: tuple[bytes, ...] | None = None
-    notices: Telling = SILENT
+    announcement: Announcement = SILENT
     absent: type[Exception] = MissingKey

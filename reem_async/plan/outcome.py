@@ -48,7 +48,7 @@ class Outcome:
         judged = self._judged()
         # The notice went out in the same transaction as the command, before anybody knew that it would be refused.
         refused = judged is REFUSED or isinstance(judged, Exception)
-        if refused and (told := self.it.notices.retract(self.it.path)):
+        if refused and (told := self.it.announcement.retract(self.it.path)):
             return Plan(told, lambda _: self._settle(members, judged), atomic=True, unfinished=self._untold)
         return self._settle(members, judged)
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from ..errors import Conflict, MissingKey, PathRefused, WrongType
 from . import Command, Plan, Reply
-from .changes import REFUSED, SILENT, Change, EncodedAttachment, Telling
+from .changes import REFUSED, SILENT, Announcement, Change, EncodedAttachment
 from .indexes import from_front, lengths
 from .keys import Keys
 from .notices import NOTE_KEPT
@@ -54,11 +54,11 @@ def set_change(
     path: Path,
     text: bytes,
     attachments: tuple[EncodedAttachment, ...],
-    notices: Telling = SILENT,
+    announcement: Announcement = SILENT,
 ) -> Change:
     """Return the change that puts `text` at `path`; raises PathRefused if the parent is not there."""
     command = ("JSON.SET", keys.document, to_jsonpath(path), text)
-    return Change(keys, path, command, _judged_set, attachments, True, None, notices, PathRefused)
+    return Change(keys, path, command, _judged_set, attachments, True, None, announcement, PathRefused)
 
 
 def _judged_set(reply: Reply) -> Any:
@@ -66,7 +66,7 @@ def _judged_set(reply: Reply) -> Any:
     return REFUSED if reply is None else None
 
 
-def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
+def delete_change(keys: Keys, path: Path, **announcement: Any) -> Change:
     """Return the change that removes what is at `path`; raises MissingKey if nothing is there."""
 
     def judge(reply: Reply) -> Any:
@@ -74,11 +74,11 @@ def delete_change(keys: Keys, path: Path, **notices: Any) -> Change:
             raise MissingKey(f"nothing is stored at {show(full(keys, path))}; nothing was deleted")
         return None
 
-    return Change(keys, path, ("JSON.DEL", keys.document, to_jsonpath(path)), judge, **notices)
+    return Change(keys, path, ("JSON.DEL", keys.document, to_jsonpath(path)), judge, **announcement)
 
 
 def append_change(
-    keys: Keys, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...], **notices: Any
+    keys: Keys, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...], **announcement: Any
 ) -> Change:
     """Return the change that appends to the list at `path`; raises MissingKey or WrongType if there is none."""
 
@@ -89,7 +89,7 @@ def append_change(
         return None
 
     command = ("JSON.ARRAPPEND", keys.document, to_jsonpath(path), *texts)
-    return Change(keys, path, command, judge, attachments, replaces=False, **notices)
+    return Change(keys, path, command, judge, attachments, replaces=False, **announcement)
 
 
 def _no_list(keys: Keys, path: Path, *, nothing: bool) -> Exception:
@@ -157,7 +157,7 @@ def _change(it: Change, cache: ShapeCache, *, held: bool = False, given_up: Call
         after.append(("SADD", it.keys.registry, *(each.suffix for each in it.attachments)))
     after.append(("SMEMBERS", it.keys.registry))
     main = len(commands)
-    told = it.notices.make(it.path)
+    told = it.announcement.commands(it.path)
     commands += (it.command, *after, *told)
     # Most writes are small, without arrays, and nothing is special about the replies: one comparison tells.
     usual = None if main else _TOLD if told else _STORED
@@ -166,7 +166,7 @@ def _change(it: Change, cache: ShapeCache, *, held: bool = False, given_up: Call
         # EXEC was answered with nil: somebody wrote to the document after the look.
         if replies is None:
             assert given_up is not None  # only watched transactions are given up
-            it.notices.take_back()
+            it.announcement.unsent()
             return given_up()
         # Any write may have replaced the number that a calculation left.
         cache.forget_numbers(it.keys.document)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager
-from typing import Any, NamedTuple, Protocol
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from ..errors import SELF_EXPLANATORY, BadKey, BadType, BadValue, ConnectionLost, MissingKey, MissingTop, ReemError
 from ..plan import Plan
 from ..plan.arithmetic import Operation, calculate, compute
-from ..plan.changes import SILENT, Change, EncodedAttachment, Telling
+from ..plan.changes import SILENT, Announcement, Change, EncodedAttachment
 from ..plan.documents import number_text
 from ..plan.olddata import is_new
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
@@ -32,7 +32,10 @@ from ..plan.writes import (
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail
 
-__all__ = ["Assignment", "DocumentWriter", "Notifier", "Outages", "Turn"]
+__all__ = ["Assignment", "DocumentWriter", "Outages", "Turn"]
+
+
+Attachments = tuple[EncodedAttachment, ...]
 
 
 class Assignment(NamedTuple):
@@ -51,52 +54,40 @@ class Assignment(NamedTuple):
     is_entry: bool = False
 
 
-class Turn(Protocol):
-    """The turn of one call, and how subscribers are told of what it changes, in the transaction that changes it.
+class Turn:
+    """The turn of one call, and how subscribers are notified of what it changes. This one notifies no one.
+
+    So calls need not wait for each other. Used as an async context manager: entering waits for the turn of the call,
+    the next one begins when it is left.
 
     Attributes:
         time: When the call was made, in seconds since 1970; None for now.
     """
 
-    time: float | None
+    time: float | None = None
 
-    def with_value(self, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Telling:
-        """Return what tells of a value that is set."""
-        ...
+    async def __aenter__(self) -> Self:
+        return self
 
-    def without_value(self, *, deleted: bool = False) -> Telling:
-        """Return what tells of any other change."""
-        ...
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
 
-    async def share(self, telling: Telling, path: Path) -> None:
-        """Put a large value that is about to be set where subscribers of the same host find it.
+    def reserve(
+        self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
+    ) -> Announcement:
+        """Return the announcement of the next change; of one that sets a value, with its text and attachments."""
+        return SILENT
 
-        Raises:
-            NotConnected: The server is out of reach; nothing was set.
-        """
-        ...
-
-    def not_sent(self, count: int) -> None:
+    def not_applied(self, count: int) -> None:
         """Note that the last `count` changes were not applied: their numbers are free."""
-        ...
 
-    def settle(self) -> None:
-        """Note that nothing is to come any more of the changes so far: what tells of them is let go."""
-        ...
+    def release(self) -> None:
+        """Give back the numbers that the changes so far have not used."""
 
 
-class Notifier(Protocol):
-    """Whom changes of one top-level key are told, and in which order.
-
-    Attributes:
-        keeps_order: A later call must not overtake an earlier one.
-    """
-
-    keeps_order: bool
-
-    def turn(self) -> AbstractAsyncContextManager[Turn]:
-        """Wait for the turn of a call; the next one begins when this is left."""
-        ...
+_SILENT_TURN = Turn()
 
 
 class Outages(Protocol):
@@ -109,38 +100,6 @@ class Outages(Protocol):
     async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
         """Send what depends on what is there, behind what is kept; raises in an outage."""
         ...
-
-
-class _Silent:
-    """Tells nobody, so that calls need not wait for each other."""
-
-    # Calls of one task are in order anyhow: each is awaited. Those of several tasks have none.
-    keeps_order = False
-    time: float | None = None
-
-    def turn(self) -> _Silent:
-        return self
-
-    async def __aenter__(self) -> _Silent:
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        return None
-
-    def with_value(self, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Telling:
-        return SILENT
-
-    def without_value(self, *, deleted: bool = False) -> Telling:
-        return SILENT
-
-    async def share(self, telling: Telling, path: Path) -> None:
-        return
-
-    def not_sent(self, count: int) -> None:
-        return
-
-    def settle(self) -> None:
-        return
 
 
 # Seconds, 300 years: servers refuse what leaves 64 bits of milliseconds.
@@ -161,22 +120,26 @@ class DocumentWriter:
     Args:
         session: The server.
         name: The key.
-        notifier: Tells subscribers; None if nobody is to be told.
         outages: What is done in an outage; None if calls raise.
 
     Attributes:
         encoder: Encodes the values.
+        keeps_order: A later call must not overtake an earlier one.
     """
 
-    def __init__(
-        self, session: Session, name: object, notifier: Notifier | None = None, outages: Outages | None = None
-    ) -> None:
+    # Calls of one task are in order anyhow: each is awaited. Those of several tasks have none.
+    keeps_order = False
+
+    def __init__(self, session: Session, name: object, outages: Outages | None = None) -> None:
         self.session = session
         self.keys = session.keys(name)
         self.name = self.keys.name
         self.encoder = Encoder(session, self.keys)
-        self._notifier: Notifier = notifier or _Silent()
         self._outages = outages
+
+    def turn(self) -> Turn:
+        """Return the turn of a call."""
+        return _SILENT_TURN
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
         """Return what makes another one, which can be pickled."""
@@ -220,7 +183,7 @@ class DocumentWriter:
     async def _let_pass(self, attachments: tuple[EncodedAttachment, ...]) -> bool:
         """Let small calls that are under way be answered before a large one; returns whether it waited."""
         # A publisher that let others pass would publish out of order.
-        if self._notifier.keeps_order or not any(has_large(each.commands) for each in attachments):
+        if self.keeps_order or not any(has_large(each.commands) for each in attachments):
             return False
         return await self.session.transport.let_pass()
 
@@ -262,16 +225,16 @@ class DocumentWriter:
         if isinstance(operand, np.generic):
             operand = operand.item()
 
-        def plan(telling: Telling) -> Plan:
-            return calculate(self.keys, path, command, operation, operand, text, telling, self.session.cache)
+        def plan(announcement: Announcement) -> Plan:
+            return calculate(self.keys, path, command, operation, operand, text, announcement, self.session.cache)
 
         return await self._demand(self._calculate, plan)
 
     async def compute(self, path: Path, function: Any) -> Any:
         """Replace the number at `path` by a function of it; returns the new number."""
 
-        def plan(telling: Telling) -> Plan:
-            return compute(self.keys, path, function, telling, self.session.cache)
+        def plan(announcement: Announcement) -> Plan:
+            return compute(self.keys, path, function, announcement, self.session.cache)
 
         return await self._demand(self._calculate, plan)
 
@@ -302,7 +265,7 @@ class DocumentWriter:
         If it is broken off, the next change of the same key looks for what it may have left.
         """
         session, document = self.session, self.keys.document
-        async with self._notifier.turn() as turn:
+        async with self.turn() as turn:
             # What cancelled calls have left on its way, over another connection, must not come after this. There is
             # nearly never anything to wait for, and a coroutine costs time.
             if not session.transport.is_settled(document):
@@ -336,7 +299,7 @@ class DocumentWriter:
                 await self._check_place(path, attachments)
             it = self._setting(turn, path, text, attachments)
             if attachments:
-                await turn.share(it.notices, path)
+                await it.announcement.share(path)
             await self.session.run(change(it, self.session.cache))
         except MissingTop:
             # Only for `kvs["cam"]["image"] = array`: it would be of no use to have to write {} first.
@@ -345,7 +308,7 @@ class DocumentWriter:
         else:
             self._saw_new(path)
             return
-        turn.settle()  # that it was refused was told, with numbers of its own
+        turn.release()  # that it was refused was told, with numbers of its own
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
 
@@ -361,7 +324,7 @@ class DocumentWriter:
         changes = [self._setting(turn, path, text or b"", attachments) for path, text, attachments, _ in assignments]
         if shipped is not None:
             for each in changes:
-                await turn.share(each.notices, each.path)
+                await each.announcement.share(each.path)
         await self.session.run(together(changes, self.session.cache))
 
     async def _put_instead(
@@ -370,13 +333,13 @@ class DocumentWriter:
         # Something that was there could be replaced, so its place can take an array as well.
         if attachments and not before.holder:  # it is put where nothing is
             await self._check_place(path, attachments)
-        await self._if_still(before, set_change(self.keys, path, text, attachments, notices=turn.without_value()))
+        await self._if_still(before, set_change(self.keys, path, text, attachments, announcement=turn.reserve()))
 
     async def _expire(self, turn: Turn, milliseconds: int | None) -> None:
         await self.session.run(expiry(self.keys, milliseconds))
 
     async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
-        await self._if_still(before, delete_change(self.keys, path, notices=turn.without_value(deleted=True)))
+        await self._if_still(before, delete_change(self.keys, path, announcement=turn.reserve(deleted=True)))
 
     async def _if_still(self, before: RawRead, it: Change) -> None:
         # What was read names its arrays, and the transaction fails if anything is not as it was read: these are all.
@@ -384,7 +347,7 @@ class DocumentWriter:
         await self.session.run(exchange(it, before.commands, before.raw, self.session.cache))
 
     async def _remove(self, turn: Turn, path: Path) -> None:
-        it = delete_change(self.keys, path, notices=turn.without_value(deleted=True))
+        it = delete_change(self.keys, path, announcement=turn.reserve(deleted=True))
         await self.session.run(change(it, self.session.cache))
 
     async def _append(
@@ -392,11 +355,11 @@ class DocumentWriter:
     ) -> None:
         if attachments:  # they would be stored though there is no list to append to
             await self.session.run(appendable(self.keys, path))
-        it = append_change(self.keys, path, texts, attachments, notices=turn.without_value())
+        it = append_change(self.keys, path, texts, attachments, announcement=turn.reserve())
         await self.session.run(change(it, self.session.cache))
 
-    async def _calculate(self, turn: Turn, plan: Callable[[Telling], Plan]) -> Any:
-        return await self.session.run(plan(turn.without_value()))
+    async def _calculate(self, turn: Turn, plan: Callable[[Announcement], Plan]) -> Any:
+        return await self.session.run(plan(turn.reserve()))
 
     async def _check_place(self, path: Path, attachments: tuple[EncodedAttachment, ...]) -> None:
         """Raise PathRefused if ships' values would be stored for nothing."""
@@ -405,4 +368,4 @@ class DocumentWriter:
             await self.session.run(plan)
 
     def _setting(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Change:
-        return set_change(self.keys, path, text, attachments, turn.with_value(text, attachments))
+        return set_change(self.keys, path, text, attachments, turn.reserve(text, attachments))

@@ -225,7 +225,7 @@ class Outage:
         if isinstance(error, ConnectionLost):  # it was applied or not: sent again, it could be applied twice
             self._count(writer.keys, len(assignments))
         else:
-            turn.not_sent(len(assignments))
+            turn.not_applied(len(assignments))
             self._take(writer, assignments, called)
         self._have_asked()
 
@@ -329,7 +329,7 @@ class Outage:
             except MissingKey:  # it was to be removed, and is not there any more
                 continue
             except (NotConnected, ServerNotReady):
-                turn.not_sent(1)
+                turn.not_applied(1)
                 out.put_back(place, it)
                 raise
             except BaseException as error:
@@ -340,7 +340,7 @@ class Outage:
                 logger.warning("%s: kept in an outage, and refused now: %s", where, error)
             finally:
                 out.sending = 0
-                turn.settle()
+                turn.release()
         turn.time = None
         self._out.pop(keys.document, None)
 

@@ -7,19 +7,19 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import TracebackType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 from ..errors import ConnectionLost, Contended, NotConnected, WriteOnly
 from ..local.path import LEAST
 from ..plan import Command
-from ..plan.changes import EncodedAttachment, Telling
+from ..plan.changes import Announcement
 from ..plan.keys import Keys
 from ..plan.notices import announce, in_slot, published, sizes_of_parts, told_at, with_value
 from ..plan.paths import Path, counts_from_end, show
 from ..plan.slots import Slot
 from ..session import Session
 from .accessor import _NOTHING, Accessor
-from .document import DocumentWriter
+from .document import Attachments, DocumentWriter, Turn
 from .low_level import Writer
 from .outage import Outage
 from .store import KeyValueStore
@@ -31,8 +31,8 @@ _Stamp = tuple[str, int]
 """Who publishes, and the number of the update."""
 
 
-class UpdateNotifier:
-    """Tells the subscribers of one top-level key.
+class PublishTurn(Turn):
+    """The turn of one call that publishes, and the numbers that are reserved for its changes.
 
     Updates of one interface to one top-level key are numbered and arrive in this order, so such
     calls wait for each other; those to different keys do not.
@@ -42,31 +42,17 @@ class UpdateNotifier:
         keys: The names of the key.
     """
 
-    # So no large array lets small calls pass it: subscribers get updates in the order of the calls.
-    keeps_order = True
+    __slots__ = ("_announcements", "_keys", "_order", "_session", "time")
 
     def __init__(self, session: Session, keys: Keys) -> None:
-        self.session = session
-        self.keys = keys
-
-    def turn(self) -> _Turn:
-        """Wait until all that was published before is told."""
-        return _Turn(self)
-
-
-class _Turn:
-    """The turn of one call, and the numbers that are reserved for it; what it has not used is given back."""
-
-    __slots__ = ("_notifier", "_order", "_tellings", "time")
-
-    def __init__(self, notifier: UpdateNotifier) -> None:
         self.time: float | None = None
-        self._notifier = notifier
+        self._session = session
+        self._keys = keys
         # Belongs to the interface, not to this object: other stores, and threads, may publish to the same key.
-        self._order = notifier.session.transport.ordered(notifier.keys.channel)
-        self._tellings: list[_Telling] = []
+        self._order = session.transport.ordered(keys.channel)
+        self._announcements: list[UpdateAnnouncement] = []
 
-    async def __aenter__(self) -> _Turn:
+    async def __aenter__(self) -> Self:
         await self._order.__aenter__()
         return self
 
@@ -74,118 +60,105 @@ class _Turn:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, Contended):
-            self.not_sent(len(self._tellings))
+            self.not_applied(len(self._announcements))
         # Before the next call's turn begins: it takes the numbers from where this one has left them.
-        self.settle()
+        self.release()
         await self._order.__aexit__(kind, error, trace)
 
-    def with_value(self, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Telling:
-        """Return what tells of a value that is set; a small value travels with it."""
-        telling = _Setting(self._notifier, self.time, text, attachments)
-        self._tellings.append(telling)
-        return telling
+    def reserve(
+        self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
+    ) -> UpdateAnnouncement:
+        if text is None:
+            announcement = UpdateAnnouncement(self._session, self._keys, self.time, deleted)
+        else:
+            announcement = ValueAnnouncement(self._session, self._keys, self.time, text, attachments)
+        self._announcements.append(announcement)
+        return announcement
 
-    def without_value(self, *, deleted: bool = False) -> Telling:
-        """Return what tells of any other change."""
-        telling = _Telling(self._notifier, self.time, deleted)
-        self._tellings.append(telling)
-        return telling
+    def not_applied(self, count: int) -> None:
+        for announcement in reversed(self._announcements[-count:]):
+            announcement.not_applied()
 
-    async def share(self, telling: Telling, path: Path) -> None:
-        """Put a large value that is about to be set where subscribers of the same host find it, if there are any."""
-        if isinstance(telling, _Setting):
-            await telling.share(path)
-
-    def not_sent(self, count: int) -> None:
-        """Note that the last `count` changes were not applied: their numbers are free from now on."""
-        for telling in reversed(self._tellings[-count:]):
-            telling.not_sent()
-
-    def settle(self) -> None:
-        """Note that nothing is to come any more of the changes so far: give back numbers that they have not used."""
+    def release(self) -> None:
         # The last reserved number goes back first, as they are only taken back from the end.
-        while self._tellings:
-            self._tellings.pop().end()
+        while self._announcements:
+            self._announcements.pop().release()
 
 
-class _Telling:
-    """What tells of one change, without the value."""
+class UpdateAnnouncement(Announcement):
+    """Notifies subscribers of one change, without the value."""
 
-    __slots__ = ("_deleted", "_everywhere", "_made", "_notifier", "_reserved", "_time")
+    __slots__ = ("_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time")
 
-    def __init__(self, notifier: UpdateNotifier, time: float | None, deleted: bool = False) -> None:
-        self._notifier = notifier
+    def __init__(self, session: Session, keys: Keys, time: float | None, deleted: bool = False) -> None:
+        self._session = session
+        self._keys = keys
         self._time = time
         self._deleted = deleted
         # States of a number: reserved -> made (in a plan) -> told, when the plan was applied; from reserved, or by
-        # `take_back` and `not_sent` from made, it goes back to the session.
-        self._reserved: list[_Stamp] = [notifier.session.stamp(notifier.keys)]
+        # `unsent` and `not_applied` from made, it goes back to the session.
+        self._reserved: list[_Stamp] = [session.stamp(keys)]
         self._made: _Stamp = self._reserved[0]
         # In a cluster, those who look for keys by pattern hear of a new key on all nodes for its first seconds.
-        self._everywhere = notifier.session.is_fresh(notifier.keys)
+        self._everywhere = session.is_fresh(keys)
 
-    def make(self, path: Path) -> list[Command]:
+    def commands(self, path: Path) -> list[Command]:
         return self._numbered(path, self._payload)
 
-    def take_back(self) -> None:
+    def unsent(self) -> None:
         self._reserved.append(self._made)
 
-    def retract(self, path: Path) -> Sequence[Command]:
-        return ()
-
-    def not_sent(self) -> None:
-        """Note that the change was not applied after all."""
+    def not_applied(self) -> None:
         self._reserved = [self._made]
-        self.end()
+        self.release()
 
-    def end(self) -> None:
-        """Give back a number that was not used."""
+    def release(self) -> None:
         while self._reserved:
-            self._notifier.session.take_back(self._notifier.keys, self._reserved.pop())
+            self._session.take_back(self._keys, self._reserved.pop())
 
     def _numbered(self, path: Path, payload: Callable[[_Stamp, Path], bytes]) -> list[Command]:
         # The reserved number; a further one where the replies say that what was told is to be told anew.
-        it = self._notifier
-        self._made = stamp = self._reserved.pop() if self._reserved else it.session.stamp(it.keys)
+        self._made = stamp = self._reserved.pop() if self._reserved else self._session.stamp(self._keys)
         place = told_at(path)
         # Told as a change of the place above: what is there is looked at.
         text = payload(stamp, path) if place is path else announce(*stamp, self._time or time.time(), place)
-        return published(it.keys, *stamp, text, everywhere=self._everywhere)
+        return published(self._keys, *stamp, text, everywhere=self._everywhere)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
         return announce(*stamp, self._time or time.time(), path, deleted=self._deleted)
 
 
-class _Setting(_Telling):
-    """What tells of a value that is set; if the server refuses it, subscribers are told to look at what is there."""
+class ValueAnnouncement(UpdateAnnouncement):
+    """Notifies subscribers of a value that is set; a small one travels in the notice.
+
+    If the server refuses it, subscribers are told to look at what is there.
+    """
 
     __slots__ = ("_attachments", "_slot", "_text")
 
-    def __init__(
-        self, notifier: UpdateNotifier, time: float | None, text: bytes, attachments: tuple[EncodedAttachment, ...]
-    ) -> None:
-        super().__init__(notifier, time)
+    def __init__(self, session: Session, keys: Keys, time: float | None, text: bytes, attachments: Attachments) -> None:
+        super().__init__(session, keys, time)
         self._text = text
         self._attachments = attachments
         self._slot: Slot | None = None
 
     async def share(self, path: Path) -> None:
-        """Put the value into shared memory if it is large and somebody near by listens; in early mode, tell him now.
+        """Put the value into shared memory if it is large and a subscriber on this host listens.
 
-        One round trip more for each early update, and else for one update a second.
+        In early mode, notify it now. One round trip more for each early update, and else for one update a second.
         """
         sizes = sizes_of_parts(self._text, self._attachments)
         if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or told_at(path) is not path:
             return
-        it, local = self._notifier, self._notifier.session.local
+        local = self._session.local
         if not local.host:
             return
-        if local.is_to_ask(it.keys):
+        if local.is_to_ask(self._keys):
             await self._tell_near(b"")
-        if not local.has_audience(it.keys):
+        if not local.has_audience(self._keys):
             return
         pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
-        self._slot = local.put(it.keys, pieces, sizes)
+        self._slot = local.put(self._keys, pieces, sizes)
         # Which item an index from the end names is known once the server has the update: it is told then.
         if self._slot is not None and local.early and not counts_from_end(path):
             await self._tell_near(self._payload(self._reserved[0], path))
@@ -196,13 +169,13 @@ class _Setting(_Telling):
         Raises:
             NotConnected: The update itself was not sent.
         """
-        it = self._notifier
-        channel = it.session.local.channel(it.keys)
+        session, keys = self._session, self._keys
+        channel = session.local.channel(keys)
         try:
-            (count,) = await it.session.transport.roundtrip([(it.keys.publish, channel, payload)])
+            (count,) = await session.transport.roundtrip([(keys.publish, channel, payload)])
         except ConnectionLost as error:
             raise NotConnected(f"{error}; the update itself was not sent, so nothing was applied") from error
-        it.session.local.answered(it.keys, count)
+        session.local.answered(keys, count)
 
     def retract(self, path: Path) -> Sequence[Command]:
         # A notice with the value has told of something that is not there. One without has subscribers read what is.
@@ -224,9 +197,15 @@ class DocumentPublisher(DocumentWriter):
         outages: What is done in an outage; None if calls raise.
     """
 
+    # So no large array lets small calls pass it: subscribers get updates in the order of the calls.
+    keeps_order = True
+
     def __init__(self, session: Session, name: object, outages: Outage | None = None) -> None:
-        super().__init__(session, name, UpdateNotifier(session, session.keys(name)), outages)
+        super().__init__(session, name, outages)
         self._policy = "raise" if outages is None else outages.policy
+
+    def turn(self) -> PublishTurn:
+        return PublishTurn(self.session, self.keys)
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
         """Return what makes another one, which can be pickled."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from ...connection import RedisInterface
 from ...errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
 from ...plan import Command, Plan, Reply
-from ...plan.changes import EncodedAttachment, Telling
+from ...plan.changes import Announcement, EncodedAttachment
 from ...plan.olddata import METADATA, candidates, special_paths
 from ...plan.paths import Path, check_top_key, to_jsonpath
 from ...plan.patterns import Pattern
@@ -147,22 +147,29 @@ async def _migrated(session: Session, key: OldKey, dry_run: bool) -> Migrated:
     return Migrated(key.name, problem=f"it was changed {_TRIES} times meanwhile; end the programs that write to it")
 
 
-class _RemovingFirst:
-    """Tells subscribers as `telling` does, behind the command that removes what is old.
+class _RemovingFirst(Announcement):
+    """Notifies subscribers as `announcement` does, behind the command that removes what is old.
 
     Args:
         removal: The command; none where what is old may be on another node.
-        telling: What tells them.
+        announcement: What notifies them.
     """
 
-    def __init__(self, removal: Sequence[Command], telling: Telling) -> None:
-        self._removal = removal
-        self._telling = telling
-        self.take_back, self.retract = telling.take_back, telling.retract
+    __slots__ = ("_announcement", "_removal")
 
-    def make(self, path: Path) -> Sequence[Command]:
-        # In the order in which it happens: whoever hears of the update finds nothing old any more.
-        return [*self._removal, *self._telling.make(path)]
+    def __init__(self, removal: Sequence[Command], announcement: Announcement) -> None:
+        self._removal = removal
+        self._announcement = announcement
+
+    def commands(self, path: Path) -> Sequence[Command]:
+        # In the order in which it happens: a subscriber that is notified finds nothing old any more.
+        return [*self._removal, *self._announcement.commands(path)]
+
+    def unsent(self) -> None:
+        self._announcement.unsent()
+
+    def retract(self, path: Path) -> Sequence[Command]:
+        return self._announcement.retract(path)
 
 
 class _Converter:
@@ -293,8 +300,8 @@ class _Converter:
             removal = [("UNLINK", *gone)] if gone else []
 
         async def send(turn: Turn, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> None:
-            telling = _RemovingFirst(removal, turn.without_value())
-            it = set_change(self.keys, (), text, attachments, notices=telling)
+            announcement = _RemovingFirst(removal, turn.reserve())
+            it = set_change(self.keys, (), text, attachments, announcement=announcement)
             await self.session.run(exchange(it, reads, seen, self.session.cache))
 
         await self._writer.in_turn(send, *encoded)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from ...errors import BadData, BadKey
 from ...plain.documents import is_document
 from ...plan import Command, Plan, Reply
-from ...plan.changes import Telling
+from ...plan.changes import Announcement
 from ...plan.orphans import permitted
 from ...plan.patterns import escaped
 from ...plan.staging import STAGED
@@ -65,27 +65,27 @@ class TextConverter:
         await self._writer.in_turn(self._send, dry_run)
 
     async def _send(self, turn: Turn, dry_run: bool) -> None:
-        await self.session.run(self._look(turn.without_value(), dry_run, _TRIES))
+        await self.session.run(self._look(turn.reserve(), dry_run, _TRIES))
 
-    def _look(self, telling: Telling, dry_run: bool, tries: int) -> Plan:
+    def _look(self, announcement: Announcement, dry_run: bool, tries: int) -> Plan:
         def decode(replies: Sequence[Reply]) -> Plan:
             permitted(replies[0], self.keys.document)
             text = replies[1] if isinstance(replies[1], bytes | bytearray) else b""  # deleted, or replaced, meanwhile
             ready = settable(bytes(text[1:])) if is_document(text) else b""
             if dry_run or not ready:
                 return Plan([("UNWATCH",)], lambda _: None, held=True)
-            return self._change(telling, ready, tries)
+            return self._change(announcement, ready, tries)
 
         return Plan([("WATCH", self.keys.document), ("GET", self.keys.document)], decode, held=True)
 
-    def _change(self, telling: Telling, text: bytes, tries: int) -> Plan:
+    def _change(self, announcement: Announcement, text: bytes, tries: int) -> Plan:
         # Under another name first, since JSON.SET refuses a key that holds a string, and a DEL before it could not be
         # undone if the text turned out not to be JSON: EXEC goes on behind an error.
         coming = f"{self.keys.tag}{STAGED}{secrets.token_hex(5)}"
         commands: list[Command] = [
             ("JSON.SET", coming, "$", text),
             ("RENAME", coming, self.keys.document),  # refused if that was: then all stays as it is
-            *telling.make(()),
+            *announcement.commands(()),
         ]
 
         def decode(replies: Sequence[Reply] | None) -> Plan | None:
@@ -94,9 +94,9 @@ class TextConverter:
                     if isinstance(reply, Exception):
                         raise BadData(f"{self.keys.name}: the server does not take its text as JSON: {reply}")
                 return None
-            telling.take_back()
+            announcement.unsent()
             if not tries:
                 raise BadData(f"{self.keys.name}: it was changed {_TRIES} times meanwhile; end what writes to it")
-            return self._look(telling, False, tries - 1)
+            return self._look(announcement, False, tries - 1)
 
         return Plan(commands, decode, atomic=True, held=True)
