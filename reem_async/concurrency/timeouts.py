@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import array
+import asyncio
 import socket
 import struct
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 
 from ..errors import BadValue
@@ -18,7 +19,10 @@ try:
 except ImportError:  # Windows: what the kernel still holds cannot be asked there
     fcntl = termios = None  # type: ignore[assignment]
 
-__all__ = ["LONGEST", "LOOKS", "check_timeout", "confirmed", "forget", "moved_last", "patience", "timeout", "unsent"]
+__all__ = [
+    "LONGEST", "LOOKS", "check_timeout", "confirmed", "forget", "moved_last", "patience", "server_timeout", "timeout",
+    "unsent",
+]  # fmt: skip
 
 LONGEST = 1e6
 """Seconds that a time limit may have: eleven days, which is as good as none."""
@@ -36,6 +40,36 @@ _BYTES_ACKED = 120
 """Where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits."""
 
 _given: ContextVar[float | None] = ContextVar("reem timeout", default=None)
+
+
+_TURNS = 100
+"""Turns of an event loop that a time limit for the server lasts at least: a handshake takes about thirty."""
+
+
+@asynccontextmanager
+async def server_timeout(seconds: float) -> AsyncIterator[None]:
+    """Raise TimeoutError after `seconds` in which the event loop was free to see what the server does.
+
+    A turn of the loop counts a hundredth of the limit at most, however long it takes: while other tasks compute, no
+    answer can be seen.
+    """
+    loop = asyncio.get_running_loop()
+    timer: asyncio.TimerHandle | None = None
+
+    def count(left: int) -> None:
+        nonlocal timer
+        if left:
+            timer = loop.call_later(seconds / _TURNS, count, left - 1)
+        else:
+            limit.reschedule(loop.time())
+
+    async with asyncio.timeout(None) as limit:
+        count(_TURNS)
+        try:
+            yield
+        finally:
+            if timer is not None:
+                timer.cancel()
 
 
 @contextmanager

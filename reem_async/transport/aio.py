@@ -28,6 +28,8 @@ __all__ = ["AsyncTransport"]
 
 # Connections for WATCH that are kept for the next one who needs one; more at the same time are made and closed again.
 _SPARE = 4
+_LENT = 32
+"""Connections for WATCH that are lent at a time. More callers wait for one: a server has 10,000 for all its clients."""
 _PING: Command = ("PING",)
 _COURTESIES = 3
 """How often a large value waits for calls that are under way: there may always be some."""
@@ -57,6 +59,8 @@ class AsyncTransport:
         self._lanes: dict[bool, Wire] = {}
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
+        self._lendable = asyncio.Semaphore(_LENT)
+        self._borrowers = 0  # callers that have a lent connection or wait for one
         self._open: set[Wire] = set()
         # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
         self._leaving: set[Wire] = set()
@@ -262,6 +266,7 @@ class AsyncTransport:
         self._lanes.clear()
         self._opening.clear()
         self._spare.clear()
+        self._lendable, self._borrowers = asyncio.Semaphore(_LENT), 0  # the others belong to another event loop
         self._open.clear()
         self._leaving.clear()
         self._orders.clear()
@@ -269,8 +274,22 @@ class AsyncTransport:
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[Held]:
-        """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled."""
+        """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled.
+
+        A caller that finds 32 lent waits for one. It must not hold another one.
+        """
         self.check()
+        lendable = self._lendable
+        self._borrowers += 1
+        try:
+            async with lendable, self._one_more() as held:
+                yield held
+        finally:
+            if self._lendable is lendable:
+                self._borrowers -= 1
+
+    @asynccontextmanager
+    async def _one_more(self) -> AsyncIterator[Held]:
         while self._spare and not self._spare[-1].alive:
             self._spare.pop()
         wire = self._spare.pop() if self._spare else await self._opened()
@@ -285,7 +304,8 @@ class AsyncTransport:
             else:
                 await wire.close()
             raise
-        if wire.alive and len(self._spare) < _SPARE and not self._closed:
+        is_awaited = self._borrowers > _LENT
+        if wire.alive and (is_awaited or len(self._spare) < _SPARE) and not self._closed:
             self._spare.append(wire)
         else:
             await wire.close()

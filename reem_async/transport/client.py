@@ -69,7 +69,8 @@ def _settings(options: Options) -> tuple[str, dict[str, Any]]:
             f"{options.address}: interface.client is for one server; use redis.RedisCluster or redis.sentinel.Sentinel"
         )
     # As redis-py comes: programs of REEM 0.1, and its documentation, expect these shapes.
-    settings = {"socket_timeout": options.timeout, **options.settings, "protocol": 2, "decode_responses": True}
+    limits = {"socket_timeout": options.timeout, "socket_connect_timeout": options.handshake_timeout}
+    settings = {**limits, **options.settings, "protocol": 2, "decode_responses": True}
     if options.socket_path is not None:
         return "UnixDomainSocketConnection", {**settings, "path": options.socket_path}
     return "SSLConnection" if options.tls else "Connection", settings

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-
+from ..concurrency.timeouts import server_timeout
 from ..errors import ConnectionLost
 from ..plan import Command, Reply
 from .identity import unanswered
@@ -39,7 +38,7 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
     """
     connection = options.asynchronous_connection()
     try:
-        async with asyncio.timeout(options.handshake_timeout):
+        async with server_timeout(options.handshake_timeout):
             await connection.connect()
     except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
         await connection.disconnect(nowait=True)

@@ -89,7 +89,6 @@ class Options:
         self.largest = _size(self.settings.pop("largest_value", LARGEST))
         # A login with TLS takes several round trips, which a time limit for single calls does not mean.
         self.handshake_timeout = max(timeout, 1.0)
-        self.settings.setdefault("socket_connect_timeout", self.handshake_timeout)
         self.tls = bool(self.settings.pop("ssl", False))
         self.socket_path: str | None = self.settings.pop("unix_socket_path", self.settings.pop("path", None))
         if self.socket_path is not None:
@@ -166,8 +165,9 @@ class Options:
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
         module: Any = redis.asyncio.connection
-        # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12.
-        settings = {"socket_timeout": None, **self.settings}
+        # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12, and it counts what
+        # other tasks of the loop do.
+        settings = {"socket_timeout": None, "socket_connect_timeout": None, **self.settings}
         if self.socket_path is not None:
             return _greeted(module.UnixDomainSocketConnection(path=self.socket_path, **settings))
         return _greeted((module.SSLConnection if self.tls else module.Connection)(**settings))
@@ -176,7 +176,9 @@ class Options:
         """Return a fresh connection of redis, not yet connected."""
         module: Any = redis.connection
         # redis-py's time limit is for the handshake only; then the transport sets its own on the socket.
-        settings = {"socket_timeout": self.handshake_timeout, "command_packer": Packer(), **self.settings}
+        limit = self.handshake_timeout
+        settings = {"socket_timeout": limit, "socket_connect_timeout": limit, "command_packer": Packer()}
+        settings |= self.settings
         if self.socket_path is not None:
             return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
         return (module.SSLConnection if self.tls else module.Connection)(**settings)
@@ -198,6 +200,11 @@ class Options:
             told = LoginRefused(f"the login was refused: {text}")
         if told is not None:
             return told.at(self.address)
+        if "max number of clients" in text:
+            return NotConnected(
+                f"the server at {self.address} has as many clients as its `maxclients` allows; close connections that "
+                "are not needed (`CLIENT LIST` shows them), or raise `maxclients`"
+            )
         if isinstance(error, redis.exceptions.ResponseError):
             return NotConnected(
                 f"the server at {self.address} does not take the greeting ({text:.200}); "

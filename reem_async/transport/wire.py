@@ -59,13 +59,14 @@ class _Due:
         count: How many they are.
         done: Takes them, or an error.
         limit: Seconds without a byte moving after which the caller is told, and
-        since: the time from which this counts at the earliest.
+        since: the time from which this counts at the earliest: when they were asked for.
         replies: Those that have come.
+        late: The limit has passed; it is given up if the next look at the socket brings nothing.
         over: The caller was told; what still comes is dropped.
         lenient: Errors are no reply.
     """
 
-    __slots__ = ("count", "done", "lenient", "limit", "over", "replies", "since")
+    __slots__ = ("count", "done", "late", "lenient", "limit", "over", "replies", "since")
 
     def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None], limit: float, since: float) -> None:
         self.count = count
@@ -73,6 +74,7 @@ class _Due:
         self.limit = limit
         self.since = since
         self.replies: list[Reply] = []
+        self.late = False
         self.over = False
         self.lenient = False
 
@@ -102,6 +104,7 @@ class Wire(asyncio.BufferedProtocol):
         self._reader = reader
         self._due: collections.deque[_Due] = collections.deque()
         self._outbox: list[Piece] = []
+        self._unsent_calls: list[_Due] = []  # those whose commands are in the outbox
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._keep: Any = None
@@ -188,6 +191,7 @@ class Wire(asyncio.BufferedProtocol):
         # Others wait already: what is sent in the same turn of the loop goes out in one system call.
         if not self._outbox:
             self._loop.call_soon(self._flush)
+        self._unsent_calls.append(self._due[-1])
         # A view of an array is copied: its owner may change it before this turn is over.
         self._outbox += [bytes(piece) if type(piece) is memoryview else piece for piece in pieces]
 
@@ -210,6 +214,9 @@ class Wire(asyncio.BufferedProtocol):
 
     def _flush(self) -> None:
         pieces, self._outbox = self._outbox, []
+        calls, self._unsent_calls = self._unsent_calls, []
+        for due in calls:  # a turn with many calls may take longer than the limit
+            due.since = self._loop.time()
         if self._reason is None:
             self._write(pieces)
             if sum(map(len, pieces)) >= SLOW:
@@ -367,7 +374,11 @@ class Wire(asyncio.BufferedProtocol):
             self._last_byte = moved_last(self._last_byte, now, self._unsent, left, waiting[0].limit)
         self._unsent = left
         for due in waiting:
-            if max(self._last_byte, due.since) + due.limit <= now:
+            if max(self._last_byte, due.since) + due.limit > now:
+                due.late = False
+            elif not due.late:  # the loop may have been busy while the reply came
+                due.late = True
+            else:
                 due.over = True
                 due.done(
                     ConnectionLost(
