@@ -199,17 +199,14 @@ class Follower:
         """Return the seconds for which the server may have had something else than the copy. Any thread may.
 
         Counts from when the last question was sent whose answer confirmed the copy: replies are in order with notices
-        and invalidation messages, so all that was changed before the question has been applied. Infinite if this is
-        not known, since the server does not report what is only stored.
+        and invalidation messages, so all that was changed before the question has been applied. If the server does not
+        report what is only stored, only a read confirms the copy.
         """
-        wire = self._wire
-        if wire is not None and not wire.tracked:
-            return math.inf
         return time.monotonic() - self._valid_at
 
     @property
     def untrusted(self) -> str:
-        """Return why the age of the copy is unknown or does not stay small; nothing if there is no such reason."""
+        """Return why the age of the copy does not stay small; nothing if there is no such reason."""
         wire = self._wire
         if wire is not None and not wire.tracked:
             return "the server does not report what is only stored; the user needs the right +client|tracking"

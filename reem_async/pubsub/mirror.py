@@ -126,9 +126,9 @@ class Mirror(Following):
 
         An upper bound on how long the server may have had something else. It measures the link to the server, not when
         the value was written: a value that nobody changes for an hour has a small age. Probes are sent each second, or
-        three times in `max_age`, so the age goes up to the time between two of them and two round trips. Infinite
-        before `listen`, in a forked child, after its event loop was closed, and where the server does not report what
-        is only stored (the user needs the right to CLIENT TRACKING).
+        three times in `max_age`, so the age goes up to the time between two of them and two round trips. Without
+        the right to CLIENT TRACKING the server does not report what is only stored, and the age is the time since the
+        last read. Infinite before `listen`, in a forked child, and after its event loop was closed.
         """
         follower = self._link.follower
         return follower.age() if follower is not None and self._link.follows else math.inf
@@ -175,8 +175,7 @@ class Mirror(Following):
         if self.max_age is None or age <= self.max_age:
             return ""
         reason = follower.untrusted
-        what = f"the copy is {age:.3f} s old" if age < math.inf else "the age of the copy is unknown"
-        return f"{what}, and max_age={self.max_age:g}" + (f"; {reason}" if reason else "")
+        return f"the copy is {age:.3f} s old, and max_age={self.max_age:g}" + (f"; {reason}" if reason else "")
 
     async def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:  # noqa: ASYNC109
         """Wait until the value is as wanted; returns it. No round trip.
