@@ -270,3 +270,21 @@ def test_the_figures_are_those_of_the_last_whole_run(tmp_path):
     summary.rewrite(Results.load(FULL), page, image)
     assert page.read_text() == summary.PAGE.read_text()
     assert image.read_text() == summary.CHART.read_text()
+
+
+def test_the_readme_is_short_and_begins_with_what_it_is():
+    """150 lines; what it is, a picture, a command, code and a comparison are on the first screen of 40."""
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 150
+    first_screen = "\n".join(lines[:40])
+    for part in (
+        "reem.gif",
+        "reem demo",
+        "```python",
+        "| ROS 2 |",
+        "| Redis by hand |",
+        "| ZeroMQ or Zenoh |",
+        "| LeRobot |",
+    ):
+        assert part in first_screen
+    assert (DOCS / "images" / "reem.gif").stat().st_size < 3_000_000
