@@ -1,4 +1,5 @@
-"""Data of REEM 0.0 and 0.1 into data of today; see `reem_async.tools.migration`, whose names these are."""
+"""Data of REEM 0.0 and 0.1 into data of today: `done = await migrate(interface, dry_run=True)`."""
 
-from .tools.migration import *  # noqa: F403
-from .tools.migration import __all__ as __all__
+from .legacy.convert import Migrated, Migration, migrate
+
+__all__ = ["Migrated", "Migration", "migrate"]

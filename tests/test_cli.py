@@ -144,7 +144,7 @@ def test_help_has_every_command_under_its_heading_with_examples():
     for entry in COMMANDS:
         assert entry.panel in run.stdout
         assert f" {entry.name} " in run.stdout
-        thing = getattr(importlib.import_module(f"reem_async.tools.cli.{entry.module}"), entry.attribute)
+        thing = getattr(importlib.import_module(entry.full_module), entry.attribute)
         if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
             said = lazy.help_text(thing.__doc__)
             assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])

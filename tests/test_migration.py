@@ -20,9 +20,9 @@ import reem_async
 from reem.migration import migrate
 from reem_async import migration
 from reem_async.errors import BadData, BadType, NotAllowed, ServerMissing
+from reem_async.legacy.values import array_of
 from reem_async.server import EmbeddedServer
-from reem_async.tools.migration.naming import ship_named
-from reem_async.tools.migration.values import array_of
+from reem_async.tools.cli.naming import ship_named
 
 
 @pytest.fixture(scope="module")

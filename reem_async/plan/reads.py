@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from ..errors import BadData, Conflict, MissingDocument, MissingKey, WrongKind, WrongType
+from ..legacy.olddata import first_read, look_first
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
@@ -28,9 +29,11 @@ __all__ = [
     "count_in",
     "entries_command",
     "exists",
+    "first_read",
     "has_key",
     "keys_at",
     "length",
+    "look_first",
     "nothing",
     "read",
     "type_of",

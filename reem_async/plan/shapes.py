@@ -22,7 +22,7 @@ class ShapeCache:
     """Guesses about documents, by document key. Threads may share it: entries are only ever replaced.
 
     Attributes:
-        new: Documents that no version before 1.0 wrote, as a look has shown (`plan/olddata.py`).
+        new: Documents that no version before 1.0 wrote, as a look has shown (`legacy/olddata.py`).
         new_below: The same of what is below their root.
     """
 

@@ -56,9 +56,8 @@ from ..plan import Plan, Reply
 from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
 from ..plan.notices import ANNOUNCED, Notice
-from ..plan.olddata import look_first
 from ..plan.paths import Path
-from ..plan.reads import read
+from ..plan.reads import look_first, read
 from ..plan.replies import decoded
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, CannotApply, get

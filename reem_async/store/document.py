@@ -13,7 +13,6 @@ from ..plan import Plan
 from ..plan.arithmetic import Operation, calculate, compute
 from ..plan.changes import SILENT, Announcement, Change, EncodedAttachment
 from ..plan.documents import number_text
-from ..plan.olddata import is_new
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
 from ..plan.reads import RawRead, nothing
 from ..plan.sizes import has_large
@@ -314,7 +313,7 @@ class DocumentWriter:
 
     def _saw_new(self, path: Path) -> None:
         """Note that nothing that an old version stored is left, if the whole document was written."""
-        if not path and not is_new(self.keys, path, self.session.cache):
+        if not path and self.keys.document not in self.session.cache.new:
             self.session.cache.saw_new(self.keys.document)
 
     async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:

@@ -9,9 +9,8 @@ import numpy as np
 
 from ..errors import BadData, MissingKey, WrongType
 from ..plan import Plan
-from ..plan.olddata import first_read, is_new
 from ..plan.paths import Path, check_name, show
-from ..plan.reads import RawRead, exists, has_key, interpret, keys_at, length, read, type_of
+from ..plan.reads import RawRead, exists, first_read, has_key, interpret, keys_at, length, read, type_of
 from ..session import Session
 
 __all__ = ["DocumentReader", "opened"]
@@ -87,8 +86,7 @@ class DocumentReader:
         session = self.session
         plan = read(self.keys, path, session.ships, session.cache)
         # Until a key is known not to be of REEM 0.1, its reads ask that too, in the same round trip.
-        known = is_new(self.keys, path, session.cache)
-        return plan if known else first_read(plan, self.keys, path, session.cache)
+        return first_read(plan, self.keys, path, session.cache)
 
     async def type_at(self, path: Path) -> type:
         """Return the Python type of the value at `path`."""

@@ -15,7 +15,7 @@ class Entry(NamedTuple):
 
     Attributes:
         name: What the user types.
-        module: The module in this package that has it.
+        module: The module that has it: in this package, or below `reem_async` if it has a dot.
         attribute: Its function, or its typer application if it has subcommands.
         panel: The heading that it stands under.
         help: One line; the whole text is the docstring.
@@ -29,11 +29,16 @@ class Entry(NamedTuple):
     help: str
     takes_minus: bool = False
 
+    @property
+    def full_module(self) -> str:
+        """The full name of the module."""
+        return f"{'reem_async' if '.' in self.module else 'reem_async.tools.cli'}.{self.module}"
+
 
 COMMANDS = (
     Entry("up", "up", "up", SERVER, "Start a private server and keep it up until Ctrl-C."),
     Entry("doctor", "doctor", "doctor", SERVER, "Check server, connection and installation, and say what to do."),
-    Entry("migrate", "migrate", "migrate", SERVER, "Convert what REEM 0.1 or older has stored, in place."),
+    Entry("migrate", "legacy.command", "migrate", SERVER, "Convert what REEM 0.1 or older has stored, in place."),
     Entry("ls", "listing", "ls", LOOK, "List keys with type and size."),
     Entry("tree", "listing", "tree", LOOK, "Show what is below keys; arrays are not fetched."),
     Entry("get", "get", "get", LOOK, "Print a value, or write it to a file."),

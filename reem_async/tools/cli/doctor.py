@@ -224,7 +224,7 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
 async def _old_data(interface: RedisInterface) -> Finding:
     """Count the keys of the namespace that are of versions before 1.0, on all servers."""
     from reem_async.errors import RedisError
-    from reem_async.tools.migration.finding import find
+    from reem_async.legacy.finding import find
 
     try:
         return checks.old_data([key.name for key in await find(interface.session, stale=False) if key.misread])

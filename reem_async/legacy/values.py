@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import BadData
-from ...plan.olddata import ROOT, candidates
-from ...plan.paths import Path, shorten
-from ...ships.numpy import NumpyShip
+from ..errors import BadData
+from ..plan.paths import Path, shorten
+from ..ships.numpy import NumpyShip
+from .olddata import ROOT, candidates
 
 __all__ = ["ARRAY_FIELDS", "ARRAY_LABEL", "Tree", "array_of", "is_array"]
 

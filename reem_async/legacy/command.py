@@ -14,7 +14,7 @@ from reem_async.tools.cli.wording import in_words
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
-    from reem_async.tools.migration import Migrated, Migration
+    from reem_async.legacy.convert import Migrated, Migration
 
 __all__ = ["migrate"]
 
@@ -56,7 +56,7 @@ def migrate(
     given = prepared("migrate", lambda: _ships(ships or []))
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.tools.migration import migrate as convert
+        from reem_async.legacy.convert import migrate as convert
 
         # Shown at once: how long it takes is not known before all keys were looked at.
         with progress_bar(after=0.0) as bar:
@@ -70,7 +70,7 @@ def migrate(
 
 def _ships(names: list[str]) -> list[Any]:
     from reem_async.ships.registry import default_ships
-    from reem_async.tools.migration.naming import ship_named
+    from reem_async.tools.cli.naming import ship_named
 
     # The user's own ships first, as in a program: they may take what the default ones would.
     return [*map(ship_named, names), *default_ships()]

@@ -5,18 +5,18 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 
-from ...errors import BadData, BadKey
-from ...plain.documents import is_document
-from ...plan import Command, Plan, Reply
-from ...plan.changes import Announcement
-from ...plan.orphans import permitted
-from ...plan.patterns import escaped
-from ...plan.staging import STAGED
-from ...session import Session
-from ...store.document import Turn
-from ...store.publish import DocumentPublisher
-from ...transport.scan import scanned
-from ..snapshots.values import settable
+from ..errors import BadData, BadKey
+from ..plain.documents import is_document
+from ..plan import Command, Plan, Reply
+from ..plan.changes import Announcement
+from ..plan.orphans import permitted
+from ..plan.patterns import escaped
+from ..plan.staging import STAGED
+from ..session import Session
+from ..store.document import Turn
+from ..store.publish import DocumentPublisher
+from ..tools.snapshots.values import settable
+from ..transport.scan import scanned
 
 __all__ = ["TextConverter", "texts"]
 

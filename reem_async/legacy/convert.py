@@ -8,22 +8,22 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
-from ...connection import RedisInterface
-from ...errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
-from ...plan import Command, Plan, Reply
-from ...plan.changes import Announcement, EncodedAttachment
-from ...plan.olddata import METADATA, candidates, special_paths
-from ...plan.paths import Path, check_top_key, to_jsonpath
-from ...plan.patterns import Pattern
-from ...plan.placeholders import Placeholder, Slot
-from ...plan.reads import RawRead, get_command, read
-from ...plan.writes import exchange, set_change
-from ...session import Session
-from ...ships.registry import Registered
-from ...store.document import Turn
-from ...store.publish import DocumentPublisher
-from ...store.reader import opened
+from ..connection import RedisInterface
+from ..errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
+from ..plan import Command, Plan, Reply
+from ..plan.changes import Announcement, EncodedAttachment
+from ..plan.paths import Path, check_top_key, to_jsonpath
+from ..plan.patterns import Pattern
+from ..plan.placeholders import Placeholder, Slot
+from ..plan.reads import RawRead, get_command, read
+from ..plan.writes import exchange, set_change
+from ..session import Session
+from ..ships.registry import Registered
+from ..store.document import Turn
+from ..store.publish import DocumentPublisher
+from ..store.reader import opened
 from .finding import OldKey, find
+from .olddata import METADATA, candidates, special_paths
 from .text import TextConverter, texts
 from .values import ARRAY_LABEL, Tree, array_of
 

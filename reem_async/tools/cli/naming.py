@@ -6,9 +6,9 @@ import importlib
 import os
 import sys
 
-from ...errors import BadType, BadValue
-from ...plan.paths import shorten
-from ...ships.base import SpecialDatatypeShip
+from reem_async.errors import BadType, BadValue
+from reem_async.plan.paths import shorten
+from reem_async.ships.base import SpecialDatatypeShip
 
 __all__ = ["ship_named"]
 

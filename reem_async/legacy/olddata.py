@@ -9,10 +9,10 @@ from typing import Any
 import orjson
 
 from ..errors import BadData
-from . import Command, Plan, Reply
-from .keys import Keys
-from .paths import Path, shorten
-from .shapes import ShapeCache
+from ..plan import Command, Plan, Reply
+from ..plan.keys import Keys
+from ..plan.paths import Path, shorten
+from ..plan.shapes import ShapeCache
 
 __all__ = [
     "CURE",
@@ -71,7 +71,7 @@ def is_new(keys: Keys, path: Path, cache: ShapeCache) -> bool:
 
 
 def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
-    """Return a read of a place that is not known to be new with a look whether it is old, in the same round trip.
+    """Return a read of a place, with a look whether it is old in the same round trip unless it is known to be new.
 
     In a cluster the second document may
     be on another node, and old programs could not use a cluster, so it is not asked for there. Whether the document
@@ -80,10 +80,12 @@ def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
     Raises (in decode):
         BadData: It is old.
     """
+    # Once for each key and interface: a read costs the same round trip, and what was found to be new stays so.
+    if is_new(keys, path, cache):
+        return plan
     # In a transaction a look that is not allowed would cost the read; later reads are none.
     if plan.atomic:
         return plan
-    # Once for each key and interface: a read costs the same round trip, and what was found to be new stays so.
     end = len(plan.commands)
     look = [] if keys.sharded else [_second_document(keys)]
 

@@ -6,13 +6,13 @@ from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...errors import BadData, NotAllowed
-from ...plan import Plan, Reply
-from ...plan.olddata import METADATA, candidates, is_rooted, root_command, special_paths
-from ...plan.patterns import escaped
-from ...plan.scan import DOCUMENT
-from ...session import Session
-from ...transport.scan import scanned
+from ..errors import BadData, NotAllowed
+from ..plan import Plan, Reply
+from ..plan.patterns import escaped
+from ..plan.scan import DOCUMENT
+from ..session import Session
+from ..transport.scan import scanned
+from .olddata import METADATA, candidates, is_rooted, root_command, special_paths
 from .values import is_array
 
 __all__ = ["OldKey", "find"]
