@@ -23,3 +23,23 @@ def test_every_file_named_is_there(name):
 @pytest.mark.parametrize("name", sorted(set(re.findall(r"\btest_\w+\b(?!\.py)", TEXT))))
 def test_every_test_named_is_there(name):
     assert any(f"def {name}(" in text for text in TESTS.values())
+
+
+def fast(name):
+    """Return whether the fast run has a test, or any test of a file."""
+    pattern = r"def test_\w+\(" if name.endswith(".py") else rf"def {name}\("
+    texts = [TESTS[name]] if name.endswith(".py") else [text for text in TESTS.values() if f"def {name}(" in text]
+    heads = [text[: found.start()].rpartition("\n\n")[2] for text in texts for found in re.finditer(pattern, text)]
+    return any("mark.long" not in head and "mark.alone" not in head for head in heads) and not any(
+        "pytestmark = pytest.mark.long" in text for text in texts
+    )
+
+
+PROMISES = dict(re.findall(r"^### (\d+\. .*?)\n(.*?)(?=^##|\Z)", TEXT, re.MULTILINE | re.DOTALL))
+
+
+@pytest.mark.parametrize("promise", PROMISES)
+def test_the_fast_run_fails_if_a_promise_breaks(promise):
+    """Some promises have nothing but a test that takes long or measures time: none may."""
+    names = re.findall(r"\btest_\w+(?:\.py)?", PROMISES[promise])
+    assert any(fast(name) for name in names), f"{names} are all in the long run only"

@@ -44,7 +44,9 @@ def blocking(options: Namespace) -> None:
     with reem.RedisInterface(options.url) as interface:
         kvs = reem.KeyValueStore(interface)
 
-        def on_result(data: dict[str, Any], updated_path: str) -> None:
+        def on_result(data: dict[str, Any] | None, updated_path: str) -> None:
+            if data is None:  # the server was restarted without it
+                return
             mount.act(data)
             latencies.append(time.time() - data["time_stamp"])
             kvs["actuator"] = asdict(mount)
@@ -65,7 +67,7 @@ async def asynchronous(options: Namespace) -> None:
         async with kvs["processed_info"].watch() as updates:
             await kvs["actuator"].write(asdict(mount))
             async for update in updates:
-                if update.initial:  # left there by a processor that ran before
+                if update.initial or update.deleted:  # of a processor that ran before, or lost in a server's restart
                     continue
                 mount.act(update.data)
                 latencies.append(time.time() - update.data["time_stamp"])

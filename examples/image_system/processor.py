@@ -59,7 +59,9 @@ def blocking(options: Namespace) -> None:
         kvs, pspace = reem.KeyValueStore(interface), reem.PublishSpace(interface)
         kvs["processor"] = {"ready": False, "frames": 0}
 
-        def on_frame(data: dict[str, Any], updated_path: str) -> None:
+        def on_frame(data: dict[str, Any] | None, updated_path: str) -> None:
+            if data is None:  # the server was restarted without it
+                return
             picture, spot = process(data["image"])
             pspace["processed_info"] = result(data, spot)
             kvs["processed_image"] = {"image": picture, "images_sent": data["images_sent"]}
@@ -80,7 +82,7 @@ async def asynchronous(options: Namespace) -> None:
         async with kvs["raw_image"].watch() as updates:
             await kvs["processor"]["ready"].write(True)
             async for update in updates:
-                if update.initial:  # left there by a camera that ran before
+                if update.initial or update.deleted:  # of a camera that ran before, or lost in a server's restart
                     continue
                 data = update.data
                 picture, spot = await anyio.to_thread.run_sync(process, data["image"])
