@@ -1,9 +1,8 @@
-"""Rows 21, 22 and 23: frames through shared memory, and programs that are killed, stopped, greedy or hostile."""
+"""Rows 22 and 23: frames through shared memory, and programs that are stopped, greedy or hostile."""
 
 from __future__ import annotations
 
 import contextlib
-import gc
 import itertools
 import os
 import signal
@@ -15,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import orjson
-import slots
 import test_local_memory as memory
 
 import reem
@@ -24,7 +22,7 @@ from reem_async.local.segment import HEAD, SLOTS, Segment
 from reem_async.plan.slots import Slot
 
 from .frame_programs import SIZE, shot
-from .scoreboard import NotBuilt, Run, row, tell
+from .scoreboard import NotBuilt, Run, row
 from .servers import PrivateServer
 from .tools import order, program, quantile, said
 
@@ -32,46 +30,6 @@ from .tools import order, program, quantile, said
 def _needs_shared_memory() -> None:
     if reason_against():
         raise NotBuilt(f"no shared memory here: {reason_against()}")
-
-
-# --- 21: killed ------------------------------------------------------------------------------------
-
-
-def _holders() -> list[str]:
-    """What processes of this row have of shared memory of REEM's: whatever is open here is mapped, too."""
-    gc.collect()
-    found: list[str] = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended
-            if os.getpgid(int(folder.name)) == os.getpgrp():
-                maps = (folder / "maps").read_text().splitlines()
-                found += [f"{folder}: {line}" for line in maps if "memfd:reem" in line]
-    return found
-
-
-@row(
-    21,
-    "frames with checksums, kill -9 of 2 publishers and 3 readers of 7",
-    "0 torn, no descriptor, memory or file left, all mirrors equal <= 2 s (early one killed: 6 s)",
-)
-def killed(run: Run) -> None:
-    """At random instants; one publisher is early, every other reader keeps frames; two parties are never killed."""
-    _needs_shared_memory()
-    rounds = run.size(40, 5)
-    files = set(os.listdir("/dev/shm"))
-    with PrivateServer() as server:
-        result = slots.with_server(server.url, run.seed, rounds, tell)
-    run.at_least("parties killed", result.killed, rounds)
-    run.at_least("updates seen", result.count["seen"], 20 * rounds)
-    run.at_least("of them in shared memory", result.count["shared"], 5 * rounds)
-    run.none("torn", result.count["torn"])
-    run.at_most("s until all mirrors were right", result.slowest, 2.0)
-    # Whom a publisher has told early, and then was killed, asks the server when three heartbeats have not confirmed it.
-    run.at_most("s where an early publisher was killed", result.slowest_early, 6.0)
-    run.none("descriptors left in who was not killed", max(0, result.descriptors))
-    run.at_most("MB more memory of who was not killed", result.grown, 30)
-    run.none("shared memory left", _holders())
-    run.none("files left in /dev/shm", sorted(set(os.listdir("/dev/shm")) - files))
 
 
 # --- 22: stopped, greedy ---------------------------------------------------------------------------
