@@ -15,8 +15,7 @@ from reem_async.errors import Conflict, NotConnected
 from reem_async.plan.copies import concerns
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
 from reem_async.plan.trees import MISSING, get
-from reem_async.pubsub.division import Division, Heard
-from reem_async.pubsub.fetching import divided_read
+from reem_async.pubsub.division import Division, Heard, divided_read
 from reem_async.pubsub.gaps import Numbers
 from reem_async.tools.recording.key_queue import KeyQueue
 from reem_async.tools.recording.order import Item

@@ -29,8 +29,8 @@ from ..ships.registry import Ships
 from ..transport.redirects import is_unapplied
 from ..transport.wire import Wire
 from .listeners import Beginning, contained, give_error
-from .looks import Looks
 from .manager import SubscriptionManager, Topic
+from .refresh import RefreshTimer
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
 from .updates import Origin, Update
 
@@ -91,7 +91,7 @@ class Follower:
         self._replica = Replica(keys, path, ships, cache, largest)
         self._wire: Wire | None = None
         self._loop = asyncio.get_running_loop()
-        self._looks = Looks(self, Follower._look, _QUICKEST, _SLOWEST)
+        self._looks = RefreshTimer(self, Follower._look, _QUICKEST, _SLOWEST)
         self._asked = 0.0  # when a read was sent last
         self._valid_at = -math.inf  # the server had what is in the copy then, or later
         self._probe_due = 0.0

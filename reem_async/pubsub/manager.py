@@ -26,12 +26,9 @@ from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.redirects import is_moved, is_unapplied
 from ..transport.wire import Wire, close_all
-from .heartbeats import Heartbeats
-from .inbox import Inbox
-from .invalidations import Invalidations
 from .key_watcher import KeyWatcher
-from .listeners import NOBODY, Beginning, Listener, ListenerGroup, Topic
-from .subscribing import Subscribing
+from .listeners import NOBODY, Beginning, Inbox, Listener, ListenerGroup, Topic
+from .subscription_commands import Heartbeats, Invalidations, Subscribing
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport

@@ -371,7 +371,7 @@ class _Lookout:
     ) -> None:
         self.pid = os.getpid()
         self._options = options
-        self._owner, self._told = weakref.ref(owner), told  # no WeakMethod: see `pubsub.looks`
+        self._owner, self._told = weakref.ref(owner), told  # no WeakMethod: see `pubsub.refresh`
         self._stopped = threading.Event()
         threading.Thread(target=self._run, name="reem-sentinel", daemon=True).start()
 

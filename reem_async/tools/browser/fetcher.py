@@ -17,8 +17,7 @@ from ...plan import Reply
 from ...plan.paths import Path, below
 from ...plan.placeholders import marked
 from ...plan.trees import MISSING, get
-from ...pubsub.division import Division, Heard
-from ...pubsub.fetching import divided_read
+from ...pubsub.division import Division, Heard, divided_read
 from ...pubsub.gaps import GapDetector
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...session import Session

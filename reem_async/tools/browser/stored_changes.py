@@ -21,9 +21,9 @@ from ...plan.paths import Path, below
 from ...plan.placeholders import marked
 from ...plan.trees import MISSING
 from ...pubsub.division import Division
-from ...pubsub.looks import Looks
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
+from ...pubsub.refresh import RefreshTimer
 from ...session import Session
 from .addresses import is_addressable
 from .fetcher import Allowance, Fetcher, hear, reading_after, rebased
@@ -45,7 +45,7 @@ _LOOK_BYTES = 8 << 20
 _LARGE = 1 << 18
 """Bytes of a document from which it is part of the past only as far as there is an allowance."""
 _QUICKEST, _SLOWEST = 0.02, 0.5
-"""Seconds from a change that a notice came with to the look for what was stored besides; see `Looks`."""
+"""Seconds from a change that a notice came with to the look for what was stored besides; see `RefreshTimer`."""
 _PATIENCE = 0.015
 """Seconds in which the notice of a change is taken."""
 
@@ -83,7 +83,7 @@ class StoredChanges:
         self._unseen: set[str] = set()  # there from the beginning, and not read yet
         self._due: dict[str, None] = {}
         self._news = asyncio.Event()
-        self._looks: dict[str, Looks[StoredChanges]] = {}
+        self._looks: dict[str, RefreshTimer[StoredChanges]] = {}
         self._reading: dict[str, Division[Event]] = {}
         # Names on the server: those whose next change it will tell, the arrays of each key, those that were changed.
         self._told: set[str] = set()
@@ -158,7 +158,7 @@ class StoredChanges:
     def _ask(self, name: str) -> None:
         """Have a key read when its next look is due."""
         if name not in self._looks:
-            self._looks[name] = Looks(self, lambda it: it._read_soon([name]), _QUICKEST, _SLOWEST, _PATIENCE)
+            self._looks[name] = RefreshTimer(self, lambda it: it._read_soon([name]), _QUICKEST, _SLOWEST, _PATIENCE)
         self._looks[name].ask()
 
     def _read_soon(self, names: Iterable[str]) -> None:

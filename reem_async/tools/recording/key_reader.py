@@ -12,7 +12,7 @@ from ...plan.paths import Path
 from ...plan.reads import HeldValues, RawRead, read
 from ...plan.replies import decoded
 from ...pubsub.attachments import HeldAttachments
-from ...pubsub.fetching import divided_read
+from ...pubsub.division import divided_read
 from ...pubsub.manager import manager_of
 from ...session import Session
 from ...store.reader import opened

@@ -17,8 +17,8 @@ from ...errors import BadData, Conflict, RedisError, WrongKind
 from ...plan.paths import Path, show
 from ...plan.patterns import Pattern
 from ...plan.trees import MISSING
-from ...pubsub.looks import Looks
 from ...pubsub.monitor import ANNOUNCED, Event
+from ...pubsub.refresh import RefreshTimer
 from ...session import Session
 from .fetch import Fetched
 from .key_queue import KeyQueue
@@ -43,7 +43,7 @@ _FAST = 20_000_000
 _READ_RATE = 8e6
 """Bytes a second of each key that are read for what is only stored."""
 _QUICKEST, _SLOWEST = 0.02, 0.5
-"""Seconds from a change that a notice came with to the look for what was stored besides; see `Looks`."""
+"""Seconds from a change that a notice came with to the look for what was stored besides; see `RefreshTimer`."""
 _PATIENCE = 0.015
 """Seconds in which the notice of a change is taken: longer than those for which updates wait for each other."""
 
@@ -102,7 +102,7 @@ class KeyRecorder:
         self.busy: asyncio.Task[None] | None = None
         self.news = False
         self.absent = False
-        self.looks = Looks(self, KeyRecorder._look, _QUICKEST, _SLOWEST, _PATIENCE)
+        self.looks = RefreshTimer(self, KeyRecorder._look, _QUICKEST, _SLOWEST, _PATIENCE)
 
     @property
     def is_over(self) -> bool:

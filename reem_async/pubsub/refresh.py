@@ -7,12 +7,12 @@ import weakref
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-__all__ = ["Looks"]
+__all__ = ["RefreshTimer"]
 
 Owner = TypeVar("Owner")
 
 
-class Looks(Generic[Owner]):
+class RefreshTimer(Generic[Owner]):
     """Calls for looks at one thing that changes. Belongs to an event loop.
 
     A published update is a change too, which its notice tells of, so most looks at what is published find nothing:

@@ -1,0 +1,266 @@
+"""What is sent over a subscription connection: SUBSCRIBE, CLIENT TRACKING and periodic probes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import weakref
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+from ..concurrency.tasks import Tasks
+from ..errors import ServerNotReady, is_of_command
+from ..plan import Command, Reply, blamed
+from ..transport import Transport
+from ..transport.wire import Wire
+from .listeners import Listener, Topic
+
+__all__ = ["Heartbeats", "Invalidations", "Subscribing"]
+
+logger = logging.getLogger("reem.subscribe")
+
+_TRACK = ("CLIENT", "TRACKING", "ON")
+"""Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
+_PERIOD = 1.0
+"""Seconds between looks at a connection; one that is dead shows a call's time limit later."""
+
+
+class Subscribing:
+    """Subscribes to topics over connections that the caller chooses.
+
+    Args:
+        transport: Whose server it is.
+        host: What names this host to publishers that share memory with it; none if that is off.
+        confirmed: Called with a topic and the connection when the server has confirmed a subscription.
+    """
+
+    def __init__(self, transport: Transport, host: str | None, confirmed: Callable[[Topic, Wire], None]) -> None:
+        self._transport = transport
+        self._host = host
+        self._on_confirmed = confirmed
+        self._invited: set[Topic] = set()  # publishers of this host know that somebody listens
+
+    async def subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
+        """Subscribe and wait until the server has confirmed each topic; raise the first refusal."""
+        answers: list[asyncio.Future[None]] = []
+        for topic in topics:
+            answer = asyncio.get_running_loop().create_future()
+            answers.append(answer)
+            # Noted in order with what is pushed: the word that the slot has moved may come right behind.
+            wire.send([self._command(topic)], partial(self._confirmed, topic, wire, answer))
+        outcomes = await asyncio.gather(*answers, return_exceptions=True)
+        for outcome in outcomes:
+            if outcome is not None:
+                raise outcome
+
+    def _confirmed(
+        self, topic: Topic, wire: Wire, answer: asyncio.Future[None], replies: list[Reply] | Exception
+    ) -> None:
+        refusal = replies if isinstance(replies, Exception) else replies[0]
+        if not isinstance(refusal, Exception):
+            self._on_confirmed(topic, wire)
+        if answer.done():  # cancelled
+            return
+        if isinstance(refusal, Exception):
+            answer.set_exception(refusal if self._transport.sharded else blamed(refusal, self._command(topic)))
+        else:
+            answer.set_result(None)
+
+    def invite(self, wire: Wire, topic: Topic) -> None:
+        """Have publishers of this host know that somebody looks into their memory; a refusal means that they do not."""
+        if self._host:
+            self._invited.add(topic)
+            wire.send([self._command(self._near(topic))], lambda _: None)
+
+    def leave(self, wire: Wire | None, topic: Topic) -> None:
+        """Unsubscribe, if there is a connection still."""
+        left = [topic, self._near(topic)] if topic in self._invited else [topic]
+        self._invited.discard(topic)
+        if wire is None or not wire.alive:
+            return
+        for each in left:
+            if self._prefix(each) == "S":
+                wire.leave(each.name)
+            else:
+                wire.send([(f"{self._prefix(each)}UNSUBSCRIBE", each.name)], lambda _: None)
+
+    def _near(self, topic: Topic) -> Topic:
+        return Topic(topic.name + f"@{self._host}".encode(), topic.pattern)
+
+    def _command(self, topic: Topic) -> tuple[str, bytes]:
+        return f"{self._prefix(topic)}SUBSCRIBE", topic.name
+
+    def _prefix(self, topic: Topic) -> str:
+        """Return what the server's commands for this kind of topic begin with."""
+        return "P" if topic.pattern else "S" if self._transport.sharded else ""
+
+
+class Invalidations:
+    """Turns the server's messages on; who may not have them is warned, once for each interface."""
+
+    def __init__(self) -> None:
+        self._warned = False
+
+    async def turn_on(self, wire: Wire) -> None:
+        """Have the server tell of changes of what is read over a connection; at most one round trip.
+
+        Raises:
+            ServerNotReady: It answers nobody now; to be tried again.
+        """
+        if wire.tracked is not None:
+            return
+        (reply,) = await wire.roundtrip([_TRACK])
+        if isinstance(reply, ServerNotReady):
+            raise blamed(reply, _TRACK)
+        if isinstance(reply, Exception):
+            self._refused(wire, blamed(reply, _TRACK), "+client|tracking")
+        else:
+            wire.tracked = True
+
+    async def touch(self, wire: Wire, names: Iterable[str], touched: Callable[[], None]) -> bool:
+        """Read keys over a connection, so that the server tells once when they are changed. One round trip.
+
+        Returns whether it will tell. `touched` is called in order with what it tells: what it has told of before was
+        changed before. When this returns it may have told more.
+        """
+        if not wire.alive or not wire.tracked:
+            return False
+        answered = asyncio.get_running_loop().create_future()
+
+        def done(outcome: list[Reply] | Exception) -> None:
+            touched()
+            if not answered.done():  # cancelled
+                answered.set_result(outcome)
+
+        wire.send([("TYPE", name) for name in names], done)
+        outcome = await answered
+        if isinstance(outcome, Exception):
+            raise outcome
+        refused = [reply for reply in outcome if isinstance(reply, Exception)]
+        if any(is_of_command(reply) for reply in refused):
+            self.may_not_touch(wire, refused[0])
+        return not refused
+
+    def may_not_touch(self, wire: Wire, refusal: Exception) -> None:
+        """Take it that the user may not read keys so, and warn."""
+        self._refused(wire, blamed(refusal, ("TYPE",)), "+type")
+
+    def _refused(self, wire: Wire, reason: Exception, right: str) -> None:
+        wire.tracked = False
+        if not self._warned:
+            self._warned = True
+            logger.warning(
+                "what is only stored cannot be followed at this server, only what is published is told; a recording "
+                "has the rest at its keyframes, and the page looks for it: %s "
+                "(the user needs the right %s, as in deploy/users.acl)",
+                reason,
+                right,
+            )
+
+
+class Heartbeats:
+    """Asks over each connection for the notes of the last updates, every second.
+
+    Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
+    time to live has passed. Belongs to an event loop.
+
+    Args:
+        tasks: Where the looks run.
+        listeners: Returns who listens over a connection.
+        forget: Called every second: forgets what nobody listens to any more, and returns who is left.
+        answered: Called when a connection has answered.
+        on_note: Called with a listener and the server's note for it, or an error of the server.
+    """
+
+    def __init__(
+        self,
+        tasks: Tasks,
+        listeners: Callable[[Wire], list[Listener]],
+        forget: Callable[[], list[Listener]],
+        answered: Callable[[], None],
+        on_note: Callable[[Listener, Reply], None],
+    ) -> None:
+        self._tasks = tasks
+        self._listeners = listeners
+        self._forget = forget
+        self._answered = answered
+        self._on_note = on_note
+        self._period = _PERIOD
+        self._beating: dict[Wire, asyncio.Task[Any]] = {}
+
+    def start(self, wire: Wire) -> None:
+        """Look at a new connection."""
+        self._beating[wire] = self._tasks.start(self._beat(wire), "reem heartbeat")
+
+    def lost(self, wire: Wire) -> None:
+        """A connection is gone; its task ends by itself."""
+        self._beating.pop(wire, None)
+
+    def hurry(self, seconds: float) -> None:
+        """Look that often while a listener needs it, if that is more often than until now."""
+        if seconds < self._period:
+            self._period = seconds
+            for wire, task in list(self._beating.items()):
+                task.cancel()
+                self.start(wire)
+
+    async def _beat(self, wire: Wire) -> None:
+        loop = asyncio.get_running_loop()
+        looked = loop.time()
+        while True:
+            await asyncio.sleep(self._period)
+            if not wire.alive:
+                return
+            notes, answered, now = [], loop.create_future(), loop.time()
+            if now - looked > _PERIOD - self._period / 2:
+                looked = now
+                self._period = self._needed()
+                notes = self._notes(wire)
+            asked: list[Command] = [("GET", note) for note in notes] or [("PING",)]
+            self._probe(wire, now)
+            wire.send(asked, partial(self._on_notes, wire, notes, answered))
+            await answered  # a connection breaks only if nothing newer waits on it
+
+    # Functions of their own, since a task that held listeners while it waits would keep those that are dropped.
+
+    def _needed(self) -> float:
+        """Return the seconds between looks that those who still listen need."""
+        return min([_PERIOD, *(listener.heartbeat for listener in self._forget())])
+
+    def _notes(self, wire: Wire) -> list[str]:
+        """Return the notes to ask for."""
+        return sorted({listener.note for listener in self._listeners(wire) if listener.note is not None})
+
+    def _probe(self, wire: Wire, now: float) -> None:
+        """Ask for the types of the documents that are due by the middle of this period."""
+        documents: dict[str, list[weakref.ref[Listener]]] = {}
+        for listener in self._listeners(wire):
+            if (document := listener.probe(now + self._period / 2)) is not None:
+                documents.setdefault(document, []).append(weakref.ref(listener))
+        if documents:
+            asked: list[Command] = [("TYPE", document) for document in documents]
+            wire.send(asked, partial(self._on_probes, list(documents.values()), now))
+
+    def _on_probes(self, asked: list[list[weakref.ref[Listener]]], sent: float, kinds: list[Reply] | Exception) -> None:
+        if isinstance(kinds, Exception):
+            return
+        for group, kind in zip(asked, kinds, strict=True):
+            for reference in group:
+                if (listener := reference()) is not None:
+                    listener.on_probe(kind, sent)
+
+    def _on_notes(
+        self, wire: Wire, names: list[str], answered: asyncio.Future[None], notes: list[Reply] | Exception
+    ) -> None:
+        if not answered.done():  # cancelled
+            answered.set_result(None)
+        if isinstance(notes, Exception):
+            return
+        self._answered()
+        if not names:
+            return
+        found = dict(zip(names, notes, strict=False))
+        for listener in self._listeners(wire):
+            if listener.note in found:
+                self._on_note(listener, found[listener.note])
