@@ -54,6 +54,8 @@ _BARE_BYTES = 1 << 20
 _MESSAGE = struct.Struct("<BQHIQQ")
 # Head of the record, checksum of all before it.
 _DATA_END = struct.Struct("<BQI")
+# What the library raises over bytes that are no record.
+_MALFORMED = (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError)
 
 Progress = Callable[[int, int], None]
 """Called with how much of something is done, and how much there is."""
@@ -115,7 +117,7 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
                 if known.setdefault(record.id, record) != record:
                     return None
             position = end
-    except (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError):
+    except _MALFORMED:
         return None
     return index_of(channels, times, offsets)
 
@@ -210,8 +212,8 @@ class _Scan:
     def _take_metadata(self, start: int, end: int) -> None:
         try:
             record = Metadata.read(ReadDataStream(io.BytesIO(self._source.read(start, end - start))))
-            self.contents.metadata.append(record)
-        except (McapError, ValueError, struct.error, EOFError):
+            self.contents.metadata[start] = record
+        except _MALFORMED:
             self.damaged += 1
 
 
@@ -257,7 +259,7 @@ class Container:
             self._source.close()
             raise
         self.channels, self.schemas = self._contents.channels, self._contents.schemas
-        self.metadata = self._contents.metadata
+        self.metadata = [record for _, record in sorted(self._contents.metadata.items())]
         # Other tools write chunks in any order; what is asked for is asked by time.
         chunks = sorted(self._contents.chunks, key=lambda it: (it.start, it.offset))
         self.every_chunk = [replace(info, number=number) for number, info in enumerate(chunks)]
@@ -265,12 +267,16 @@ class Container:
     def _read_contents(self, progress: Progress | None) -> Contents:
         footer = read_footer(self._source)
         self.indexed = footer is not None
-        contents = read_summary(self._source, footer)
-        if contents is not None:
+        try:
+            contents, is_complete = (Contents(), False) if footer is None else read_summary(self._source, footer)
+        except _MALFORMED:
+            contents, is_complete, self.damaged = Contents(), False, 1
+        self._messages = contents.messages  # as the writer has counted them
+        if is_complete:
             return contents
         scan = _Scan(self._source)
         scan.run(footer, progress)
-        self.damaged = scan.damaged + (footer is not None and footer.text is None)
+        self.damaged += scan.damaged
         return scan.contents
 
     def close(self) -> None:
@@ -361,16 +367,18 @@ class Container:
 
     def verify(self, progress: Progress | None = None) -> int:
         """Read every chunk; return how many records of the file are damaged."""
+        messages = 0
         for info in self.chunks:
             content = self.content(info)
             made = None if content is None else _take_records(content, self._contents)
             known = self._read_index(info) if made is not None and info.index_length else made
-            if made is None or known is None or not known.same(made):
+            if made is None or known is None or not known.same(made) or made.span() != (info.start, info.end):
                 self._discard(info)
+            messages += 0 if made is None else len(made.times)
             if progress is not None:
                 progress(info.number + 1, len(self.every_chunk))
         # What is outside of chunks has no checksum but that of all data, if its writer has made one.
-        if not self.damaged and not self._is_sound():
+        if not self.damaged and (self._messages not in (None, messages) or not self._is_sound()):
             self.damaged += 1
         return self.damaged
 

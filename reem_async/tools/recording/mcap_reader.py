@@ -12,16 +12,14 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, MetadataIndex, Schema
+from mcap.records import Channel, Metadata, MetadataIndex, Schema, Statistics
 
 __all__ = [
     "HEAD", "MAGIC", "ChunkInfo", "Contents", "Footer", "Index", "Numbers", "Source", "index_of", "index_places",
@@ -167,12 +165,17 @@ class ChunkInfo:
 
 @dataclass(slots=True)
 class Contents:
-    """What a file has: channels and schemas by number, chunks, metadata in the order of the file."""
+    """What a file has: channels and schemas by number, chunks, metadata by place.
+
+    Attributes:
+        messages: How many there are by the statistics of the summary; None if there are none.
+    """
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: list[ChunkInfo] = field(default_factory=list)
-    metadata: list[Metadata] = field(default_factory=list)
+    metadata: dict[int, Metadata] = field(default_factory=dict)
+    messages: int | None = None
 
     def unknown(self) -> int:
         """Return how many channels with messages, or their schemas, the file does not describe."""
@@ -216,33 +219,33 @@ def read_footer(source: Source) -> Footer | None:
     return Footer(start, text if is_sound else None)
 
 
-def read_summary(source: Source, footer: Footer | None) -> Contents | None:
-    """Return what the summary says; None if there is none, or if it leaves out anything that the file has.
+def read_summary(source: Source, footer: Footer) -> tuple[Contents, bool]:
+    """Return what the summary says, and whether it leaves out nothing that the file has.
 
     MCAP leaves most of a summary to the program that writes it. So the data section is compared with it, without being
     read: from record to record, the known chunks and metadata are all that it may have.
+
+    Raises:
+        ValueError, and others: The summary is damaged, or lists what the file does not have.
     """
-    if footer is None or not footer.text:
-        return None
-    try:
-        contents, places = _parsed(source, footer)
-    except (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError):
-        return None
+    if footer.text is None:
+        raise ValueError("the summary does not have the checksum that the footer names")
+    if not footer.text:
+        return Contents(), False
+    contents = _parsed(source, footer.data_end, footer.text)
     known = all(chunk.index_length and len(chunk.channels) for chunk in contents.chunks) and not contents.unknown()
-    return contents if known and _lists_all(source, footer.data_end, places) else None
+    return contents, _lists_all(source, footer.data_end, contents) and known
 
 
-def _parsed(source: Source, footer: Footer) -> tuple[Contents, dict[int, int]]:
-    """Return what the summary says, and where each chunk and metadata record that it lists begins and ends."""
-    contents, text, position = Contents(), footer.text or b"", 0
-    metadata: list[MetadataIndex] = []
+def _parsed(source: Source, data_end: int, text: bytes) -> Contents:
+    contents, position = Contents(), 0
     while position < len(text):
         opcode, length = HEAD.unpack_from(text, position)
         body, position = position + HEAD.size, position + HEAD.size + length
         if position > len(text):
             raise ValueError("a record goes beyond the summary")
         if opcode == Opcode.CHUNK_INDEX:
-            contents.chunks.append(_chunk(text, body, position, footer.data_end))
+            contents.chunks.append(_chunk(text, body, position, data_end))
             continue
         stream = ReadDataStream(io.BytesIO(text[body:position]))
         if opcode == Opcode.SCHEMA:
@@ -251,12 +254,12 @@ def _parsed(source: Source, footer: Footer) -> tuple[Contents, dict[int, int]]:
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(stream)
             contents.channels[channel.id] = channel
+        elif opcode == Opcode.STATISTICS:
+            contents.messages = Statistics.read(stream).message_count
         elif opcode == Opcode.METADATA_INDEX:
-            metadata.append(MetadataIndex.read(stream))
-    metadata.sort(key=lambda it: it.offset)
-    contents.metadata = [_metadata(source, it) for it in metadata]
-    places = {it.offset: it.index + it.index_length for it in contents.chunks}
-    return contents, places | {it.offset: it.offset + it.length for it in metadata}
+            it = MetadataIndex.read(stream)
+            contents.metadata[it.offset] = _metadata(source, it.offset, it.length)
+    return contents
 
 
 def _chunk(text: bytes, body: int, end: int, start: int) -> ChunkInfo:
@@ -269,30 +272,31 @@ def _chunk(text: bytes, body: int, end: int, start: int) -> ChunkInfo:
     return ChunkInfo(0, first, last, offset, length, offset + length, index_length, channels, start + places)
 
 
-def _metadata(source: Source, it: MetadataIndex) -> Metadata:
-    if it.offset + it.length > source.size or it.length < HEAD.size:
+def _metadata(source: Source, offset: int, length: int) -> Metadata:
+    if offset + length > source.size or length < HEAD.size:
         raise ValueError("a metadata record goes beyond the file")
-    text = source.read(it.offset + HEAD.size, it.length - HEAD.size)
+    text = source.read(offset + HEAD.size, length - HEAD.size)
     record: Metadata = Metadata.read(ReadDataStream(io.BytesIO(text)))
     return record
 
 
-def _lists_all(source: Source, data_end: int, places: Mapping[int, int]) -> bool:
-    """Return whether a data section consists of what the summary lists, and of what the reader does not need."""
-    position, listed = len(MAGIC), 0
+def _lists_all(source: Source, data_end: int, contents: Contents) -> bool:
+    """Return whether the summary lists all that the reader needs of the data section; ValueError if it lists more."""
+    position, listed, is_all = len(MAGIC), 0, True
+    ends = {it.offset: it.index + it.index_length for it in contents.chunks}
     while position < data_end:
-        end = places.get(position, 0)
-        if end > position:
-            listed += 1
-            position = end
-            continue
-        if position + HEAD.size > data_end:
-            return False
-        opcode, length = HEAD.unpack(source.peek(position, HEAD.size))
-        if opcode in _LISTED:
-            return False
-        position += HEAD.size + length
-    return position == data_end and listed == len(places)
+        end = ends.get(position, 0)
+        if end <= position:
+            if position + HEAD.size > data_end:
+                raise ValueError("the data section ends within a record")
+            opcode, length = HEAD.unpack(source.peek(position, HEAD.size))
+            end = position + HEAD.size + length
+            is_all = is_all and (opcode not in _LISTED or position in contents.metadata)
+        listed += position in ends or position in contents.metadata
+        position = end
+    if position != data_end or listed != len(contents.chunks) + len(contents.metadata):
+        raise ValueError("the summary lists what the file does not have")
+    return is_all
 
 
 def index_places(source: Source, info: ChunkInfo) -> Numbers:
