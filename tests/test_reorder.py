@@ -50,7 +50,7 @@ class Heard:
         assert channel == CHANNEL
         self.told.append((it.publisher, it.sequence))
 
-    def doubt(self, channel):
+    def invalidate(self, channel):
         assert channel == CHANNEL
         self.told.append("doubt")
 

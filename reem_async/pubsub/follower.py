@@ -55,7 +55,7 @@ class Follower:
         note: Where the server keeps a note of the last update.
         queues: Where each update goes.
         ready: Done when the first snapshot is there.
-        patience: Seconds that updates may wait for each other: none.
+        max_batch_delay: Seconds that updates may wait for each other: none.
         stored: It is told of what is only stored, too.
         local: It takes large values from the memory of publishers of the same host.
         heartbeat: Seconds between probes of the document, if it needs more of them than others.
@@ -82,7 +82,7 @@ class Follower:
         self.note: str | None = keys.last
         self.queues: list[BoundedQueue] = []
         self.ready: asyncio.Future[None] | None = None
-        self.patience = 0.0
+        self.max_batch_delay = 0.0
         self.stored = stored
         self.local = largest == math.inf  # else it wants no large values
         self.heartbeat = heartbeat
@@ -131,7 +131,7 @@ class Follower:
         self.told(self._replica.at())
 
     @contained
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Take a snapshot: something was published that could not be read."""
         self._replica.unreadable()
         self._perform()

@@ -217,7 +217,7 @@ class _Part(ForwardingListener):
     """
 
     def __init__(self, listener: Listener, topic: Topic) -> None:
-        super().__init__(topic, listener.patience)
+        super().__init__(topic, listener.max_batch_delay)
         self._listener: Callable[[], Listener | None] = weakref.ref(listener)
 
     def let_go(self) -> None:
@@ -231,10 +231,10 @@ class _Part(ForwardingListener):
         elif (listener := self._listener()) is not None:
             listener.lost(reason)
 
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Hand it on."""
         if (listener := self._listener()) is not None:
-            listener.doubt(channel)
+            listener.invalidate(channel)
 
 
 def _nobody() -> None:
@@ -274,10 +274,10 @@ class _KeyListener(_Part):
         elif (listener := self._listener()) is not None:
             listener.on_notice(notice, channel)
 
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Hand it on."""
         self.seen = time.monotonic()
-        super().doubt(channel)
+        super().invalidate(channel)
 
 
 class _NewKeysListener(_Part):

@@ -86,7 +86,7 @@ class Listener(Protocol):
         note: The key where the server keeps a note of the last update, None if there are many.
         ready: Done when it has begun to follow.
         queues: Where each update goes.
-        patience: Seconds that updates may wait for each other before it is told.
+        max_batch_delay: Seconds that updates may wait for each other before it is told.
         stored: It wants to know of keys that were changed, not only of what is published.
         heartbeat: Seconds between probes that it needs; infinite if those that all get will do.
         local: It takes large values from the memory of publishers of the same host.
@@ -96,7 +96,7 @@ class Listener(Protocol):
     note: str | None
     ready: asyncio.Future[None] | None
     queues: list[BoundedQueue]
-    patience: float
+    max_batch_delay: float
     stored: bool
     heartbeat: float
     local: bool
@@ -107,7 +107,7 @@ class Listener(Protocol):
     def lost(self, reason: Exception) -> None:
         """Note that the connection is gone."""
 
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Note that something was published on `channel` that could not be read."""
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
@@ -146,13 +146,13 @@ class ForwardingListener:
 
     Args:
         topic: What it subscribes to.
-        patience: Seconds that updates may wait for each other before it is told.
+        max_batch_delay: Seconds that updates may wait for each other before it is told.
         queues: What ends when it is followed no more.
     """
 
-    def __init__(self, topic: Topic, patience: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
+    def __init__(self, topic: Topic, max_batch_delay: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
         self.topic = topic
-        self.patience = patience
+        self.max_batch_delay = max_batch_delay
         self.queues: list[BoundedQueue] = [*queues]
         self.note: str | None = None  # there are many, or others compare it
         self.ready: asyncio.Future[None] | None = None
@@ -299,14 +299,14 @@ class Inbox:
         except BadData as error:
             self._unreadable(channel, error)
             for listener in listeners:
-                listener.doubt(channel)
+                listener.invalidate(channel)
             return
         for listener in listeners:
             try:
                 listener.on_notice(notice if listener.local or notice.slot is None else _unseen(notice), channel)
             except Exception as error:  # one message must not end the connection for all that follow
                 self._unreadable(channel, error)
-                listener.doubt(channel)
+                listener.invalidate(channel)
 
     def _take_early(self, channel: bytes, payload: bytes) -> None:
         """Take what a publisher near by says before the server has it; an empty message only asks who listens."""

@@ -206,14 +206,14 @@ class SubscriptionManager:
     def _enter(self, listener: Listener) -> None:
         """Note who listens, before the server confirms: a notice right behind that must find somebody."""
         if not self._topics:
-            self._pace = listener.patience
-        self.hurry(listener.patience)
-        self._heartbeats.hurry(listener.heartbeat)
+            self._pace = listener.max_batch_delay
+        self.limit_batch_delay(listener.max_batch_delay)
+        self._heartbeats.limit_period(listener.heartbeat)
         self._topics.setdefault(listener.topic, ListenerGroup()).add(listener)
 
-    def hurry(self, patience: float) -> None:
-        """Have updates wait for each other no longer than so many seconds from now on, whoever listens."""
-        self._pace = min(self._pace, patience)
+    def limit_batch_delay(self, max_batch_delay: float) -> None:
+        """Have updates wait for each other at most so many seconds from now on, whatever listens."""
+        self._pace = min(self._pace, max_batch_delay)
         for wire in self._wires.values():
             wire.pace = self._pace
 
@@ -317,7 +317,7 @@ class SubscriptionManager:
             if listener.topic in self._unsure:  # they are back: what was published meanwhile went elsewhere
                 self._unsure.discard(listener.topic)
                 for each in self._listeners([listener.topic]):
-                    each.doubt(listener.topic.name)
+                    each.invalidate(listener.topic.name)
             listener.on_note(note)
 
     def _moved(self, topics: list[Topic], reason: str) -> None:

@@ -304,7 +304,7 @@ class _PatternListener(ForwardingListener):
         self._monitor.changed(key)
 
     @contained
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Remember that an update of a key was lost."""
         if not self._is_others(channel):
             self._monitor._doubt(channel)

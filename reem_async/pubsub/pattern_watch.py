@@ -328,7 +328,7 @@ class _Publishers(ForwardingListener):
         super().__init__(topic, queues=[watch.queue])
         self._watch = weakref.ref(watch)
 
-    def doubt(self, channel: bytes) -> None:
+    def invalidate(self, channel: bytes) -> None:
         """Do nothing: who follows the key has it too."""
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:

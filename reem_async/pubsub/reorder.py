@@ -135,7 +135,7 @@ class ReorderBuffer:
         """Wait no longer: what is older was lost."""
         listener = self._listener()
         if listener is not None and not sender.last:  # nobody can tell how much
-            listener.doubt(self._channel)
+            listener.invalidate(self._channel)
         self._settle(sender)
 
     def _settle(self, sender: _Sender) -> None:

@@ -197,8 +197,8 @@ class Heartbeats:
         """A connection is gone; its task ends by itself."""
         self._beating.pop(wire, None)
 
-    def hurry(self, seconds: float) -> None:
-        """Look that often while a listener needs it, if that is more often than until now."""
+    def limit_period(self, seconds: float) -> None:
+        """Send probes at least that often as long as a listener needs it."""
         if seconds < self._period:
             self._period = seconds
             for wire, task in list(self._beating.items()):

@@ -323,7 +323,7 @@ class Recorder:
 
     def hurry(self) -> None:
         """Look more often at what was published: large updates come fast."""
-        manager_of(self.session).hurry(HURRIED)
+        manager_of(self.session).limit_batch_delay(HURRIED)
 
     def failed(self, error: Exception) -> None:
         """End the recording: something went wrong that should not."""
