@@ -288,3 +288,16 @@ def test_the_readme_is_short_and_begins_with_what_it_is():
     ):
         assert part in first_screen
     assert (DOCS / "images" / "reem.gif").stat().st_size < 3_000_000
+
+
+def test_a_decision_is_short():
+    """Context, decision, consequence; at most 12 lines."""
+    _, *entries = re.split(r"^## ", (DOCS / "decisions.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    for entry in entries:
+        heading, *lines = [line for line in entry.splitlines() if line]
+        assert re.findall(r"^\*\*(\w+)\.\*\*", "\n".join(lines), re.MULTILINE) == [
+            "Context",
+            "Decision",
+            "Consequence",
+        ], heading
+        assert len(lines) <= 12, heading
