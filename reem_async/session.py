@@ -18,10 +18,8 @@ from .concurrency.tasks import Tasks
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
 from .local.path import LocalPath
 from .plan import Plan
-from .plan.keys import Keys, keys_of
-from .plan.paths import LONGEST_TOP_KEY, check_namespace, check_top_key
-from .plan.patterns import Pattern, escaped
-from .plan.scan import DOCUMENT
+from .plan.keys import DOCUMENT, Keys, keys_of
+from .plan.paths import LONGEST_TOP_KEY, Pattern, check_namespace, check_top_key, escaped
 from .plan.shapes import ShapeCache
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships

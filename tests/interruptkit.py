@@ -35,7 +35,7 @@ from reem.server import EmbeddedServer
 from reem_async.local.host import reason_against
 from reem_async.local.reader import LocalReader
 from reem_async.local.segment import SLOTS
-from reem_async.plan.slots import Slot
+from reem_async.plan.notices import Slot
 
 STUCK = 15.0
 """Seconds after which a call has not ended: all limits of the calls below are far shorter."""

@@ -42,7 +42,7 @@ from reem_async.local.path import LEAST, LocalPath
 from reem_async.local.reader import LocalReader
 from reem_async.local.segment import SLOTS
 from reem_async.plan.keys import keys_of
-from reem_async.plan.slots import Slot
+from reem_async.plan.notices import Slot
 
 FORK = multiprocessing.get_context("fork")
 PUBLISHERS, READERS = 2, 4

@@ -25,9 +25,8 @@ from reem_async.local.reader import LocalReader
 from reem_async.local.segment import HEAD, IDENTITY, MARK, SEALS, SLOTS, STAMP, Segment, stamp_at
 from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.keys import keys_of
-from reem_async.plan.notices import ANNOUNCED, LARGEST_INLINE, announce, decode, in_slot
+from reem_async.plan.notices import ANNOUNCED, LARGEST_INLINE, Slot, announce, decode, in_slot
 from reem_async.plan.placeholders import Placeholder
-from reem_async.plan.slots import Slot
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.transport.recorder import CommandRecorder
 

@@ -14,7 +14,7 @@ from conftest import aeventually, nothing_fetched
 import reem_async
 from reem_async.concurrency.queues import Every, Last
 from reem_async.errors import BadKey, InterfaceClosed, MissingKey, QueueFull
-from reem_async.plan.patterns import escaped, parse_pattern
+from reem_async.plan.paths import escaped, parse_pattern
 from reem_async.pubsub.monitor import ANNOUNCED, Monitor
 from reem_async.store.catalog import names, outline
 

@@ -7,8 +7,8 @@ import random
 
 import pytest
 
+from reem_async.plan.copies import is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED
-from reem_async.plan.overtaken import is_own, rest_of
 from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
 from reem_async.tools.recording.order import Item, is_replaced, settled, skipped
 from reem_async.tools.recording.state import applied

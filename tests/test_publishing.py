@@ -17,8 +17,7 @@ from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.keys import keys_of
 from reem_async.plan.reads import read
 from reem_async.plan.shapes import ShapeCache
-from reem_async.plan.together import together
-from reem_async.plan.writes import append_change, change, delete_change, set_change, takes
+from reem_async.plan.writes import append_change, change, delete_change, set_change, takes, together
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.store.publish import PublishTurn
 from reem_async.transport.recorder import CommandRecorder

@@ -17,7 +17,7 @@ from hypothesis import example, given, settings
 from test_values import arrays, mixed
 
 from reem_async.errors import BadData, BadInput, BadValue
-from reem_async.plan.patterns import parse_pattern
+from reem_async.plan.paths import parse_pattern
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.tools.recording.layout import from_json, to_json

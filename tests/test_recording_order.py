@@ -12,7 +12,7 @@ import pytest
 from conftest import PATIENCE, Remembering, aeventually, assert_same
 
 import reem_async
-from reem_async.plan.patterns import parse_pattern
+from reem_async.plan.paths import parse_pattern
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.recording import Recorder, Replayer, key_recorder, open_log
 from reem_async.tools.recording.state import pruned

@@ -11,7 +11,7 @@ from test_recording_stored import is_followed, news, recording
 
 import reem_async
 from reem_async.concurrency.queues import BoundedQueue, Last
-from reem_async.plan.patterns import parse_pattern
+from reem_async.plan.paths import parse_pattern
 from reem_async.tools.recording import Recorder, open_log
 from reem_async.tools.recording.roles import Kind, Role
 from reem_async.tools.recording.sink import Sink

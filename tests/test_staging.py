@@ -14,7 +14,7 @@ import reem
 from reem_async.errors import Conflict, NotAllowed
 from reem_async.plan.keys import keys_of as keys_of_name
 from reem_async.plan.shapes import ShapeCache
-from reem_async.plan.staging import STAGED, are_missing, looks_at, stage
+from reem_async.plan.sizes import STAGED, are_missing, looks_at, stage
 from reem_async.plan.writes import exchange, set_change
 
 SHAPE = (1000, 1000)

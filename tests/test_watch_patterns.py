@@ -13,7 +13,7 @@ import reem_async
 from reem_async import Last
 from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import BadKey, ConnectionLost, WriteOnly
-from reem_async.plan import scan
+from reem_async.plan import keys as key_plans
 from reem_async.plan.notices import announce
 from reem_async.plan.paths import show
 from reem_async.pubsub.follower import Follower
@@ -242,7 +242,7 @@ async def test_a_look_for_keys_that_the_server_refuses_is_made_again(akvs, key, 
     """Whatever error it answers with: the watch goes on."""
     async with akvs.watch(key("*")) as watch:
         with monkeypatch.context() as patched:
-            patched.setattr(scan, "_PAGE", "none")  # "ERR value is not an integer"
+            patched.setattr(key_plans, "_PAGE", "none")  # "ERR value is not an integer"
             await watch.look()
         await akvs[key("a")].write(1)
         await watch.look()

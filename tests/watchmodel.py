@@ -27,8 +27,8 @@ import redis
 import reem
 import reem_async
 from reem_async.errors import InterfaceClosed, MissingKey, ReemError, Stale
-from reem_async.plan.differences import same
 from reem_async.plan.paths import parse
+from reem_async.plan.trees import same
 from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
 

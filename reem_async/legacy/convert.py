@@ -12,9 +12,8 @@ from ..connection import RedisInterface
 from ..errors import BadData, BadInput, Conflict, MissingKey, PartialWrite, WrongKind
 from ..plan import Command, Plan, Reply
 from ..plan.changes import Announcement, EncodedAttachment
-from ..plan.paths import Path, check_top_key, to_jsonpath
-from ..plan.patterns import Pattern
-from ..plan.placeholders import Placeholder, Slot
+from ..plan.paths import Path, Pattern, check_top_key, to_jsonpath
+from ..plan.placeholders import Placeholder, PlaceholderSlot
 from ..plan.reads import RawRead, get_command, read
 from ..plan.writes import exchange, set_change
 from ..session import Session
@@ -280,7 +279,7 @@ class _Converter:
     async def _opened(self, place: str, ship: Registered, reply: Reply) -> Any:
         """Return what a user's ship makes of what it stored."""
         holder: list[Any] = [None]
-        slot = Slot(Placeholder(ship.label, place), holder, 0)
+        slot = PlaceholderSlot(Placeholder(ship.label, place), holder, 0)
         return await opened(RawRead(holder, self.name, [(slot, ship, reply)], (), ()))
 
     async def _write(self, value: Any, raw_read: RawRead, second: Reply, gone: list[str], *, dry_run: bool) -> None:

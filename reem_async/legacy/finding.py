@@ -8,8 +8,8 @@ from typing import Any
 
 from ..errors import BadData, NotAllowed
 from ..plan import Plan, Reply
-from ..plan.patterns import escaped
-from ..plan.scan import DOCUMENT
+from ..plan.keys import DOCUMENT
+from ..plan.paths import escaped
 from ..session import Session
 from ..transport.scan import scanned
 from .olddata import METADATA, candidates, is_rooted, root_command, special_paths

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from ..errors import BadData, BadKey
 from ..plain.documents import is_document
 from ..plan import Command, Plan, Reply
+from ..plan.attachments import permitted
 from ..plan.changes import Announcement
-from ..plan.orphans import permitted
-from ..plan.patterns import escaped
-from ..plan.staging import STAGED
+from ..plan.paths import escaped
+from ..plan.sizes import STAGED
 from ..session import Session
 from ..store.document import Turn
 from ..store.publish import DocumentPublisher

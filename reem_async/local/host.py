@@ -9,7 +9,7 @@ import os
 import sys
 from functools import lru_cache
 
-from ..plan.slots import Slot
+from ..plan.notices import Slot
 from .reader import LocalReader
 from .segment import Segment
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import BadValue
 from ..plan.keys import Keys
-from ..plan.slots import Slot, starts
+from ..plan.notices import Slot, starts
 
 if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from .host import host

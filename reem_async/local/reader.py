@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..plan.slots import Slot
+from ..plan.notices import Slot
 from .locks import lock_for_reading
 from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, stamp_at
 

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..plan.slots import starts
+from ..plan.notices import starts
 from .locks import lock_for_writing, unlock
 
 __all__ = ["HEAD", "IDENTITY", "MARK", "NAME", "SEALS", "SLOTS", "STAMP", "Segment", "Shape", "stamp_at"]
@@ -132,7 +132,7 @@ class Segment:
 
         Args:
             pieces: Flat buffers of bytes. Several make up one part where a size spans them.
-            sizes: The bytes of each part; see `plan.slots.starts`.
+            sizes: The bytes of each part; see `plan.notices.starts`.
         """
         for number in self._oldest:
             writing = self._taken(number)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Generator, Sequence
 
 from ..plan import Command, Reply
-from ..plan.scan import DOCUMENT
+from ..plan.keys import DOCUMENT
 from .documents import READS, WRITES, Document, is_document
 from .paths import Refusal
 

@@ -14,15 +14,14 @@ from typing import Any
 
 from ..errors import MissingKey, Overflow, PartialWrite, WrongType
 from . import Plan, Reply
+from .attachments import permitted
 from .changes import Announcement
 from .documents import encode
-from .indexes import from_front, lengths
 from .keys import Keys
-from .orphans import permitted
 from .paths import Path, counts_from_end, show, to_jsonpath
 from .placeholders import find
 from .reads import get_command, present
-from .replies import checked, full, loads
+from .replies import checked, from_front, full, lengths, loads
 from .shapes import ShapeCache
 
 __all__ = ["calculate", "compute"]

@@ -6,10 +6,15 @@ that one transaction can hold it all.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-__all__ = ["Keys", "keys_of"]
+from ..errors import ALL_NODES, ClusterNode, NotAllowed
+from . import Command, Plan, Reply
+
+__all__ = ["DOCUMENT", "Keys", "count", "first_page", "keys_of", "page"]
 
 
 class Keys(NamedTuple):
@@ -47,3 +52,69 @@ def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = F
     channel = f"{tag}:notices" + (f"@{database}" if database else "")
     publish = "SPUBLISH" if sharded else "PUBLISH"
     return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last", publish)
+
+
+# Plans that look through the keys of one server.
+
+
+DOCUMENT = "ReJSON-RL"
+"""What TYPE says of a JSON document."""
+
+_PAGE = "1000"
+
+
+def page(glob: str = "", kind: str = "", cursor: Any = b"0") -> Plan:
+    """Plan to list about 1000 keys of one server; the result is the next cursor and the names, as bytes.
+
+    Args:
+        glob: A pattern of the names, in the server's syntax; all if it is empty.
+        kind: The Redis type; any if it is empty.
+        cursor: Where to go on.
+    """
+    return Plan([_scan(glob, kind, cursor)], lambda replies: _raised(replies[0]))
+
+
+def first_page(glob: str = "", kind: str = "") -> Plan:
+    """Plan to list the first keys, as `page` does, of a server that is taken for the only one.
+
+    Raises (in decode):
+        ClusterNode: It is one node of several, which have the other keys.
+    """
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        standing, found = replies
+        if isinstance(standing, bytes) and b"cluster_enabled:1" in standing:
+            return Plan([("CLUSTER", "INFO")], lambda said: _alone(said[0], found))
+        return _raised(found)
+
+    return Plan([("INFO", "cluster"), _scan(glob, kind, b"0")], decode)
+
+
+def _alone(standing: Reply, found: Reply) -> Reply:
+    if not isinstance(standing, bytes) or b"cluster_size:1\r" not in standing:
+        raise ClusterNode("the server is one node of a Redis Cluster and holds a part of the keys", ALL_NODES)
+    return _raised(found)
+
+
+def _scan(glob: str, kind: str, cursor: Any) -> Command:
+    # COUNT is how many buckets the server looks through, so a page may be empty though there are more keys.
+    matching = ("MATCH", glob) if glob else ()
+    return ("SCAN", cursor, *matching, "COUNT", _PAGE, *(("TYPE", kind) if kind else ()))
+
+
+def count(database: int) -> Plan:
+    """Plan to ask one server how many keys a database of it holds; the result is None if this user may not ask."""
+
+    def decode(replies: Sequence[Reply]) -> int | None:
+        if isinstance(replies[0], NotAllowed):
+            return None
+        found = re.search(rb"(?m)^db%d:keys=(\d+)" % database, _raised(replies[0]))
+        return int(found[1]) if found is not None else 0
+
+    return Plan([("INFO", "keyspace")], decode)  # DBSIZE is a right of its own, which programs do not have
+
+
+def _raised(reply: Reply) -> Reply:
+    if isinstance(reply, Exception):
+        raise reply
+    return reply

@@ -7,8 +7,9 @@ announced. What arrives is not trusted: anything unexpected is refused as `BadDa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import orjson
@@ -21,12 +22,24 @@ from .documents import nested_over
 from .keys import Keys
 from .paths import Path, check_element
 from .placeholders import find, marked
-from .slots import Slot, named, starts
 
 __all__ = [
-    "LARGEST_INLINE", "Notice", "View", "announce", "decode", "in_slot", "note_of", "parsed_note", "published",
-    "sizes_of_parts", "told_at", "with_value",
-]  # fmt: skip
+    "LARGEST_INLINE",
+    "Notice",
+    "Slot",
+    "View",
+    "announce",
+    "decode",
+    "in_slot",
+    "named",
+    "note_of",
+    "parsed_note",
+    "published",
+    "sizes_of_parts",
+    "starts",
+    "told_at",
+    "with_value",
+]
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14
@@ -78,7 +91,7 @@ class Notice(NamedTuple):
 NOTE_KEPT = 60
 """Seconds for which the note of a last update is kept."""
 
-View = Callable[[Slot, int], "memoryview | None"]
+View = Callable[["Slot", int], "memoryview | None"]
 """Returns the first bytes of a slot, so many, read-only; None if they are not to be had."""
 
 
@@ -287,3 +300,50 @@ def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deep
     for slot in find(holder, "a notice: ") if marked(text) else ():
         slot.container[slot.key] = replies[slot.placeholder.label, slot.placeholder.suffix]
     return holder[0]
+
+
+# Where the bytes of an update are in shared memory, as its notice says it. Names and arithmetic; no memory here.
+
+
+_ALIGNED = 64
+"""Bytes: each part of a slot begins at a multiple, as the data of an .npy file does; numpy is slow on odd addresses."""
+
+_MOST_SLOTS = 1 << 53
+"""As for every number in a notice."""
+
+
+class Slot(NamedTuple):
+    """One place in the shared memory of a publisher.
+
+    Attributes:
+        host: Which processes can reach it: those of one user in one host, or container, that was not restarted since.
+        process: The publisher's process id.
+        descriptor: Its file descriptor of the memory.
+        inode: What it must be of: descriptors and process ids are used again.
+        number: Which slot, from 0.
+        stamp: A random number that the slot has as long as it holds these bytes.
+    """
+
+    host: str
+    process: int
+    descriptor: int
+    inode: int
+    number: int
+    stamp: int
+
+
+def starts(sizes: Iterable[int]) -> list[int]:
+    """Return where parts of these sizes begin in a slot, and where the last one ends."""
+    sizes = list(sizes)
+    begins = list(accumulate((-(-size // _ALIGNED) * _ALIGNED for size in sizes), initial=0))
+    return [*begins[:-1], begins[-2] + sizes[-1]] if sizes else [0]
+
+
+def named(words: Any) -> tuple[Slot, int] | None:
+    """Return the slot that a notice names, and the bytes of the text in it; None if these are no such words."""
+    if type(words) is not list or len(words) != len(Slot._fields) + 1 or type(words[0]) is not str:
+        return None
+    numbers: Sequence[Any] = words[1:]
+    if not all(type(number) is int and 0 <= number < _MOST_SLOTS for number in numbers):
+        return None
+    return Slot(*words[:-1]), words[-1]

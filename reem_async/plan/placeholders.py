@@ -27,7 +27,7 @@ __all__ = [
     "INLINE_LABELS",
     "MARK",
     "Placeholder",
-    "Slot",
+    "PlaceholderSlot",
     "Unfetched",
     "find",
     "inline_float",
@@ -87,7 +87,7 @@ def _written(it: Placeholder) -> str:
 _SAFE = "".join(chr(code) for code in range(33, 127) if chr(code) != "%")
 
 
-class Slot(NamedTuple):
+class PlaceholderSlot(NamedTuple):
     """A placeholder found in a decoded tree, and where: `container[key]` is to be replaced."""
 
     placeholder: Placeholder
@@ -147,7 +147,7 @@ def marked(text: bytes) -> bool:
     return b"$" in text and _MARK_BYTES in text
 
 
-def find(holder: list[Any], name: str) -> list[Slot]:
+def find(holder: list[Any], name: str) -> list[PlaceholderSlot]:
     """Resolve what stands in place inside `holder` and return the placeholders that are left.
 
     `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
@@ -157,7 +157,7 @@ def find(holder: list[Any], name: str) -> list[Slot]:
         BadData: A string has the mark but is no placeholder, or two stand for the same key: a document of a
             few bytes could demand any number of copies. Says where, below the top-level key `name`.
     """
-    slots: list[Slot] = []
+    slots: list[PlaceholderSlot] = []
     stack: list[Any] = [holder]
     while stack:
         container = stack.pop()
@@ -172,7 +172,7 @@ def find(holder: list[Any], name: str) -> list[Slot]:
                 except BadData as error:
                     raise BadData(f"{name}{_place(holder[0], value)}: {error}") from None
                 if type(meaning) is Placeholder:
-                    slots.append(Slot(meaning, container, key))
+                    slots.append(PlaceholderSlot(meaning, container, key))
                 else:
                     container[key] = meaning
     # A set only where there are several: most documents with arrays have one or two.

@@ -17,7 +17,7 @@ from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
-from .placeholders import Placeholder, Slot, Unfetched, find, marked
+from .placeholders import Placeholder, PlaceholderSlot, Unfetched, find, marked
 from .replies import checked, explained, full, loads, missing, type_name
 from .shapes import ShapeCache
 from .sizes import LARGE
@@ -64,14 +64,14 @@ class RawRead(NamedTuple):
 
     holder: list[Any]
     name: str
-    slots: list[tuple[Slot, Registered, Reply]]
+    slots: list[tuple[PlaceholderSlot, Registered, Reply]]
     commands: tuple[Command, ...]
     raw: tuple[Any, ...]
     also: tuple[Any, ...] = ()
     left: Mapping[tuple[str, str], Unfetched] = {}
 
 
-def interpret(name: str, slot: Slot, ship: Registered, reply: Reply) -> Any:
+def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
     """Return what the ship makes of a reply: the value, or something to await.
 
     Raises:

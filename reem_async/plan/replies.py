@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import orjson
@@ -27,15 +27,27 @@ from ..errors import (
     WrongKind,
     turned_down,
 )
-from . import Plan, Reply, unwrap
+from . import Command, Plan, Reply, unwrap
 from .documents import nested_over
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
 
 __all__ = [
-    "checked", "decoded", "diagnose", "explained", "full", "loads", "missing", "no_json", "refusal",
-    "registered", "settable", "type_name",
-]  # fmt: skip
+    "checked",
+    "decoded",
+    "diagnose",
+    "explained",
+    "from_front",
+    "full",
+    "lengths",
+    "loads",
+    "missing",
+    "no_json",
+    "refusal",
+    "registered",
+    "settable",
+    "type_name",
+]
 
 _REFUSALS: dict[str, tuple[type[Refused], str]] = {
     "NOAUTH": (LoginRefused, "the server needs a password: RedisInterface(..., username=..., password=...)"),
@@ -235,3 +247,41 @@ def missing(keys: Keys, path: Path, reply: Reply = ()) -> MissingKey:
     """
     kind = MissingDocument if reply is None or reply == [None] else MissingKey
     return kind(f"nothing is stored at {show(full(keys, path))}")
+
+
+# Indexes that count from the end: which items they name at the instant of their look.
+
+
+def lengths(keys: Keys, path: Path) -> list[Command]:
+    """Return the commands that `from_front` takes the replies of: how long lists are that are counted from the end."""
+    return [("JSON.ARRLEN", keys.document, to_jsonpath(path[:position])) for position in _from_end(path)]
+
+
+def from_front(replies: Sequence[Reply], keys: Keys, path: Path, absent: type[Exception]) -> Path:
+    """Return `path` with every index counted from the front; raises `absent` if there is no such item."""
+    # Which item -1 names is true for one instant only, so whoever uses the result watches the document, and starts
+    # again if it was changed.
+    front = list(path)
+    for position, reply in zip(_from_end(path), replies, strict=True):
+        index = path[position]
+        count = _count(reply, keys, path, absent)
+        where = show(full(keys, path))
+        if count is None:
+            raise absent(f"{where}: there is no list at {show(full(keys, path[:position]))}")
+        if count + int(index) < 0:
+            raise absent(f"{where}: the index {index} is out of range, the list has {count} items")
+        front[position] = count + int(index)
+    return tuple(front)
+
+
+def _from_end(path: Path) -> Iterator[int]:
+    return (position for position, key in enumerate(path) if isinstance(key, int) and key < 0)
+
+
+def _count(reply: Reply, keys: Keys, path: Path, absent: type[Exception]) -> int | None:
+    """Return the number in a reply to JSON.ARRLEN, None if there is no list."""
+    if isinstance(reply, Exception):
+        error = explained(reply, keys, path)
+        raise absent(str(error)) if isinstance(error, MissingKey) else error
+    count: int | None = reply[0] if reply else None
+    return count

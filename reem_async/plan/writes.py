@@ -13,18 +13,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..errors import Conflict, MissingKey, PathRefused, WrongType
+from ..errors import BadType, Conflict, MissingKey, PathRefused, RedisError, ReemError, WrongType
 from . import Command, Plan, Reply
+from .attachments import Outcome, left_behind, permitted, place_of, survey, unreferred, watch
 from .changes import REFUSED, SILENT, Announcement, Change, EncodedAttachment
-from .indexes import from_front, lengths
 from .keys import Keys
 from .notices import NOTE_KEPT
-from .orphans import left_behind, permitted, place_of, survey, unreferred, watch
-from .outcome import Outcome
 from .paths import Path, counts_from_end, has_index, may_hold, show, to_jsonpath
-from .replies import checked, full, missing, registered, settable, type_name
+from .replies import checked, from_front, full, lengths, missing, registered, settable, type_name
 from .shapes import ShapeCache
-from .staging import Staged, are_missing, looks_at, stage
+from .sizes import Staged, are_missing, looks_at, stage
 
 __all__ = [
     "append_change",
@@ -38,8 +36,8 @@ __all__ = [
     "make_parents",
     "set_change",
     "takes",
+    "together",
 ]
-
 
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 _STORED: list[Reply] = [b"OK", []]
@@ -362,3 +360,58 @@ def expiry(keys: Keys, milliseconds: int | None) -> Plan:
 
     commands = [watch(keys), ("JSON.TYPE", keys.document, to_jsonpath(())), ("SMEMBERS", keys.registry)]
     return Plan(commands, look, held=True)
+
+
+# Several changes in one transaction.
+
+
+def together(changes: Sequence[Change], cache: ShapeCache) -> Plan:
+    """Plan changes of entries of one dict in one transaction, and after it what follows from each.
+
+    They are applied all or not at all: what the server refuses one for, the dict that is not there, goes for each.
+
+    Raises:
+        BadType: An entry is a list item's, with arrays that may have moved: only one at a time can be watched.
+    """
+    # A change that is watched begins with a look, and two looks cannot share one transaction.
+    for each in changes:
+        if is_watched(each, cache):
+            raise BadType(
+                f"{show(full(each.keys, each.path))}: in a list that holds arrays, or counted from its end, keys "
+                "cannot be set together; write them one by one, or use edit()"
+            )
+    plans = [change(each, cache) for each in changes]
+
+    def decode(replies: Sequence[Reply]) -> Any:
+        start, outcomes = 0, []
+        for plan in plans:
+            mine = replies[start : start + len(plan.commands)]
+            start += len(plan.commands)
+            outcomes.append(_decoded(plan, mine))
+        return _each(outcomes)
+
+    return Plan([command for plan in plans for command in plan.commands], decode, atomic=True)
+
+
+def _decoded(plan: Plan, replies: Sequence[Reply]) -> Any:
+    """Return what a part of a transaction comes to: its result, the next plan, or an error."""
+    try:
+        return plan.decode(replies)
+    except (ReemError, RedisError) as error:
+        return error
+
+
+def _each(outcomes: list[Any]) -> Any:
+    """Go on with each outcome that is a plan; raises the first error once all of them have been seen to."""
+    for number, outcome in enumerate(outcomes):
+        # One after the other: each may need the connection for itself, and the next starts from what this one left.
+        if isinstance(outcome, Plan):
+
+            def decode(replies: Sequence[Reply] | None, number: int = number, plan: Plan = outcome) -> Any:
+                return _each([*outcomes[:number], _decoded(plan, replies), *outcomes[number + 1 :]])  # type: ignore[arg-type]
+
+            return outcome._replace(decode=decode)
+    for outcome in outcomes:
+        if isinstance(outcome, Exception):
+            raise outcome
+    return None

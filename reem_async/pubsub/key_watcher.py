@@ -18,9 +18,8 @@ from typing import Any, Protocol
 
 from ..concurrency.tasks import Tasks
 from ..errors import InterfaceClosed, RedisError
-from ..plan.keys import keys_of
+from ..plan.keys import DOCUMENT, keys_of
 from ..plan.notices import Notice
-from ..plan.scan import DOCUMENT
 from ..session import QUIET
 from ..transport import Transport
 from ..transport.scan import scanned

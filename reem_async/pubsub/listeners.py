@@ -16,8 +16,7 @@ from ..errors import BadData
 from ..local.path import LocalPath
 from ..plan import Reply
 from ..plan.notices import ANNOUNCED, Notice, decode
-from ..plan.paths import shorten
-from ..plan.patterns import names_key
+from ..plan.paths import names_key, shorten
 from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.wire import Wire

@@ -14,8 +14,7 @@ from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed
 from ..plan.arguments import check_number
 from ..plan.notices import ANNOUNCED, Notice
-from ..plan.paths import Path, is_namespace, show
-from ..plan.patterns import Pattern, channel_pattern, fits, name_of, parse_patterns
+from ..plan.paths import Path, Pattern, channel_pattern, fits, is_namespace, name_of, parse_patterns, show
 from ..transport.wire import Wire
 from .gaps import Numbers
 from .listeners import Beginning, ForwardingListener, contained

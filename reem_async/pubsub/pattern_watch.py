@@ -16,8 +16,7 @@ from ..concurrency.queues import BoundedQueue, Last, Policy, chosen
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan.notices import Notice
-from ..plan.paths import Path, parse_shown, show
-from ..plan.patterns import Pattern, channel_pattern, name_of, parse_pattern, spelled_out
+from ..plan.paths import Path, Pattern, channel_pattern, name_of, parse_pattern, parse_shown, show, spelled_out
 from ..session import Session
 from .follower import Follower, checked_largest
 from .listeners import ForwardingListener, Listener

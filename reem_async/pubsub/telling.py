@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from enum import Enum, auto
 from typing import Any
 
-from ..plan.copies import applied, concerns, is_whole
-from ..plan.differences import difference
+from ..plan.copies import applied, concerns, is_own, is_whole
 from ..plan.notices import ANNOUNCED, Notice
-from ..plan.overtaken import is_own
 from ..plan.paths import Path
-from ..plan.trees import MISSING, CannotApply, get, replaced
+from ..plan.trees import MISSING, CannotApply, difference, get, replaced
 from .division import Heard
 from .outputs import Output, Skipped, Snapshot, Stored, Updated
 
@@ -105,7 +103,7 @@ class Teller:
     def _updates(self, before: Any, covered: Sequence[Heard[Notice]], tree: Any) -> None:
         """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
 
-        `plan/overtaken.py` says which. What came with its value has that, whatever came later. What was lost may
+        `plan/copies.py` says which. What came with its value has that, whatever came later. What was lost may
         have changed any of those announced before. Each is told with the copy that it led to, as long as that is known;
         from the first one on of which it is not, with the snapshot: no copy is told after a newer one.
         """

@@ -10,12 +10,10 @@ from typing import Any
 from ..connection import RedisInterface
 from ..errors import MissingKey
 from ..plan import Plan, Reply
-from ..plan.indexes import from_front, lengths
-from ..plan.paths import Path, parse, shorten, show
-from ..plan.patterns import parse_pattern
+from ..plan.paths import Path, parse, parse_pattern, shorten, show
 from ..plan.placeholders import Placeholder, find, marked
 from ..plan.reads import get_command, present
-from ..plan.replies import loads
+from ..plan.replies import from_front, lengths, loads
 from ..session import Session
 
 __all__ = ["Outline", "names", "outline", "outline_at"]

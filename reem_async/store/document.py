@@ -16,7 +16,6 @@ from ..plan.documents import number_text
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
 from ..plan.reads import RawRead, nothing
 from ..plan.sizes import has_large
-from ..plan.together import together
 from ..plan.writes import (
     append_change,
     appendable,
@@ -27,6 +26,7 @@ from ..plan.writes import (
     into_new,
     set_change,
     takes,
+    together,
 )
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail

@@ -14,9 +14,8 @@ from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys
-from ..plan.notices import announce, in_slot, published, sizes_of_parts, told_at, with_value
+from ..plan.notices import Slot, announce, in_slot, published, sizes_of_parts, told_at, with_value
 from ..plan.paths import Path, counts_from_end, show
-from ..plan.slots import Slot
 from ..session import Session
 from .accessor import _NOTHING, Accessor
 from .document import Attachments, DocumentWriter, Turn

@@ -7,7 +7,7 @@ little later, within the call's time limit. A connection that breaks after sendi
 One transaction is guarded besides: one that publishes. Servers look at a transaction's keys before
 they run it, but not if it holds a PUBLISH of any kind: while a slot is moving they would then write
 to a key that has left already. So its keys are watched first, which takes one more round trip, and
-another where there is something large, which is sent before: see `plan.staging`.
+another where there is something large, which is sent before: see `plan.sizes`.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ..errors import ConnectionLost, NotConnected
 from ..plan import Command, Reply
-from ..plan.staging import are_missing, as_given, is_large, looks_at, stage
+from ..plan.sizes import are_missing, as_given, is_large, looks_at, stage
 from . import Held, Transport
 from .redirects import Ask, Moved, keys_in, refusal
 from .route import Route, asked_of, watched

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from typing import Any
 
-from ..plan.scan import count, first_page, page
+from ..plan.keys import count, first_page, page
 from . import Transport, drive
 
 __all__ = ["counted", "scanned"]

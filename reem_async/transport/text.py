@@ -19,7 +19,7 @@ from ..plain.batches import Known, Steps, Watched, concerns, has_json
 from ..plain.changes import after_look
 from ..plain.translation import directly, finished, looked_at, shortcut, translated
 from ..plan import Command, Reply
-from ..plan.staging import KEPT, as_given, is_large, stage
+from ..plan.sizes import KEPT, as_given, is_large, stage
 from . import Held
 from .contention import Contention
 from .parsing import error_of

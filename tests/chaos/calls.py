@@ -15,7 +15,7 @@ from slotkit import shared_in
 import reem
 import reem_async
 from reem_async.concurrency.queues import Last
-from reem_async.plan.staging import KEPT, STAGED
+from reem_async.plan.sizes import KEPT, STAGED
 
 from .proxy import Proxy
 from .scoreboard import Run, row, tell

@@ -19,7 +19,7 @@ import test_local_memory as memory
 import reem
 from reem_async.local.host import host, reason_against
 from reem_async.local.segment import HEAD, SLOTS, Segment
-from reem_async.plan.slots import Slot
+from reem_async.plan.notices import Slot
 
 from .frame_programs import SIZE, shot
 from .scoreboard import NotBuilt, Run, row

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reem_async.plan.differences import same
 from reem_async.plan.paths import below, show
-from reem_async.plan.trees import MISSING, get
+from reem_async.plan.trees import MISSING, get, same
 from reem_async.recording import Log, LogUpdate
 
 from .streams import STREAMS, Op, after

@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 from reem_async import KeyValueStore, RedisInterface
 from reem_async.errors import MissingKey
-from reem_async.plan.differences import same
-from reem_async.plan.trees import MISSING
+from reem_async.plan.trees import MISSING, same
 from reem_async.recording import Replayer, open_log
 from reem_async.server import EmbeddedServer
 

@@ -28,7 +28,7 @@ from reem_async.tools.cli.wording import for_users
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
-    from reem_async.plan.patterns import Pattern
+    from reem_async.plan.paths import Pattern
     from reem_async.pubsub.monitor import Event
 
 __all__ = ["echo"]
@@ -65,7 +65,7 @@ def echo(
 
     async def work(interface: RedisInterface) -> int:
         from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, WrongKind
-        from reem_async.plan.patterns import parse_pattern
+        from reem_async.plan.paths import parse_pattern
         from reem_async.pubsub.monitor import ANNOUNCED
         from reem_async.store.reader import DocumentReader
 
@@ -103,7 +103,7 @@ def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
     """Return what an update of a whole dict says of the one place in it that was asked for."""
     import dataclasses
 
-    from reem_async.plan.patterns import spelled_out
+    from reem_async.plan.paths import spelled_out
     from reem_async.plan.trees import MISSING, get
     from reem_async.pubsub.monitor import ANNOUNCED
 

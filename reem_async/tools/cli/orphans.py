@@ -10,9 +10,9 @@ import re
 from typing import NamedTuple
 
 from reem_async.errors import BadKey, RedisError, ReemError
-from reem_async.plan.orphans import orphans, remove_orphans
+from reem_async.plan.attachments import orphans, remove_orphans
 from reem_async.plan.paths import check_top_key, parse_suffix
-from reem_async.plan.staging import STAGED
+from reem_async.plan.sizes import STAGED
 from reem_async.session import Session
 from reem_async.transport.scan import scanned
 

@@ -24,8 +24,7 @@ async def found(interface: RedisInterface, pattern: str) -> AsyncIterator[Outlin
     Raises:
         MissingKey: The pattern is a path, and nothing is there.
     """
-    from reem_async.plan.paths import check_top_key, parse
-    from reem_async.plan.patterns import parse_pattern
+    from reem_async.plan.paths import check_top_key, parse, parse_pattern
     from reem_async.store.catalog import names, outline
 
     # A plain path is asked for directly, and that nothing is there is an error; a pattern that finds nothing is none.

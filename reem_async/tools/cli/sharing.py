@@ -23,7 +23,7 @@ _FIRST_NAMESPACE = 0xEFFFFFFC
 _LOOK = """
 import sys
 from reem_async.local.reader import LocalReader
-from reem_async.plan.slots import Slot
+from reem_async.plan.notices import Slot
 view = LocalReader().view(Slot("", *map(int, sys.argv[1:])), 1)
 sys.exit(0 if view is not None and bytes(view) == b"R" else 3)
 """

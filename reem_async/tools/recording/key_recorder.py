@@ -14,8 +14,7 @@ from typing import Any, Protocol
 
 from ...concurrency.tasks import started
 from ...errors import BadData, Conflict, RedisError, WrongKind
-from ...plan.paths import Path, show
-from ...plan.patterns import Pattern
+from ...plan.paths import Path, Pattern, show
 from ...plan.trees import MISSING
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import RefreshTimer

@@ -13,8 +13,7 @@ from typing import Any, Self
 import numpy as np
 
 from ...errors import MissingKey
-from ...plan.paths import Path, parse, show
-from ...plan.patterns import parse_pattern
+from ...plan.paths import Path, parse, parse_pattern, show
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
 from ...ships.numpy import NumpyShip

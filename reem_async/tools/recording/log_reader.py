@@ -13,10 +13,8 @@ import orjson
 from mcap.records import Channel, Metadata
 
 from ...errors import BadData
-from ...plan.differences import same
-from ...plan.paths import Path, below
-from ...plan.patterns import Pattern
-from ...plan.trees import MISSING, get
+from ...plan.paths import Path, Pattern, below
+from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .container import Container, Progress

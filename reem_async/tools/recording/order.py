@@ -1,6 +1,6 @@
 """The news of one top-level key that waits to be written, in order, and what a read tells of it. Pure.
 
-`plan/overtaken.py` draws how a note tells which updates are in what was read. Here that becomes a queue of which
+`plan/copies.py` draws how a note tells which updates are in what was read. Here that becomes a queue of which
 each announced update up to the line has its value or is skipped; nothing is moved before what came before it.
 """
 
@@ -10,8 +10,8 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from ...plan.copies import is_own, rest_of
 from ...plan.notices import ANNOUNCED
-from ...plan.overtaken import is_own, rest_of
 from ...plan.paths import Path, below, has_index
 from ...plan.trees import MISSING, get
 from .roles import Role

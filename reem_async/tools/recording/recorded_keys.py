@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 
 from ...connection import RedisInterface
-from ...plan.patterns import Pattern
+from ...plan.paths import Pattern
 from ...store.catalog import names
 from .key_recorder import Collector, KeyRecorder
 

@@ -17,8 +17,7 @@ from ...concurrency.streams import arrived
 from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
-from ...plan.paths import Path
-from ...plan.patterns import parse_patterns
+from ...plan.paths import Path, parse_patterns
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from .description import description

@@ -10,8 +10,7 @@ from typing import Any
 
 from ...connection import RedisInterface
 from ...errors import BadKey, BadValue, MissingKey, PathRefused
-from ...plan.paths import Path, check_top_key, has_index, parse
-from ...plan.patterns import Pattern, parse_pattern
+from ...plan.paths import Path, Pattern, check_top_key, has_index, parse, parse_pattern
 from ...plan.trees import MISSING
 from ...plan.writes import make_parents
 from ...store.publish import PublishSpace

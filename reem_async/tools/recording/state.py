@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from ...plan.differences import difference, is_addressable, same
-from ...plan.paths import Path
-from ...plan.patterns import Pattern
-from ...plan.trees import MISSING, CannotApply, get, removed, replaced
+from ...plan.paths import Path, Pattern
+from ...plan.trees import MISSING, CannotApply, difference, get, is_addressable, removed, replaced, same
 from .roles import Kind, Role
 from .stored import Stored
 

@@ -17,10 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...concurrency.scheduling import give_way
-from ...plan.differences import same
-from ...plan.paths import Path, show
-from ...plan.patterns import Pattern
-from ...plan.trees import MISSING, CannotApply, get, replaced
+from ...plan.paths import Path, Pattern, show
+from ...plan.trees import MISSING, CannotApply, get, replaced, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent

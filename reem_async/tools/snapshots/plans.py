@@ -8,12 +8,11 @@ from typing import Any
 
 from ...errors import BadData, Conflict, NotAllowed, PartialWrite, Refused, WrongKind
 from ...plan import Command, Plan, Reply
-from ...plan.keys import Keys
-from ...plan.orphans import permitted
+from ...plan.attachments import permitted
+from ...plan.keys import DOCUMENT, Keys
 from ...plan.placeholders import find, marked
 from ...plan.reads import get_command
 from ...plan.replies import checked, loads
-from ...plan.scan import DOCUMENT
 from ...plan.shapes import ShapeCache
 from .values import Entry, Value, kind_of, settable
 

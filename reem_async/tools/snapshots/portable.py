@@ -16,10 +16,9 @@ from ... import __version__
 from ...connection import RedisInterface
 from ...errors import BadData, Conflict, MissingKey, NotAllowed, PartialWrite, RedisError, ReemError, WrongKind
 from ...plan import Command, Plan
-from ...plan.keys import Keys
+from ...plan.keys import DOCUMENT, Keys
 from ...plan.notices import announce, published
 from ...plan.paths import shorten
-from ...plan.scan import DOCUMENT
 from ...session import Session
 from .archive import Archive, ArchiveWriter, header, verify
 from .files import Snapshot, check_target, sniff

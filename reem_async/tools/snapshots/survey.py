@@ -7,10 +7,9 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from ...errors import BadKey
-from ...plan.paths import check_top_key
-from ...plan.patterns import Pattern
-from ...plan.scan import DOCUMENT
-from ...plan.staging import STAGED
+from ...plan.keys import DOCUMENT
+from ...plan.paths import Pattern, check_top_key
+from ...plan.sizes import STAGED
 from ...session import Session
 from ...transport.scan import counted, scanned
 from .plans import NOT_ALLOWED, shown, strangers, types
