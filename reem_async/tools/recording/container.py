@@ -46,7 +46,7 @@ __all__ = ["Container", "Message", "Progress"]
 _CACHED_BYTES = 96 << 20
 _CACHED_ENTRIES = 4 << 20
 """Messages of which the places are kept, 16 bytes for each."""
-_LARGEST_CHUNK = 1 << 31
+_SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
 """Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
@@ -127,49 +127,43 @@ class _Scan:
 
     Attributes:
         contents: What was found.
+        messages: How many messages there are.
         damaged: How many records are damaged or cut off.
-        is_whole: The data section ends where it should.
     """
 
     def __init__(self, source: Source) -> None:
         self.contents = Contents()
+        self.messages = 0
         self.damaged = 0
-        self.is_whole = False
         self._source = source
         self._size = source.size
 
     def run(self, footer: Footer | None, progress: Progress | None) -> None:
         """Read the file."""
-        position, source = len(MAGIC), self._source
-        bare = position  # since where there have been messages outside of chunks
+        position = bare = len(MAGIC)  # since where there have been messages outside of chunks
         while position + HEAD.size <= self._size:
-            opcode, length = HEAD.unpack(source.peek(position, HEAD.size))
+            opcode, length = HEAD.unpack(self._source.peek(position, HEAD.size))
             end = position + HEAD.size + length
             # What follows a damaged head could be anything.
-            if opcode == 0 or end > self._size:
+            if opcode == 0 or end > self._size or (opcode == Opcode.CHUNK and length < _SMALLEST_CHUNK):
                 break
-            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE) or position - bare >= _BARE_BYTES:
+            is_bare = opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+            if not is_bare or position - bare >= _BARE_BYTES:
                 self._take_bare(bare, position)
                 bare = position
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                self.is_whole = footer is None or end == footer.data_end or opcode == Opcode.FOOTER
-                self.damaged += not self.is_whole
-                break
+                # Behind an end in the middle of the data there would be more.
+                self.damaged += opcode == Opcode.DATA_END and footer is not None and end != footer.data_end
+                return
             if opcode == Opcode.CHUNK:
                 end = self._take_chunk(position, end)
             elif opcode == Opcode.METADATA:
                 self._take_metadata(position + HEAD.size, end)
-            position = end
-            if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-                bare = position
+            position, bare = end, bare if is_bare else end
             if progress is not None:
                 progress(position, self._size)
-        else:
-            opcode = 0
-        if opcode not in (Opcode.DATA_END, Opcode.FOOTER):
-            self._take_bare(bare, position)
-            self.damaged += position < self._size
-        self.damaged += self.contents.unknown()
+        self._take_bare(bare, position)
+        self.damaged += position < self._size
 
     def _take_bare(self, start: int, end: int) -> None:
         """Take messages that are outside of chunks as one chunk."""
@@ -185,8 +179,11 @@ class _Scan:
             self.damaged += 1
         elif len(found.times):
             first, last = found.span()
-            chunk = replace(info, start=first, end=last, index_length=0, channels=found.channels)
-            self.contents.chunks.append(chunk)
+            self._add(replace(info, start=first, end=last, index_length=0), found)
+
+    def _add(self, info: ChunkInfo, index: Index) -> None:
+        self.contents.chunks.append(replace(info, channels=index.channels))
+        self.messages += len(index.times)
 
     def _take_chunk(self, position: int, end: int) -> int:
         """Take a chunk with the index behind it; return where that ends."""
@@ -204,7 +201,7 @@ class _Scan:
         found = parse_index(text, record_starts(text), start, last) if is_whole else None
         known = found is not None and found.span() == (start, last)
         if found is not None and known and self.contents.channels.keys() >= set(found.channels.tolist()):
-            self.contents.chunks.append(replace(info, channels=found.channels))
+            self._add(info, found)
         else:  # it brings new channels, or has no index
             self._take_content(info)
         return index
@@ -276,7 +273,8 @@ class Container:
             return contents
         scan = _Scan(self._source)
         scan.run(footer, progress)
-        self.damaged += scan.damaged
+        self.damaged += scan.damaged + scan.contents.unknown()
+        self.damaged += not self.damaged and self._messages not in (None, scan.messages)
         return scan.contents
 
     def close(self) -> None:
