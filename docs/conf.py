@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from pathlib import Path
+
+from sphinx.application import Sphinx
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
@@ -24,7 +27,7 @@ myst_heading_anchors = 4
 suppress_warnings = ["myst.header"]  # the reports of past runs begin where they begin
 default_role = "code"
 nitpicky = False
-exclude_patterns = ["**/README.md"]
+exclude_patterns = ["skills"]
 add_module_names = False
 
 html_theme = "furo"
@@ -40,7 +43,7 @@ html_theme_options = {
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(((?:\.\./)+[^)\s]+)\)")
 
 
-def _name_files(app: object, name: str, source: list[str]) -> None:
+def _name_files(app: Sphinx, name: str, source: list[str]) -> None:
     """Links to files of the repository that are no pages become the name of the file."""
     folder = (HERE / name).parent
 
@@ -54,7 +57,16 @@ def _name_files(app: object, name: str, source: list[str]) -> None:
     source[0] = _LINK.sub(shown, source[0])
 
 
-def setup(app: object) -> None:
+def _copy_for_agents(app: Sphinx, error: Exception | None) -> None:
+    """Put llms.txt and the skill at the top of the site; their links lead to the sources of the pages."""
+    shutil.copytree(HERE / "skills", app.outdir / "skills", dirs_exist_ok=True)
+    text = (HERE / "llms.txt").read_text(encoding="utf-8")
+    text = re.sub(r"\]\((?!skills)([\w/-]+\.md)\)", r"](_sources/\1.txt)", text)
+    (app.outdir / "llms.txt").write_text(text, encoding="utf-8")
+
+
+def setup(app: Sphinx) -> None:
     """Write the generated pages, then let Sphinx read them."""
     generate.write_all()
-    app.connect("source-read", _name_files)  # type: ignore[attr-defined]
+    app.connect("source-read", _name_files)
+    app.connect("build-finished", _copy_for_agents)

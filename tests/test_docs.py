@@ -40,6 +40,7 @@ PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     ROOT / "CHANGELOG.md",
+    DOCS / "llms.txt",
     *(path for path in sorted(DOCS.rglob("*.md")) if "generated" not in path.parts),
 ]
 RUN = {"python", "console", "sh"}
@@ -242,6 +243,7 @@ def test_every_page_is_in_the_table_of_contents():
     listed = set(re.findall(r"^[\w/-]+$", (DOCS / "index.md").read_text(encoding="utf-8"), re.MULTILINE))
     assert {str(path.relative_to(DOCS).with_suffix("")) for path in PAGES if DOCS in path.parents} - listed <= {
         "index",
+        "llms",
         "skills/reem/SKILL",
     }
 
