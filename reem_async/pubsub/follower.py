@@ -95,7 +95,8 @@ class Follower:
         self._asked = 0.0  # when a read was sent last
         self._valid_at = -math.inf  # the server had what is in the copy then, or later
         self._probe_due = 0.0
-        self._was_gone = True  # what the last probe of the document has shown
+        self._may_be_gone = True  # the last read, or the probe after it, may have found no document at all
+        self._reads_for_probe = False  # the next read is to see what a probe has shown
         self._probe_refusal: Exception | None = None
         self.born: list[Notice] | None = None
         self.failure: Exception | None = None
@@ -177,9 +178,10 @@ class Follower:
             return
         gone, has_value = kind == b"none", self._replica.tree is not MISSING
         # No server reports SWAPDB, and none reports an expiry before something accesses the key.
-        unreported = has_value if gone else self._was_gone and not has_value
-        self._was_gone = gone
+        unreported = has_value if gone else self._may_be_gone and not has_value
+        self._may_be_gone = gone
         if unreported:
+            self._reads_for_probe = True
             self.changed(None)
         else:
             self._valid_at = max(self._valid_at, sent)
@@ -302,6 +304,8 @@ class Follower:
         if wire is None:
             return
         self._asked = self._loop.time()
+        self._may_be_gone |= not self._reads_for_probe
+        self._reads_for_probe = False
         if command.plan.bulk:
             self._tasks.start(self._read_large(command), f"reem fetch {self.keys.name}")
         else:
