@@ -33,6 +33,7 @@ API = {
             "reem:Newest",
             "reem:Last",
             "reem:Every",
+            "reem:Unreadable",
             "reem_async.monitor:Monitor",
         ),
     ),

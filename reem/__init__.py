@@ -14,6 +14,7 @@ from reem_async import StateChange, timeout
 from reem_async import __version__ as __version__
 from reem_async._installation import CURE, original_reem
 from reem_async.concurrency.queues import Every, Last, Newest
+from reem_async.plan.unreadable import Unreadable
 from reem_async.pubsub.updates import Origin, Update
 
 from .accessor import Accessor
@@ -59,6 +60,7 @@ __all__ = [
     "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite", "PathRefused", "PublishSpace", "Publisher",
     "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "ServerFailed", "ServerFull",
     "ServerMissing", "ServerNotReady", "ServerReadOnly", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
-    "StateChange", "TlsRefused", "TooDeep", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
+    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "WrongType",
     "timeout",
 ]  # fmt: skip

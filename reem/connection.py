@@ -274,7 +274,7 @@ class RedisInterface:
 
     @property
     def unreadable(self) -> int:
-        """How many messages on the channels that are followed could not be read, and were left out."""
+        """How many messages on the channels that are followed, and values in what is followed, could not be read."""
         return self._direct.unreadable
 
     @property

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .concurrency.timeouts import timeout
     from .connection import RedisInterface
     from .errors import *
+    from .plan.unreadable import Unreadable
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
     from .pubsub.updates import Origin, Update
     from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
@@ -34,7 +35,8 @@ __all__ = [
     "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite", "PathRefused", "PublishSpace", "Publisher",
     "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "ServerFailed", "ServerFull",
     "ServerMissing", "ServerNotReady", "ServerReadOnly", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
-    "StateChange", "TlsRefused", "TooDeep", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
+    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "WrongType",
     "timeout",
 ]  # fmt: skip
 
@@ -55,6 +57,7 @@ _HOMES = {
     "SilentSubscriber": ".pubsub.subscribers",
     "SpecialDatatypeShip": ".ships",
     "StateChange": ".transport.state",
+    "Unreadable": ".plan.unreadable",
     "Update": ".pubsub.updates",
     "Writer": ".store",
     "timeout": ".concurrency.timeouts",

@@ -160,9 +160,10 @@ class RedisInterface:
 
     @property
     def unreadable(self) -> int:
-        """How many messages on the channels that are followed could not be read, and were left out.
+        """How many messages on the channels that are followed, and values in what is followed, could not be read.
 
-        Anybody who may publish can send what is no update of REEM, and a later version may send what this one does
+        A value that cannot be read, such as an array that was evicted, has an `Unreadable` in its place and is logged
+        once. Any client may publish what is no update of REEM, and a later version may send what this one does
         not know. Such a message costs itself alone: what follows its key is read anew, with `gap`, and the
         first of each channel is logged.
         """

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from reem_async.tools.cli.bar import progress_bar
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note
 from reem_async.tools.cli.running import FAILED, prepared, run
 from reem_async.tools.cli.wording import in_words
@@ -21,15 +21,7 @@ __all__ = ["migrate"]
 
 def migrate(
     yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only what would be done is shown.")] = False,
-    ships: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--ship",
-            metavar="MODULE:CLASS",
-            show_default=False,
-            help="A ship of your own that stored values; may be given several times. It is imported.",
-        ),
-    ] = None,
+    ships: Ships = None,
     match: Annotated[
         str,
         typer.Option(
@@ -53,7 +45,7 @@ def migrate(
         reem migrate --yes
         reem migrate --yes --ship my_ships:PoseShip --url redis://robot.local:6379
     """
-    given = prepared("migrate", lambda: _ships(ships or []))
+    given = prepared("migrate", lambda: named_ships(ships))
 
     async def work(interface: RedisInterface) -> int:
         from reem_async.legacy.convert import migrate as convert
@@ -66,14 +58,6 @@ def migrate(
         return FAILED if done.problems else 0
 
     run("migrate", work, url, namespace, ships=given)
-
-
-def _ships(names: list[str]) -> list[Any]:
-    from reem_async.ships.registry import default_ships
-    from reem_async.tools.cli.naming import ship_named
-
-    # The user's own ships first, as in a program: they may take what the default ones would.
-    return [*map(ship_named, names), *default_ships()]
 
 
 def _show(done: Migration, as_json: bool) -> None:

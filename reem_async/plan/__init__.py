@@ -36,6 +36,8 @@ class Plan(NamedTuple):
         atomic: Send the commands as one MULTI/EXEC.
         held: Keep the connection to this plan and its successors (WATCH lives on a connection).
         bulk: Many bytes are expected back: use a connection where nobody waits behind them.
+        without_refused: The user may not do some of the commands, so nothing of the transaction was done: takes a reply
+            per command, and returns the plan for the rest; None if there is none.
         unfinished: What came before was applied: makes the error to raise, from the one that says why the rest was not.
     """
 
@@ -45,6 +47,7 @@ class Plan(NamedTuple):
     held: bool = False
     bulk: bool = False
     unfinished: Callable[[Exception], Exception] | None = None
+    without_refused: Callable[[Sequence[Any]], Plan | None] | None = None
 
 
 def wire_commands(plan: Plan) -> Sequence[Command]:

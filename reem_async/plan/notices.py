@@ -22,6 +22,7 @@ from .documents import nested_over
 from .keys import Keys
 from .paths import Path, check_element
 from .placeholders import find, marked
+from .unreadable import Unreadable
 
 __all__ = [
     "LARGEST_INLINE",
@@ -290,6 +291,9 @@ def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deep
     """
     replies: dict[tuple[str, str], Any] = {}
     for (label, suffix, _), blob in zip(parts, blobs, strict=True):
+        if not ships.has(label):
+            replies[label, suffix] = Unreadable(suffix.partition("~")[0], str(ships.lacks(label, "it")))
+            continue
         ship = ships.labelled(label, "an update").blob
         if ship is None:
             return ANNOUNCED

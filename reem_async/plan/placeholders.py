@@ -14,6 +14,7 @@ user's string that begins with the mark, `float` for a float no decimal text of 
 
 from __future__ import annotations
 
+import collections
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,6 +23,7 @@ from urllib.parse import quote, unquote
 
 from ..errors import BadData
 from .paths import Path, shorten, suffix
+from .unreadable import Unreadable
 
 __all__ = [
     "INLINE_LABELS",
@@ -34,6 +36,7 @@ __all__ = [
     "inline_text",
     "marked",
     "parse",
+    "place_of",
 ]  # fmt: skip
 
 MARK = "$ship "
@@ -147,11 +150,13 @@ def marked(text: bytes) -> bool:
     return b"$" in text and _MARK_BYTES in text
 
 
-def find(holder: list[Any], name: str) -> list[PlaceholderSlot]:
+def find(holder: list[Any], name: str, unreadable: list[Unreadable] | None = None) -> list[PlaceholderSlot]:
     """Resolve what stands in place inside `holder` and return the placeholders that are left.
 
     `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
     every node, so callers look for the mark in the text first.
+
+    If there is a list of what is `unreadable`, nothing is raised: an `Unreadable` takes the place, and is added to it.
 
     Raises:
         BadData: A string has the mark but is no placeholder, or two stand for the same key: a document of a
@@ -170,15 +175,32 @@ def find(holder: list[Any], name: str) -> list[PlaceholderSlot]:
                 try:
                     meaning = parse(value)
                 except BadData as error:
-                    raise BadData(f"{name}{_place(holder[0], value)}: {error}") from None
+                    where = f"{name}{_place(holder[0], value)}"
+                    if unreadable is None:
+                        raise BadData(f"{where}: {error}") from None
+                    unreadable.append(Unreadable(where, str(error)))
+                    container[key] = unreadable[-1]
+                    continue
                 if type(meaning) is Placeholder:
                     slots.append(PlaceholderSlot(meaning, container, key))
                 else:
                     container[key] = meaning
     # A set only where there are several: most documents with arrays have one or two.
     if len(slots) > 1 and len({slot.placeholder.suffix for slot in slots}) < len(slots):
-        raise BadData(f"{name}: several placeholders name the same key, which REEM does not write; write it anew")
+        reason = "several placeholders name the same key, which REEM does not write; write it anew"
+        if unreadable is None:
+            raise BadData(f"{name}: {reason}")
+        counts = collections.Counter(slot.placeholder.suffix for slot in slots)
+        for slot in [slot for slot in slots if counts[slot.placeholder.suffix] > 1]:
+            slot.container[slot.key] = Unreadable(place_of(name, slot.placeholder.suffix), reason)
+            unreadable.append(slot.container[slot.key])
+        slots = [slot for slot in slots if counts[slot.placeholder.suffix] == 1]
     return slots
+
+
+def place_of(name: str, suffix: str) -> str:
+    """Return where a value that a ship holds is, as people write it: its key ends in the path, and maybe a number."""
+    return f"{name}{suffix.partition('~')[0]}"
 
 
 def _place(tree: Any, text: str) -> str:

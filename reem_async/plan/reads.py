@@ -8,29 +8,33 @@ read is done again with what they name: a mixture is never returned.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
-from ..errors import BadData, Conflict, MissingDocument, MissingKey, WrongKind, WrongType
+from ..errors import BadData, Conflict, MissingDocument, MissingKey, NotAllowed, WrongKind, WrongType
 from ..legacy.olddata import first_read, look_first
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
-from .placeholders import Placeholder, PlaceholderSlot, Unfetched, find, marked
+from .placeholders import Placeholder, PlaceholderSlot, Unfetched, find, marked, place_of
 from .replies import checked, explained, full, loads, missing, type_name
 from .shapes import ShapeCache
 from .sizes import LARGE
 from .trees import MISSING
+from .unreadable import Unreadable
 
 __all__ = [
     "HeldValues",
     "RawRead",
+    "awaited",
     "count_in",
     "entries_command",
     "exists",
     "first_read",
     "has_key",
+    "interpreted",
     "keys_at",
     "length",
     "look_first",
@@ -60,6 +64,7 @@ class RawRead(NamedTuple):
         raw: what was received for it, to tell later whether anything changed.
         also: The replies to what was asked besides, if it was asked for.
         left: What stands in the tree for attachments that were left at the server, by label and suffix.
+        unreadable: What stands in the tree for values that could not be read; None if that is an error.
     """
 
     holder: list[Any]
@@ -69,6 +74,31 @@ class RawRead(NamedTuple):
     raw: tuple[Any, ...]
     also: tuple[Any, ...] = ()
     left: Mapping[tuple[str, str], Unfetched] = {}
+    unreadable: list[Unreadable] | None = None
+
+    def give_up(self, slot: PlaceholderSlot, error: Exception) -> Unreadable:
+        """Return what stands for a value that cannot be read; raises the error if the read is to have all values."""
+        if self.unreadable is None:
+            raise error
+        it = Unreadable(place_of(self.name, slot.placeholder.suffix), str(error))
+        self.unreadable.append(it)
+        return it
+
+
+def interpreted(raw_read: RawRead, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
+    """Return what the ship makes of a reply: the value, something for `awaited`, or what `RawRead.give_up` says."""
+    try:
+        return interpret(raw_read.name, slot, ship, reply)
+    except BadData as error:
+        return raw_read.give_up(slot, error)
+
+
+async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any]) -> Any:
+    """Return the value that a ship has to be awaited for, or what `RawRead.give_up` says."""
+    try:
+        return await value
+    except Exception as error:
+        return raw_read.give_up(slot, error)
 
 
 def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
@@ -80,9 +110,9 @@ def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) 
     try:
         return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
-        raise BadData(f"{name}{slot.placeholder.suffix.partition('~')[0]}: {error}") from None
+        raise BadData(f"{place_of(name, slot.placeholder.suffix)}: {error}") from None
     except Exception as error:
-        where = f"{name}{slot.placeholder.suffix.partition('~')[0]}"
+        where = place_of(name, slot.placeholder.suffix)
         raise BadData(f"{where}: the ship {ship.label!r} could not make a value of it: {error!r}") from error
 
 
@@ -111,6 +141,8 @@ def read(
     also: tuple[Command, ...] = (),
     held: HeldValues = _NOTHING,
     largest: float = math.inf,
+    *,
+    tolerant: bool = False,
 ) -> Plan:
     """Plan to read the value at `path`; the result is `RawRead`, or MissingKey is raised.
 
@@ -120,6 +152,9 @@ def read(
     Attachments that are `held` are not fetched. Which these are is looked at again as the reply is decoded: what has
     left `held` by then is fetched in another round trip. Attachments of more than `largest` bytes are not fetched:
     an `Unfetched` is in the tree, the same as in `held` if that has one; their keys are only touched.
+
+    A `tolerant` read has an `Unreadable` in the place of each attachment that cannot be read, now or by `interpreted`:
+    it is gone or damaged, its ship is lacking, the user may not read it. Any other read raises BadData or NotAllowed.
     """
     # States of a read: without a guess it asks for the document alone, and is done if there are no placeholders in it.
     # Else `_Fetch` asks for document and arrays in one transaction, until the placeholders are those that were asked
@@ -128,7 +163,7 @@ def read(
     # What a ship wrote that is lacking here is an error if it is there still; that a reply says, not a guess.
     known = tuple([each for each in known if ships.has(each.label) or each.size > largest])
     if known:
-        return _Fetch(keys, path, ships, cache, known, also, held, largest).plan()
+        return _Fetch(keys, path, ships, cache, known, also, held, largest, tolerant=tolerant).plan()
 
     command = get_command(keys, path)
 
@@ -138,11 +173,12 @@ def read(
         if text is None:
             return RawRead([MISSING], keys.name, [], (command,), (None,), tuple(replies[1:]))
         holder = loads(text, keys)
-        slots = find(holder, keys.name) if marked(text) else []
+        unreadable: list[Unreadable] | None = [] if tolerant else None
+        slots = find(holder, keys.name, unreadable) if marked(text) else []
         if not slots:
-            return RawRead(holder, keys.name, [], (command,), (text,), tuple(replies[1:]))
+            return RawRead(holder, keys.name, [], (command,), (text,), tuple(replies[1:]), unreadable=unreadable)
         met = tuple(slot.placeholder for slot in slots)
-        return _Fetch(keys, path, ships, cache, met, also, held, largest).plan()
+        return _Fetch(keys, path, ships, cache, met, also, held, largest, tolerant=tolerant).plan()
 
     return Plan([command, *also], decode, atomic=bool(also))
 
@@ -169,7 +205,7 @@ def present(reply: Reply, keys: Keys, path: Path) -> bytes:
 class _Fetch:
     """Reads document and ships' keys in one transaction, again if the guess was wrong."""
 
-    __slots__ = ("also", "cache", "held", "keys", "largest", "path", "ships", "tries", "wanted")
+    __slots__ = ("also", "cache", "held", "keys", "largest", "path", "refused", "ships", "tolerant", "tries", "wanted")
 
     def __init__(
         self,
@@ -181,7 +217,11 @@ class _Fetch:
         also: tuple[Command, ...] = (),
         held: HeldValues = _NOTHING,
         largest: float = math.inf,
+        *,
+        tolerant: bool,
     ) -> None:
+        self.tolerant = tolerant
+        self.refused: dict[tuple[str, str], Exception] = {}  # what the user may not read
         self.held = held
         self.largest = largest
         self.keys = keys
@@ -194,7 +234,11 @@ class _Fetch:
 
     def plan(self) -> Plan:
         where = show(full(self.keys, self.path))
-        lacking = [each for each in self.wanted if (each.label, each.suffix) not in self.held]
+        lacking = [
+            each
+            for each in self.wanted
+            if (each.label, each.suffix) not in self.held and self._unobtainable(each) is None
+        ]
         fetched = [each for each in lacking if each.size <= self.largest]
         asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in fetched}
         left = {(each.label, each.suffix) for each in lacking if each.size > self.largest}
@@ -210,7 +254,24 @@ class _Fetch:
             lambda replies: self._decode(asked, left, commands, replies),
             atomic=True,
             bulk=bulk,
+            without_refused=partial(self._without_refused, [*asked, *left]) if self.tolerant else None,
         )
+
+    def _unobtainable(self, it: Placeholder) -> Exception | None:
+        """Return why an attachment is not asked for by a tolerant read; None if it is."""
+        if not self.tolerant or it.size > self.largest:  # then no ship is needed
+            return self.refused.get((it.label, it.suffix))
+        if not self.ships.has(it.label):
+            return self.ships.lacks(it.label, "it")
+        return self.refused.get((it.label, it.suffix))
+
+    def _without_refused(self, places: list[tuple[str, str]], replies: Sequence[Reply]) -> Plan | None:
+        """Plan to read what the user may read; None if that is not even the document."""
+        refused = {place: it for place, it in zip(places, replies[1:], strict=False) if isinstance(it, NotAllowed)}
+        if not refused or isinstance(replies[0], Exception):
+            return None
+        self.refused |= refused
+        return self.plan()
 
     def _decode(
         self,
@@ -224,7 +285,8 @@ class _Fetch:
         if text is None:
             return RawRead([MISSING], self.keys.name, [], commands, (None,), tuple(replies[end:]))
         holder = loads(text, self.keys)
-        slots = find(holder, self.keys.name)
+        unreadable: list[Unreadable] | None = [] if self.tolerant else None
+        slots = find(holder, self.keys.name, unreadable)
         met = tuple(slot.placeholder for slot in slots)
         got = dict(zip(asked, replies[1:], strict=False))
         places = [(each.label, each.suffix) for each in met]
@@ -232,32 +294,41 @@ class _Fetch:
         touched = {place for place, each in zip(places, met, strict=True) if each.size > self.largest} & (
             left | got.keys()
         )
+        errors = {place: self._unobtainable(each) for place, each in zip(places, met, strict=True)}
         # A placeholder of which nothing was asked: the document was changed since the last read. What came is thrown
         # away, since arrays of a later instant do not belong to it.
-        if any(place not in got and place not in self.held and place not in touched for place in places):
+        if any(
+            place not in got and place not in self.held and place not in touched and errors[place] is None
+            for place in places
+        ):
             return self._again(met)
         # Only now: a guess that was wrong must not be remembered.
         self.cache.saw_layout(self.keys.document, self.path, met)
-        placed, unfetched = [], {}
+        placed: list[tuple[PlaceholderSlot, Registered, Reply]] = []
+        unfetched: dict[tuple[str, str], Unfetched] = {}
+        raw, also = (text, *replies[1:end]), tuple(replies[end:])
+        raw_read = RawRead(holder, self.keys.name, placed, commands, raw, also, unfetched, unreadable)
         for slot, place in zip(slots, places, strict=True):
-            if place in got and place not in touched:
-                placed.append((slot, asked[place], self._intact(got[place], place[1])))
+            error = errors[place] or self._strange(got.get(place), place[1])
+            if error is not None:
+                slot.container[slot.key] = raw_read.give_up(slot, error)
+            elif place in got and place not in touched:
+                placed.append((slot, asked[place], got[place]))
             elif place in touched:
                 it = slot.placeholder
                 slot.container[slot.key] = unfetched[place] = Unfetched(it.label, it.size, it.summary)
             else:
                 slot.container[slot.key] = self.held[place]
-        raw = (text, *replies[1:end])
-        return RawRead(holder, self.keys.name, placed, commands, raw, tuple(replies[end:]), unfetched)
+        return raw_read
 
-    def _intact(self, reply: Reply, suffix: str) -> Reply:
-        """Return a ship's reply; raise BadData if another type of data is under its key."""
+    def _strange(self, reply: Reply, suffix: str) -> BadData | None:
+        """Return an error if another type of data is under a ship's key, None if it is a reply for the ship."""
         if not isinstance(reply, Exception):
-            return reply
+            return None
         # A stranger has put a list or a hash under the ship's key; any other error is the server's own.
         if isinstance(explained(reply, self.keys, self.path), WrongKind):
-            where = f"{self.keys.name}{suffix.partition('~')[0]}"
-            raise BadData(f"{where}: what is under {self.keys.tag}{suffix} is not what the ship wrote: {reply}")
+            where = place_of(self.keys.name, suffix)
+            return BadData(f"{where}: what is under {self.keys.tag}{suffix} is not what the ship wrote: {reply}")
         raise reply
 
     def _again(self, met: tuple[Placeholder, ...]) -> Plan:

@@ -105,6 +105,11 @@ def decoded(plan: Plan, replies: list[Reply]) -> Any:
     """
     try:
         return plan.decode(unwrap(plan, replies))
+    except NotAllowed:
+        rest = plan.without_refused(replies[1:-1]) if plan.without_refused is not None else None
+        if rest is None:
+            raise
+        return rest
     except (ReemError, RedisError):
         raise
     # Decoders take the shape of replies for granted. What has another shape comes from no Redis server: something else

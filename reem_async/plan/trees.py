@@ -14,6 +14,7 @@ import numpy as np
 
 from ..errors import BadKey
 from .paths import Path, check_element
+from .unreadable import Unreadable
 
 __all__ = ["MISSING", "CannotApply", "copied", "difference", "get", "is_addressable", "removed", "replaced", "same"]
 
@@ -35,13 +36,18 @@ class CannotApply(Exception):
 
 
 def get(tree: Any, path: Path) -> Any:
-    """Return what is at `path`, or MISSING."""
+    """Return what is at `path`, or MISSING; inside of what cannot be read that is all that is known."""
     for key in path:
         if isinstance(key, str):
-            tree = tree.get(key, MISSING) if type(tree) is dict else MISSING
+            tree = tree.get(key, MISSING) if type(tree) is dict else _inside(tree)
         else:
-            tree = tree[key] if type(tree) is list and -len(tree) <= key < len(tree) else MISSING
+            tree = tree[key] if type(tree) is list and -len(tree) <= key < len(tree) else _inside(tree)
     return tree
+
+
+def _inside(tree: Any) -> Any:
+    """Return what is inside of what cannot hold the element of a path."""
+    return tree if type(tree) is Unreadable else MISSING
 
 
 def replaced(tree: Any, path: Path, value: Any) -> Any:
@@ -68,7 +74,10 @@ def removed(tree: Any, path: Path) -> Any:
         return tree
     if not path:
         return MISSING
-    parent = get(tree, path[:-1]).copy()
+    parent = get(tree, path[:-1])
+    if type(parent) is Unreadable:
+        raise CannotApply
+    parent = parent.copy()
     del parent[path[-1]]
     return replaced(tree, path[:-1], parent)
 

@@ -7,6 +7,7 @@ from typing import Any
 from ..plan import Plan
 from ..plan.keys import Keys
 from ..plan.reads import RawRead
+from ..plan.unreadable import Unreadable
 
 __all__ = ["HeldAttachments"]
 
@@ -72,6 +73,7 @@ class HeldAttachments:
             return
         for slot, ship, _ in raw.slots:
             label, suffix = slot.placeholder.label, slot.placeholder.suffix
-            if ship.blob is not None and suffix not in self._stale:
-                self.values[label, suffix] = slot.container[slot.key]
+            value = slot.container[slot.key]
+            if ship.blob is not None and suffix not in self._stale and type(value) is not Unreadable:
+                self.values[label, suffix] = value
         self.values.update({place: it for place, it in raw.left.items() if place[1] not in self._stale})

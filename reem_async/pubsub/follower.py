@@ -16,13 +16,14 @@ from typing import Any
 
 from ..concurrency.queues import BoundedQueue
 from ..concurrency.tasks import is_being_cancelled
-from ..errors import BadData, ClusterNode, Stale, is_of_command
+from ..errors import BadData, ClusterNode, NotAllowed, Stale, is_of_command
 from ..plan import Reply, wire_commands
 from ..plan.arguments import check_number
 from ..plan.keys import Keys
 from ..plan.notices import Notice
 from ..plan.paths import Path, show
-from ..plan.reads import interpret
+from ..plan.placeholders import PlaceholderSlot
+from ..plan.reads import awaited, interpreted
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
@@ -292,6 +293,8 @@ class Follower:
         refusals = [outcome] if isinstance(outcome, Exception) else [it for it in outcome if isinstance(it, Exception)]
         # Of a slot that moves, its new node is asked: what is followed begins anew there.
         refusal = next((it for it in refusals if not is_unapplied(it)), None)
+        if isinstance(refusal, NotAllowed) and not is_of_command(refusal):
+            refusal = None  # the read finds out which of the keys the user may not read
         if self._wire is not None and refusal is not None and is_of_command(refusal):
             self._manager.invalidations.may_not_touch(self._wire, refusal)
             self._replica.untracked(number)
@@ -339,36 +342,37 @@ class Follower:
     def _open(self, command: Open) -> None:
         """Have the ships make values of their replies; those that must be awaited get a task."""
         raw_read, waiting = command.raw_read, []
-        try:
-            for slot, ship, reply in raw_read.slots:
-                value = interpret(raw_read.name, slot, ship, reply)
-                if inspect.isawaitable(value):
-                    waiting.append((slot.container, slot.key, value))
-                else:
-                    slot.container[slot.key] = value
-        except Exception as error:
-            self._replica.failed(command.number, error)
-            return
+        for slot, ship, reply in raw_read.slots:
+            value = interpreted(raw_read, slot, ship, reply)
+            if inspect.isawaitable(value):
+                waiting.append((slot, value))
+            else:
+                slot.container[slot.key] = value
         if waiting:
             self._tasks.start(self._await_ships(command, waiting), f"reem ships {self.keys.name}")
         else:
-            self._replica.opened(command.number, raw_read.holder[0])
+            self._opened(command)
 
-    async def _await_ships(self, command: Open, waiting: list[tuple[Any, Any, Awaitable[Any]]]) -> None:
-        try:
-            for container, key, value in waiting:
-                container[key] = await value
-        except asyncio.CancelledError as error:
-            if is_being_cancelled():
-                raise
-            # Of something that was cancelled, and whose result a ship has asked for.
-            failure = BadData(f"{self.keys.name}: a ship could not make a value of what is there: {error!r}")
-            self._replica.failed(command.number, failure)
-        except Exception as error:
-            self._replica.failed(command.number, error)
-        else:
-            self._replica.opened(command.number, command.raw_read.holder[0])
+    async def _await_ships(self, command: Open, waiting: list[tuple[PlaceholderSlot, Awaitable[Any]]]) -> None:
+        for slot, value in waiting:
+            try:
+                slot.container[slot.key] = await awaited(command.raw_read, slot, value)
+            except asyncio.CancelledError as error:
+                if is_being_cancelled():
+                    raise
+                # Of something that was cancelled, and whose result a ship has asked for.
+                slot.container[slot.key] = command.raw_read.give_up(slot, BadData(f"a ship was cancelled: {error!r}"))
+        self._opened_aside(command)
+
+    @contained
+    def _opened_aside(self, command: Open) -> None:
+        self._opened(command)
         self._perform()
+
+    def _opened(self, command: Open) -> None:
+        """Take the tree that the ships have made."""
+        self._manager.report(command.raw_read.unreadable)
+        self._replica.opened(command.number, command.raw_read.holder[0])
 
     # --- what the replica tells
 

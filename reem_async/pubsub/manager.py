@@ -21,6 +21,7 @@ from ..concurrency.tasks import Tasks
 from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
 from ..local.path import LocalPath
 from ..plan import Reply
+from ..plan.unreadable import Unreadable
 from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport
@@ -39,6 +40,9 @@ logger = logging.getLogger("reem.subscribe")
 
 _LONGEST_PAUSE = 0.5
 """Seconds between tries to connect: with one that hangs before it, still less than two in all."""
+
+_MOST_REPORTED = 1000
+"""Places that cannot be read of which is warned: programs may publish under ever new names."""
 
 
 def manager_of(session: Session) -> SubscriptionManager:
@@ -74,6 +78,7 @@ class SubscriptionManager:
         self.tasks = Tasks()
         self._reconnecting: asyncio.Task[Any] | None = None
         self._key_watcher: KeyWatcher | None = None
+        self._reported: set[str] = set()
         self._pace = 0.0
         self._closed = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
@@ -113,6 +118,14 @@ class SubscriptionManager:
     def unwatch(self, watcher: Listener) -> None:
         """Tell a listener no more. Idempotent."""
         self._inbox.watchers.discard(watcher)
+
+    def report(self, unreadable: Iterable[Unreadable] | None) -> None:
+        """Count places that cannot be read, and warn of them, of each once."""
+        for it in unreadable or ():
+            if it.place not in self._reported and len(self._reported) < _MOST_REPORTED:
+                self._reported.add(it.place)
+                self.transport.states.unreadable += 1
+                logger.warning("%s cannot be read, what is beside it can: %s (said once)", it.place, it.reason)
 
     @property
     def hears_of_changes(self) -> bool:

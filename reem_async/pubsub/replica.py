@@ -51,16 +51,17 @@ import math
 from enum import Enum, auto
 from typing import Any
 
-from ..errors import RedisError, ReemError
+from ..errors import BadData, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan import Plan, Reply
 from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
 from ..plan.notices import ANNOUNCED, Notice
-from ..plan.paths import Path
+from ..plan.paths import Path, show
 from ..plan.reads import look_first, read
 from ..plan.replies import decoded
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, CannotApply, get
+from ..plan.unreadable import Unreadable
 from ..ships.registry import Ships
 from .attachments import HeldAttachments
 from .division import Division, Heard, Phase
@@ -320,7 +321,8 @@ class Replica:
         self._early.read()
         noted = (("GET", self._keys.last),)
         try:
-            plan = read(self._keys, self.path, self._ships, self._cache, noted, self._attachments.values, self._largest)
+            held = self._attachments.values
+            plan = read(self._keys, self.path, self._ships, self._cache, noted, held, self._largest, tolerant=True)
         except ReemError as error:
             self._fail(error)
         else:
@@ -407,6 +409,11 @@ class Replica:
         self._teller.miss(covered)
         self.state = State.UNREAD if isinstance(error, RedisError) else State.BROKEN
         self.outputs.append(Failed(error))
+        if not self._begins and isinstance(error, BadData | WrongKind | NotAllowed):
+            # The copy must not go on saying what was there before.
+            before, self.tree = self.tree, Unreadable(show((self._keys.name, *self.path)), str(error))
+            if self.tree != before:
+                self._teller.lose(self.tree)
         if self._teller.told is not Told.INITIAL:
             self._teller.told = Told.GAP
             for heard in later:  # newer than what could not be read

@@ -100,6 +100,11 @@ class Teller:
             missed, self.missed = self.missed, 0
             self._outputs.append(Snapshot(data, False, missed))
 
+    def lose(self, tree: Any) -> None:
+        """Tell that what is there cannot be read: `tree` stands for it."""
+        missed, self.missed = self.missed, 0
+        self._outputs.append(Snapshot(tree, False, missed))
+
     def _updates(self, before: Any, covered: Sequence[Heard[Notice]], tree: Any) -> None:
         """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
 

@@ -163,11 +163,15 @@ class Ships:
         try:
             return self._by_label[label]
         except KeyError:
-            known = ", ".join(self._by_label) or "none"
-            raise BadData(
-                f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "
-                "pass it in RedisInterface(ships=[...])"
-            ) from None
+            raise self.lacks(label, where) from None
+
+    def lacks(self, label: str, where: str) -> BadData:
+        """Return the error for what a ship wrote that this interface does not have."""
+        known = ", ".join(self._by_label) or "none"
+        return BadData(
+            f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "
+            "pass it in RedisInterface(ships=[...])"
+        )
 
 
 def _only(commands: Sequence[Command], what: Any) -> Command:

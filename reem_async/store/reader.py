@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import BadData, MissingKey, WrongType
 from ..plan import Plan
 from ..plan.paths import Path, check_name, show
-from ..plan.reads import RawRead, exists, first_read, has_key, interpret, keys_at, length, read, type_of
+from ..plan.reads import RawRead, awaited, exists, first_read, has_key, interpreted, keys_at, length, read, type_of
 from ..session import Session
 
 __all__ = ["DocumentReader", "opened"]
@@ -109,8 +109,9 @@ class DocumentReader:
 
 
 async def opened(raw_read: RawRead) -> Any:
-    """Return the value a read brought, everything the ships hold put in its place."""
+    """Return the value a read brought, everything the ships hold put in its place; see `RawRead.give_up`."""
     for slot, ship, reply in raw_read.slots:
-        value = interpret(raw_read.name, slot, ship, reply)
-        slot.container[slot.key] = await value if ship.blob is None and inspect.isawaitable(value) else value
+        value = interpreted(raw_read, slot, ship, reply)
+        waits = ship.blob is None and inspect.isawaitable(value)
+        slot.container[slot.key] = await awaited(raw_read, slot, value) if waits else value
     return raw_read.holder[0]

@@ -68,6 +68,7 @@ class LogSource:
 
     Args:
         path: The file that `reem record` wrote.
+        ships: What makes values of what is not JSON; None for the default ones.
 
     Raises:
         DamagedRecording: It is no recording of REEM.
@@ -77,9 +78,9 @@ class LogSource:
     live = False
     writable = False
 
-    def __init__(self, path: str | FilePath) -> None:
+    def __init__(self, path: str | FilePath, ships: Sequence[Any] | None = None) -> None:
         self.title = FilePath(path).name
-        self.log: Log = open_log(path)
+        self.log: Log = open_log(path, ships)
         self._times = _Times(self.log)
         self._states: OrderedDict[float, dict[str, Any]] = OrderedDict()
         self._turns: anyio.CapacityLimiter | None = None

@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable, Callable, Iterable, Sequence
-from contextlib import suppress
 from itertools import islice, takewhile
 from typing import Any
 
@@ -20,6 +19,7 @@ from ...errors import BadData, RedisError, ReemError
 from ...plan.paths import Path, below
 from ...plan.placeholders import marked
 from ...plan.trees import MISSING
+from ...plan.unreadable import Unreadable
 from ...pubsub.division import Division
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
@@ -233,9 +233,11 @@ class StoredChanges:
             if it is None or not divisions[name].divide(it[1]) or self._fetcher.concerns(name):
                 self._ask(name)
                 continue
-            with suppress(BadData):
-                later = divisions[name].take()[1]
-                self._compare(name, it[0], [each.update for each in later if each.update is not None])
+            later = [each.update for each in divisions[name].take()[1] if each.update is not None]
+            try:
+                self._compare(name, it[0], later)
+            except BadData as error:  # what was there before is not there any more
+                self._history.add((name,), Unreadable(name, str(error)), 0, self._history.clock.now())
             self._unseen.discard(name)
             if it[0] is None:
                 self._let_go(name)

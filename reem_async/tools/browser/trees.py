@@ -13,6 +13,7 @@ from ...errors import BadData
 from ...plan.paths import Path
 from ...plan.placeholders import find, marked
 from ...plan.trees import MISSING, CannotApply, removed, replaced
+from ...plan.unreadable import Unreadable
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
 from .previews import preview_of
@@ -116,20 +117,24 @@ def leaf_of(value: Any) -> Leaf:
         return Leaf("numpy", summary, size)
     if isinstance(value, bytes):
         return Leaf("bytes", "bytes", len(value))
+    if isinstance(value, Unreadable):
+        return Leaf("unreadable", value.reason, 0)
     return Leaf(type(value).__name__, "", 0)
 
 
 def tree_of(text: bytes, name: str) -> Any:
     """Return the tree in a document's text, a `Leaf` in the place of each placeholder.
 
+    In the place of something that looks like a placeholder and is none there is an `Unreadable`.
+
     Raises:
-        BadData: It is no JSON, or holds something that looks like a placeholder and is none.
+        BadData: It is no JSON.
     """
     try:
         holder = [orjson.loads(text)]
     except orjson.JSONDecodeError as error:  # nested too deep, or not from RedisJSON
         raise BadData(f"{name}: what the server sent is not JSON: {error}") from None
-    for slot in find(holder, name) if marked(text) else ():
+    for slot in find(holder, name, []) if marked(text) else ():
         it = slot.placeholder
         slot.container[slot.key] = Leaf(it.label, it.summary, it.size, it.suffix)
     return holder[0]
@@ -198,7 +203,7 @@ def strip(tree: Any) -> Any:
         return {key: strip(item) for key, item in tree.items()}
     if isinstance(tree, list):
         return [strip(item) for item in tree]
-    return tree if isinstance(tree, (Frame, *_SCALARS)) or tree is MISSING else leaf_of(tree)
+    return tree if isinstance(tree, (Frame, Unreadable, *_SCALARS)) or tree is MISSING else leaf_of(tree)
 
 
 def weight(tree: Any) -> int:

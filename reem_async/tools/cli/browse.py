@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Url, existing
+from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
 from reem_async.tools.cli.running import USAGE, Refused, guarded, interface_to
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def browse(
         int, typer.Option(min=8, max=65536, metavar="MB", help="How much memory the past may take, live.")
     ] = 128,
     allow_write: Annotated[bool, typer.Option("--allow-write", help="Let the page change values.")] = False,
+    ships: Ships = None,
     open_: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a web browser.")] = True,
 ) -> None:
     """Show all keys on a page in the web browser, with a slider for the time.
@@ -66,7 +67,8 @@ def browse(
         _check_packages(log)
         if log is not None and allow_write:
             raise Refused("a recording is not changed: leave out --allow-write, or --log", USAGE)
-        asyncio.run(_serve(_source(url, namespace, log, buffer, memory), host, port, allow_write, open_))
+        source = _source(url, namespace, log, buffer, memory, named_ships(ships))
+        asyncio.run(_serve(source, host, port, allow_write, open_))
         return None
 
     code = guarded("browse", work, live=True)
@@ -82,15 +84,15 @@ def _check_packages(log: Path | None) -> None:
         raise Refused(f"needs {', '.join(absent)}: pip install 'reem-async[tools]'")
 
 
-def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int) -> Source:
+def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int, ships: list[Any]) -> Source:
     """Return what to show. Made outside of the event loop, in which it is used."""
     if log is not None:
         from reem_async.tools.browser.logsource import LogSource
 
-        return LogSource(log)
+        return LogSource(log, ships)
     from reem_async.tools.browser import LiveSource
 
-    interface = interface_to(url, namespace)
+    interface = interface_to(url, namespace, ships=ships)
     return LiveSource(interface, buffer, memory * _MEGABYTE)
 
 

@@ -136,7 +136,7 @@ def _missing(log: Log) -> str:
         counts = dict.fromkeys(("dropped", "skipped"), "?")
     gaps = list(log.gaps())
     text = f"{counts.get('dropped')} dropped, {counts.get('skipped')} skipped, {len(gaps)} gaps"
-    words = {"lost": "not recordable", "samples late": "samples late", "samples failed": "samples failed"}
+    words = {"lost": "unreadable or not recordable", "samples late": "samples late", "samples failed": "samples failed"}
     text += "".join([f", {counts[name]} {word}" for name, word in words.items() if counts.get(name, "0") != "0"])
     worst = [
         f"{key.removeprefix('not recorded: ')} {value}" for key, value in counts.items() if key.startswith("not rec")

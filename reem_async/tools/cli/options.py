@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -11,8 +11,8 @@ from reem_async.tools.cli.completion import complete_path
 from reem_async.tools.cli.running import NOTHING, complain
 
 __all__ = [
-    "DEFAULT_URL", "AsJson", "Count", "Force", "Namespace", "PathArgument", "Patterns", "Publish", "Text",
-    "Timeout", "Url", "Value", "WindowLength", "existing",
+    "DEFAULT_URL", "AsJson", "Count", "Force", "Namespace", "PathArgument", "Patterns", "Publish", "Ships", "Text",
+    "Timeout", "Url", "Value", "WindowLength", "existing", "named_ships",
 ]  # fmt: skip
 
 # localhost and not 127.0.0.1: it stands for the server's Unix socket, which is quicker.
@@ -37,6 +37,15 @@ Namespace = Annotated[
     str,
     typer.Option(
         "--namespace", metavar="TEXT", rich_help_panel=_SERVER, help="What goes before every key, such as robot1:"
+    ),
+]
+Ships = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--ship",
+        metavar="MODULE:CLASS",
+        show_default=False,
+        help="A ship of your own that stored values; may be given several times. It is imported.",
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, one object a line, for scripts.")]
@@ -90,3 +99,12 @@ Timeout = Annotated[
 WindowLength = Annotated[
     int, typer.Option("--window", "-w", min=2, max=1_000_000, metavar="N", help="Of how many updates of a path.")
 ]
+
+
+def named_ships(names: list[str] | None) -> list[Any]:
+    """Return the ships of an interface: those named by `--ship`, then the default ones."""
+    from reem_async.ships.registry import default_ships
+    from reem_async.tools.cli.naming import ship_named
+
+    # The user's own ships first, as in a program: they may take what the default ones would.
+    return [*map(ship_named, names or ()), *default_ships()]

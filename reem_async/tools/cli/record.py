@@ -11,7 +11,17 @@ import typer
 
 from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
 from reem_async.errors import BadValue
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Patterns, Url, existing
+from reem_async.tools.cli.options import (
+    DEFAULT_URL,
+    AsJson,
+    Force,
+    Namespace,
+    Patterns,
+    Ships,
+    Url,
+    existing,
+    named_ships,
+)
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
 from reem_async.tools.cli.running import Refused, prepared, run
 
@@ -43,6 +53,7 @@ def record(
     ] = 5.0,
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Force = False,
+    ships: Ships = None,
     background: Annotated[
         bool, typer.Option("--background", help="Take only processor time that nobody else wants.")
     ] = False,
@@ -57,6 +68,9 @@ def record(
     Where the server does not tell of it (a user without the right +client|tracking) it is read at each keyframe.
     With --sample paths are read as often as you like; with it and no pattern, only the samples are recorded.
     Ctrl-C ends the recording and completes the file; if it is killed, all but the last second can be read.
+
+    What cannot be read is marked so in the file and counted; what is beside it is recorded. Values of a ship of your
+    own need that ship: --ship.
 
     Once it has begun it says so: `recording into run.mcap` on standard error, or with --json the first line of JSON.
     What is published from then on is in the file. Ctrl-C before that leaves no file, and exits with 130.
@@ -107,7 +121,7 @@ def record(
                     note(_nothing(wanted, recorder.status.failed))
         return 0
 
-    run("record", work, url, namespace)
+    run("record", work, url, namespace, ships=prepared("record", lambda: named_ships(ships)))
 
 
 def _stand_back() -> None:
@@ -214,7 +228,7 @@ def _fields(status: RecorderStatus) -> dict[str, Any]:
 def _missing(status: RecorderStatus) -> str:
     extra = {
         "gaps": status.gaps,
-        "not recordable": status.lost,
+        "unreadable or not recordable": status.lost,
         "samples late": status.late,
         "samples failed": status.failed,
     }

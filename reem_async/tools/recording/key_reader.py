@@ -11,6 +11,7 @@ from ...plan.keys import Keys
 from ...plan.paths import Path
 from ...plan.reads import HeldValues, RawRead, read
 from ...plan.replies import decoded
+from ...plan.unreadable import Unreadable
 from ...pubsub.attachments import HeldAttachments
 from ...pubsub.division import divided_read
 from ...pubsub.manager import manager_of
@@ -121,7 +122,8 @@ class KeyReader:
 
     def _plan(self, path: Path, held: HeldValues) -> Plan:
         session = self._session
-        return read(self._keys, path, session.ships, session.cache, (("GET", self._keys.last),), held)
+        noted = (("GET", self._keys.last),)
+        return read(self._keys, path, session.ships, session.cache, noted, held, tolerant=True)
 
     async def _touch(self, plan: Plan) -> bool:
         """Have the server tell of the next change of what a plan reads; return whether it will."""
@@ -139,7 +141,9 @@ class KeyReader:
         """Have the ships make values, and keep of which of them nothing else is known."""
         self._attachments.opening(raw_read)
         await opened(raw_read)
+        manager_of(self._session).report(raw_read.unreadable)
         made = [(slot, slot.container[slot.key]) for slot, ship, _ in raw_read.slots if ship.blob is not None]
+        made = [(slot, value) for slot, value in made if type(value) is not Unreadable]
         for slot, _ in made:
             slot.container[slot.key] = Unchanged()
         if keeps:

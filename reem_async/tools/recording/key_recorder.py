@@ -13,9 +13,10 @@ from functools import partial
 from typing import Any, Protocol
 
 from ...concurrency.tasks import started
-from ...errors import BadData, Conflict, RedisError, WrongKind
+from ...errors import BadData, Conflict, NotAllowed, RedisError, WrongKind
 from ...plan.paths import Path, Pattern, show
 from ...plan.trees import MISSING
+from ...plan.unreadable import Unreadable
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import RefreshTimer
 from ...session import Session
@@ -248,11 +249,13 @@ class KeyRecorder:
         """Leave out what cannot be fetched; the key is read anew later: soon, or at a keyframe if it is no value."""
         if self._complaint != str(error):
             logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
-        counts, first, self._complaint = self._collector.writer_thread.counts, not self._complaint, str(error)
+        self._complaint = str(error)
         given_up = self._queue.give_up()
+        is_there = isinstance(error, BadData | WrongKind | NotAllowed)
         if given_up.role == Role.SKIP:
             self._emit(given_up)
-        elif first:
-            counts.lose(head.path)
-        if not isinstance(error, BadData | WrongKind):
+        elif is_there:  # the recording must not go on saying what was there before
+            given_up.value = Unreadable(show(head.path), str(error))
+            self._emit(given_up)
+        if not is_there:
             self._collector.writer_thread.behind.add(self._name)

@@ -15,6 +15,7 @@ import numpy as np
 from ...errors import MissingKey
 from ...plan.paths import Path, parse, parse_pattern, show
 from ...plan.trees import MISSING
+from ...plan.unreadable import Unreadable
 from ...ships.base import SpecialDatatypeShip
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
@@ -24,7 +25,7 @@ from .container import Container
 from .log_reader import Past, Stream
 from .roles import Role
 from .state import pruned
-from .stored import Stored, resolve
+from .stored import LOST, Stored, resolve
 from .timeline import Ref, Totals
 from .times import Instant, nanoseconds, seconds
 
@@ -244,11 +245,18 @@ class Log:
         place = parse(path) if isinstance(path, str) else tuple(path)
         if not place:
             trees = self._trees_at(nanoseconds(instant))
-            return {name: resolve(tree, self._past.value) for name, tree in trees.items()}
+            return {name: resolve(tree, self._recorded) for name, tree in trees.items()}
         found = self._at(place, nanoseconds(instant))
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
-        return resolve(found, self._past.value)
+        return self._past.value(found) if type(found) is Stored else resolve(found, self._recorded)
+
+    def _recorded(self, it: Stored) -> Any:
+        """Return a value, or what stands in a tree for one that could not be recorded; raises DamagedRecording."""
+        if it.label != LOST:
+            return self._past.value(it)
+        self._past.unreadable += 1
+        return Unreadable(it.shown, it.summary)
 
     def readable_at(self, name: str, instant: Instant, patterns: Sequence[str] = ("*",)) -> Any:
         """Return what patterns name of a top-level key at an instant, without what cannot be read; or MISSING.

@@ -60,7 +60,7 @@ class RecorderStatus:
         skipped: Updates that were announced, and that a newer one replaced, or changed inside, before they could be
             fetched: what they wrote cannot be had any more.
         gaps: How often updates were lost on the way from the server.
-        lost: Values that cannot be recorded: of custom types that are not made of bytes.
+        lost: Values that could not be read, or are of custom types that are not made of bytes; marked in the file.
         late: Readings of samples left out since the ones before took too long.
         failed: Readings of samples that failed: what is there cannot be read, or the server did not answer.
         rate: Messages a second, on average.

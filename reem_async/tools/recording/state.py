@@ -7,8 +7,9 @@ from typing import Any
 
 from ...plan.paths import Path, Pattern
 from ...plan.trees import MISSING, CannotApply, difference, get, is_addressable, removed, replaced, same
+from ...plan.unreadable import Unreadable
 from .roles import Kind, Role
-from .stored import Stored
+from .stored import LOST, Stored
 
 __all__ = ["applied", "differing", "planted", "pruned", "without"]
 
@@ -87,7 +88,7 @@ def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
     if any(len(pattern.rest) < len(path) for pattern in wanted):
         return tree
     # The items keep their places, also those of a long list that has a message of its own.
-    if wanted and (type(tree) is list or (type(tree) is Stored and tree.label == "list")):
+    if wanted and (type(tree) in (list, Unreadable) or (type(tree) is Stored and tree.label in ("list", LOST))):
         return tree
     if type(tree) is not dict or not wanted:
         return MISSING

@@ -19,6 +19,7 @@ import numpy as np
 from ...concurrency.scheduling import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.trees import MISSING, CannotApply, get, replaced, same
+from ...plan.unreadable import Unreadable
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent
@@ -373,7 +374,8 @@ class WriterThread:
             # A state that was read again: what has not changed need not be written again.
             old = get(before, path[len(it.path) :]) if it.role in (Role.STATE, Role.STORED) else None
             if data is None:
-                lost = Stored(LOST, path, it.stamp[0], 0, f"{type(value).__name__}, not recorded")
+                why = value.reason if type(value) is Unreadable else f"{type(value).__name__}, not recorded"
+                lost = Stored(LOST, path, it.stamp[0], 0, why)
                 # Counted once, not at each read.
                 if type(old) is Stored and (old.label, old.summary) == (LOST, lost.summary):
                     return old
@@ -401,7 +403,8 @@ class WriterThread:
         """Return an array or bytes, and the label; None if there is no way to make bytes of the value."""
         if label:
             return value, label
-        ship = None if self._ships.asynchronous else self._ships.fits(value)
+        unasked = self._ships.asynchronous or type(value) is Unreadable
+        ship = None if unasked else self._ships.fits(value)
         if ship is None or ship.blob is None:
             return None, LOST
         return b"".join(ship.blob.pack(value)), ship.label
