@@ -33,9 +33,10 @@ __all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machin
 Address = tuple[str, int]
 """Host and port."""
 
-codecs.lookup("idna")
-"""What a socket needs of a host's name: imported by a first connection it may be too late, while Python is shutting
-down, or in the middle of a fork."""
+for _codec in ("ascii", "idna", "latin-1"):
+    # For host names, digests and redis-py: imported by a first connection it may be too late, while Python is shutting
+    # down, or in the middle of a fork.
+    codecs.lookup(_codec)
 
 _SCHEMES = ("redis://", "rediss://", "unix://")
 _LEAST = 1 << 20
