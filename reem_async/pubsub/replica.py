@@ -66,8 +66,7 @@ from ..ships.registry import Ships
 from .attachments import HeldAttachments
 from .division import Division, Heard, Phase
 from .early import EarlyUpdates, Outcome
-from .gaps import GapDetector
-from .outputs import (
+from .events import (
     Arm,
     Failed,
     Fence,
@@ -79,9 +78,11 @@ from .outputs import (
     Skipped,
     Snapshot,
     Stored,
+    Teller,
+    Told,
     Updated,
 )
-from .telling import Teller, Told
+from .gaps import GapDetector
 
 __all__ = [
     "Arm", "Failed", "Fence", "Look", "Open", "Output", "Read", "Ready", "Replica", "Skipped", "Snapshot", "State",
