@@ -128,7 +128,6 @@ WITH_MODULE = {
     "test_nobody_gets_in_without_a_password": "the same",
     "test_whole_arms_send_what_they_should": "sends commands of the module by sockets of its own",
     "test_outline_tells_what_is_there_without_fetching_arrays": "counts GET",
-    "test_an_empty_server_gets_everything_bit_for_bit": "compares text that the module has made of numbers",
     "test_the_servers_own_text_would_not_do": "shows how the module reads numbers",
     "test_what_a_user_may_not_do_is_named": "takes away rights to the module's commands",
     "test_a_client_that_may_not_read_the_document_removes_no_array_of_it": "may ask for the type of a document alone",

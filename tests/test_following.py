@@ -81,51 +81,6 @@ def following(front):
 # --- the mirror ------------------------------------------------------------------------------------
 
 
-def test_a_mirror_starts_with_what_is_there(following, kvs, key):
-    """Arrays included, without any publish."""
-    value = {"number": 5, "image": np.arange(6).reshape(2, 3), "l": [b"x", np.arange(2)]}
-    kvs[key()] = value
-    mirror = following.mirror(key())
-    assert_same(mirror.value(), value)
-    assert mirror["number"].read() == 5
-    assert_same(mirror["l"][1].read(), np.arange(2))
-
-
-def test_a_mirror_follows_every_change_of_shape(following, pspace, key):
-    """Dicts, entries, scalars, lists and arrays, at the root and below."""
-    mirror = following.mirror(key())
-    assert not mirror.value()
-    pspace[key()] = {"number": 5, "string": "REEM"}
-    following.until(lambda: mirror.value() == {"number": 5, "string": "REEM"})
-    pspace[key()]["number"] = 6
-    following.until(lambda: mirror["number"].read() == 6)
-    pspace[key()]["deep"] = {"l": [1, np.arange(3)], "odd.'key é": 1.5}
-    pspace[key()]["deep"]["l"][0] = np.arange(2)
-    following.until(lambda: isinstance(mirror["deep"]["l"][0].get(), np.ndarray))
-    deep = {"l": [np.arange(2), np.arange(3)], "odd.'key é": 1.5}
-    assert_same(mirror.value(), {"number": 6, "string": "REEM", "deep": deep})
-    for value in (5, [1, 2], np.arange(4), b"x", None, 0.9374604873776271, {}, "$ship x"):
-        pspace[key()] = value
-        following.until(lambda value=value: type(mirror.value()) is type(value))
-        assert_same(mirror.value(), value)
-
-
-def test_everything_a_publish_space_writes_is_published(following, open_front, kvs, key):
-    """Arithmetic, append, extend, delete and dotted set too: it is written like a store."""
-    space, top = open_front("PublishSpace"), key()
-    space.write((top,), {"n": 5, "l": [1], "gone": np.arange(2)})
-    mirror = following.mirror(top)
-    space.increment((top, "n"), 2)
-    space.multiply((top, "n"), 3)
-    space.append((top, "l"), np.arange(2))
-    space.extend((top, "l"), ["x"])
-    space.delete((top, "gone"))
-    space.set(f"{top}.last", True)
-    following.until(lambda: "last" in mirror.value())
-    assert_same(mirror.value(), {"n": 21, "l": [1, np.arange(2), "x"], "last": True})
-    assert_same(kvs[top].read(), mirror.value())
-
-
 def test_reading_a_mirror_is_local_and_gives_copies(following, kvs, key, raw):
     """Plain calls that send nothing, and copies that may be changed."""
     kvs[key()] = {"number": 5, "l": [1]}

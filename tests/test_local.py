@@ -21,10 +21,6 @@ pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memor
 IMAGE = np.arange(30_000, dtype=np.float64).reshape(100, 300)
 
 
-def fetched(raw):
-    return raw.info("commandstats").get("cmdstat_get", {}).get("calls", 0)
-
-
 @pytest.fixture
 def seen(server_url, key):
     """The updates of a key as a callback of another interface gets them."""

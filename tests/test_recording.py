@@ -33,39 +33,6 @@ def logged(file):
         yield log
 
 
-async def test_every_update_is_recorded_bit_for_bit(key, apspace, akvs, binterface, file):
-    """Small ones from their notices, large ones fetched; numbers of an arithmetic and appended items too."""
-    name = key("arm")
-    async with Recorder(binterface, [key("*")], file) as recorder:
-        values = []
-        for number in range(20):
-            values.append({"n": number, "q": np.array([0.1, number]), "image": IMAGE + np.uint8(number), "b": b"x"})
-            await apspace[name].write(values[-1])
-            await aeventually(lambda n=number: recorder.status.messages > 2 * n)  # else newer ones overtake large ones
-        await apspace[name]["n"].increment(5)
-        await apspace[name]["list"].write([1])
-        await apspace[name]["list"].append({"a": IMAGE})
-        await apspace[name]["list"][0].delete()
-    assert (recorder.status.dropped, recorder.status.lost, recorder.status.gaps) == (0, 0, 0)
-    with logged(file) as log:
-        assert (log.indexed, log.damaged, log.names()) == (True, 0, [name])
-        updates = [update for update in log.updates(patterns=[name]) if update.path == (name,)]
-        assert_same([update.value for update in updates], values)
-        assert [update.sequence for update in updates] == list(range(1, 21))
-        for update, value in zip(updates, values, strict=True):
-            assert_same(log[name].at(update.time), value)
-            assert_same(log[name]["image"].at(update.time), value["image"])
-            assert update.published <= update.time + 0.1
-        assert_same(log[name].at(log.end), await akvs[name].read())
-        times, images = log[f"{name}.image"].history()
-        assert (images.shape, images.dtype) == ((20, *IMAGE.shape), np.uint8)
-        assert len(times) == 20
-        assert (np.diff(times) > 0).all()
-        times, numbers = log[f"{name}.n"].history()
-        assert numbers.tolist() == [*range(20), 24]
-        assert log[name]["list"][0].at(log.end)["a"].shape == IMAGE.shape
-
-
 async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, binterface, file):
     """Else the next one would have replaced what was announced; where few come, publishers are spared."""
     name = key("cam")
@@ -102,37 +69,6 @@ async def test_what_was_there_and_what_only_was_stored(key, akvs, binterface, fi
         frames = [each for each in log.channels() if each.schema == "foxglove.RawImage"]
         assert sum(each.messages for each in frames) == 2  # an array that stays is written once
         assert log.changes(log.start, log.end) >= {(key("a"),), (key("new"),)}
-
-
-async def test_deleting_and_other_types(key, apspace, binterface, file):
-    async with Recorder(binterface, [key("a")], file):
-        instants = []
-        for value in ({"x": {"y": 1}}, {"x": "text"}, 5, [1, 2.5], None, IMAGE, b"bytes", {"x": [0, 1, 2]}):
-            await apspace[key("a")].write(value)
-            instants.append((time.time(), value))
-            await asyncio.sleep(0.02)
-        await apspace[key("a")]["x"][0].delete()
-        instants.append((time.time(), {"x": [1, 2]}))
-        await asyncio.sleep(0.02)
-        await apspace[key("a")]["x"][0].write(7)
-        instants.append((time.time(), {"x": [7, 2]}))
-        await asyncio.sleep(0.02)
-        await apspace[key("a")]["x"].delete()
-        instants.append((time.time(), {}))
-        await asyncio.sleep(0.02)
-        await apspace[key("a")].delete()
-        gone = time.time()
-        await asyncio.sleep(0.02)
-        await apspace[key("a")].write(1)
-    with logged(file) as log:
-        for instant, value in instants:
-            assert_same(log[key("a")].at(instant + 0.01), value)
-        assert log[key("a.x[1]")].at(instants[-2][0] + 0.01) == 2
-        assert [int(value) for _, value in log[key("a.x[0]")].values()] == [0, 1, 7]
-        with pytest.raises(MissingKey, match=key("a")):
-            log[key("a")].at(gone + 0.01)
-        assert key("a") not in log.tree_at(gone + 0.01)
-        assert log[key("a")].at(log.end) == 1
 
 
 async def test_a_part_of_a_key(key, apspace, binterface, file):
@@ -229,45 +165,6 @@ async def test_samples(key, akvs, binterface, file, tmp_path):
         assert "joint" not in log[key("arm")].at(log.end)
         assert log.metadata["samples failed"] == "0"
         assert {update.kind for update in log.updates()} == {"kvs"}
-
-
-async def test_set_points_and_a_camera_together(key, server_url, binterface, file):
-    """1 kHz and 30 Hz for 3 s: nothing dropped, no gap, every set point there, any instant found at once."""
-    connect = reem_async.RedisInterface
-    async with (
-        connect(server_url) as one,
-        connect(server_url) as two,
-        Recorder(binterface, [key("*")], file) as recorder,
-    ):
-        sent = await asyncio.gather(
-            _publish(one, key("point"), lambda n: {"n": n, "q": [0.1 * n, 0.2, 0.3]}, 1000, 3.0),
-            _publish(two, key("camera"), lambda n: {"n": n, "image": np.roll(FRAME, n)}, 30, 3.0),
-        )
-    status = recorder.status
-    assert (status.dropped, status.gaps, status.lost) == (0, 0, 0)
-    with logged(file) as log:
-        assert log[key("point.n")].history()[1].tolist() == list(range(sent[0]))
-        times, frames = log[key("camera.n")].history()
-        assert len(frames) + status.skipped == sent[1]
-        for place in range(0, len(times), 10):
-            image = log[key("camera.image")].at(times[place])
-            assert_same(image, np.roll(FRAME, int(frames[place])))
-        took = []
-        for instant in np.random.default_rng(1).uniform(log.start + 0.2, log.end, 50):
-            begun = time.perf_counter()
-            log[key("camera")].at(instant)
-            log[key("point")].at(instant)
-            took.append(time.perf_counter() - begun)
-        assert np.median(took) < 0.05
-
-
-async def _publish(interface, name, value, rate, seconds):
-    space, begun, count = reem_async.PublishSpace(interface), time.monotonic(), 0
-    while (now := time.monotonic() - begun) < seconds:
-        await asyncio.sleep(max(0.0, count / rate - now))
-        await space[name].write(value(count))
-        count += 1
-    return count
 
 
 async def test_a_full_queue_drops_and_says_so(key, apspace, akvs, binterface, file):

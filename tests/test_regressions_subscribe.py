@@ -22,7 +22,6 @@ import reem_async
 from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace, RedisInterface
 from reem_async import SilentSubscriber as Mirror
 from reem_async.errors import BadType, InterfaceClosed, PathRefused, QueueFull
-from reem_async.plan.floats import exact_text
 
 
 async def waiting(awaitable):
@@ -52,53 +51,6 @@ async def cut(raw, others):
 # --- what is followed -----------------------------------------------------------------------------
 
 
-async def test_a_follower_of_one_item_is_not_changed_by_another(ainterface, akvs, apspace, key):
-    """l[1] has nothing to do with l[0], nor with what is in it."""
-    await apspace[key()].write([10, {"x": 1}, 30, {"x": 2}])
-    async with Mirror(f"{key()}[1]", ainterface) as second, Mirror(f"{key()}[3].x", ainterface) as deep:
-        heard = akvs[key()][1].watch(Every(100))
-        await heard.listen()
-        await apspace[key()][0].write(99)
-        await apspace[key()][2].write({"x": 77})
-        await apspace[key()][2]["x"].write(78)
-        await apspace[key()][3]["x"].write(3)
-        await aeventually(lambda: deep.value() == 3)
-        assert second.value() == {"x": 1}
-        await apspace[key()][1]["x"].write(4)
-        await aeventually(lambda: second.value() == {"x": 4})
-        assert [(await waiting(anext(heard))).data for _ in range(2)] == [{"x": 1}, {"x": 4}]
-        assert taken(heard) == []
-
-
-async def test_followers_of_items_are_right_after_items_were_deleted(ainterface, akvs, apspace, key):
-    """The items after it move up; counted from the end they do not."""
-    names = ["[0]", "[1]", "[1].x", "[2]", "[-1]", "[-2].x", ""]
-    await apspace[key()].write([{"x": n} for n in range(6)])
-    mirrors = [Mirror(key() + name, ainterface) for name in names]
-    for mirror in mirrors:
-        await mirror.listen()
-    changes = [
-        lambda items: items[1].delete(),
-        lambda items: items[-1].delete(),
-        lambda items: items[0]["x"].write(10),
-        lambda items: items[0].delete(),
-        lambda items: items[-1]["x"].write(np.arange(3)),
-        lambda items: items.append({"x": 20}),
-        lambda items: items[0].delete(),
-        lambda items: items[1]["x"].delete(),
-        lambda items: items[0]["x"].write(30),
-    ]
-    marks = Mirror(key("marks"), ainterface)
-    await marks.listen()
-    for number, change in enumerate(changes):
-        await change(apspace[key()])
-        await apspace[key("marks")].write(number)
-        await aeventually(lambda number=number: marks.value() == number)
-        for mirror in mirrors:
-            stored = await akvs.get(mirror.channel, None)
-            await aeventually(lambda mirror=mirror, stored=stored: repr(mirror.value()) == repr(stored))
-
-
 async def test_an_update_that_the_server_refuses_is_never_left_in_a_mirror(ainterface, akvs, apspace, key):
     """For want of a parent; nor does a callback get it."""
     heard = []
@@ -119,34 +71,6 @@ async def test_an_update_that_the_server_refuses_is_never_left_in_a_mirror(ainte
         await apspace[key()].write({"a": {"b": 6}, "m": {"x": 4}})
         await aeventually(lambda: mirror.value() == {"x": 4} and below.value() == 6 and 6 in heard)
         assert 5 not in heard
-
-
-def unexact(seed=3):
-    """A float that RedisJSON has no exact text for, so that it is stored as a placeholder."""
-    numbers = random.Random(seed)
-    while True:
-        value = numbers.uniform(-1, 1) * 10 ** numbers.randint(-30, 30)
-        if exact_text(value) is None:
-            return value
-
-
-async def test_arithmetic_that_is_put_right_leaves_mirrors_equal_to_the_server(akvs, apspace, binterface, key, raw):
-    """What overflows is put back, and floats that are stored as text are added by the client."""
-    odd = unexact()
-    async with Mirror(key(), binterface) as mirror, Mirror(f"{key()}.x", binterface) as below:
-        for number in range(10):
-            for start, operand in ((odd, 1), (2**63 - 1, 1), (odd, 0.5), (0.5, 1)):
-                await apspace[key()].write({"x": start})
-                assert start != odd or "$ship float" in raw.execute_command("JSON.GET", key())
-                try:
-                    await apspace[key()]["x"].increment(operand)
-                except OverflowError:
-                    assert start == 2**63 - 1
-                await apspace[key()]["mark"].write(number)
-                await aeventually(lambda number=number: mirror["mark"].get() == number)
-                assert_same(mirror.value(), await akvs[key()].read())
-                assert_same(below.value(), await akvs[key()]["x"].read())
-                await apspace[key()].write(0)
 
 
 FORK = """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import struct
 import threading
-import time
 import tracemalloc
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 import redis
 import snapshotkit
 from conftest import PLAIN, aeventually, assert_no_orphans, assert_same, commands_run
-from snapshotkit import STRANGE, TREE, everything, fill, hard_floats, left_in
+from snapshotkit import everything, hard_floats, left_in
 from test_ships import Pose, PoseShip
 
 import reem
@@ -32,26 +31,6 @@ servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.
 
 
 # --- there and back -------------------------------------------------
-
-
-async def test_an_empty_server_gets_everything_bit_for_bit(here, there, raws, tmp_path):
-    """Documents, arrays, registries; and what is read is what was written."""
-    kvs = await fill(here)
-    raws[0].execute_command("JSON.NUMMULTBY", "number", "$", "1.1")  # a float that no program has written
-    before = everything(raws[0])
-    saved = await save(here, tmp_path / "a.zip")
-    assert everything(raws[0]) == before, "saving changes nothing"
-    assert (saved.count, saved.foreign, saved.kind) == (len(STRANGE) + 8, 0, "portable")
-    assert saved.size == (tmp_path / "a.zip").stat().st_size > 8_000_000
-    assert abs(saved.time - time.time()) < 60
-    done = await restore(there, tmp_path / "a.zip")
-    assert everything(raws[1]) == before
-    assert set(done.names) == {key.name for key in saved.keys} == {"tree", "number", *STRANGE} | set(done.names)
-    copy = reem_async.KeyValueStore(there)
-    assert_same(await copy["tree"].read(), TREE)
-    for name in STRANGE:
-        assert_same(await copy[name].read(), await kvs[name].read())
-    assert await describe(tmp_path / "a.zip", check=True) == saved
 
 
 async def test_the_servers_own_text_would_not_do(raws):

@@ -368,15 +368,6 @@ async def test_close_ends_every_loop(server_url, key):
     await aeventually(lambda: asyncio.all_tasks() <= tasks)
 
 
-async def test_an_async_subscriber_hears_a_blocking_publisher(ainterface, key, pspace):
-    """One layout, one wire."""
-    assert isinstance(pspace, reem.PublishSpace)
-    async with Mirror(key(), ainterface) as mirror:
-        pspace[key()] = {"image": np.arange(3)}
-        await aeventually(lambda: mirror.value() is not None)
-        assert_same(mirror.value(), {"image": np.arange(3)})
-
-
 def test_a_deletion_at_any_index_is_a_notice_that_can_be_read(interface, pspace, key):
     """Where nothing is deleted, there is nothing to make of it."""
     pspace[key()] = {"l": [1]}
