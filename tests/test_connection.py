@@ -13,6 +13,7 @@ import time
 import numpy as np
 import pytest
 import redis
+from chaos.proxy import Proxy
 from conftest import PATIENCE, PLAIN, aeventually, eventually, subscribed
 
 import reem
@@ -56,6 +57,23 @@ async def test_an_asyncio_call_to_a_stopped_server_ends_in_time(server):
             assert PLAIN or interface.state == "lost"  # there the write had a connection of its own, which is idle
         assert await store["foo"].read() == 1
         assert interface.state == "connected"
+
+
+async def test_a_dead_connection_is_given_up_though_calls_go_on(server):
+    """A link swallows all bytes for a moment, and closes nothing. New calls waited behind those before them, for ever."""
+    with Proxy(server.port) as proxy:
+        async with reem_async.RedisInterface(proxy.url, timeout=0.4) as interface:
+            store = reem_async.KeyValueStore(interface)
+            await store["foo"].write(1)
+            proxy.black_hole()
+            proxy.heal()  # for new connections
+            calls = []
+            for _ in range(25):
+                calls.append(asyncio.ensure_future(store["foo"].read()))
+                await asyncio.sleep(0.1)
+            answers = await asyncio.gather(*calls, return_exceptions=True)
+    assert isinstance(answers[0], ConnectionLost)
+    assert answers[-10:] == [1] * 10
 
 
 @pytest.mark.alone

@@ -21,6 +21,12 @@ from reem_async.pubsub.monitor import Monitor
 MANY, AGAIN = 500, 30
 
 
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    monkeypatch.setattr(session, "QUIET", 0.5)
+    monkeypatch.setattr(key_watcher, "_GONE", 1.0)
+
+
 @pytest.fixture
 def key():
     return Keys()

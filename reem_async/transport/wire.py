@@ -114,6 +114,7 @@ class Wire(asyncio.BufferedProtocol):
         self._goal = 0  # over TLS: how many bytes the other side has confirmed when it has all of what was written
         self._watch: asyncio.TimerHandle | None = None
         self._last_byte = self._read_before = 0.0
+        self._doubted = 0.0
         self._unsent = 0  # bytes of large values that were on their way up when last looked at
         self._reason: Exception | None = None
         self._gone = self._loop.create_future()
@@ -366,7 +367,11 @@ class Wire(asyncio.BufferedProtocol):
         self._watch = self._loop.call_at(moment, self._check_time)
 
     def _check_time(self) -> None:
-        """Tell the callers whose limit has passed; break the connection if nobody is left to wait for it."""
+        """Fail the calls whose limit has passed. Break the connection if no other call waits, or if it stays silent.
+
+        Calls that were sent before the first one failed keep their own limits. Without an end to the silence, a program
+        that goes on calling would keep a dead connection for ever.
+        """
         self._watch = None
         now, left = self._loop.time(), self._bytes_unsent()
         waiting = [due for due in self._due if not due.over]
@@ -386,12 +391,23 @@ class Wire(asyncio.BufferedProtocol):
                     )
                 )
         moments = [max(self._last_byte, due.since) + due.limit for due in self._due if not due.over]
-        if moments:
+        if moments and self._due[0].over:
+            moments.append(self._end_of_silence())
+        silent = bool(moments) and self._due[0].over and moments[-1] <= now
+        if silent and self._doubted == self._last_byte:
+            self.abort(ConnectionLost(f"the server moved no byte for {now - self._last_byte:.3g} s"))
+        elif moments:
+            self._doubted = self._last_byte if silent else 0.0  # look again: the loop may have been busy
             # While a large value is on its way up, look often: its last progress begins the limit.
             soon = now + min(due.limit for due in self._due if not due.over) / LOOKS if left else max(moments)
             self._watch_until(max(min(*moments, soon), now + 0.002))
         elif waiting:
             self.abort(ConnectionLost(f"the server moved no byte for {waiting[-1].limit:g} s"))
+
+    def _end_of_silence(self) -> float:
+        """Return when the connection is given up whatever was sent since: its oldest call has failed."""
+        oldest, longest = self._due[0], max(due.limit for due in self._due if not due.over)
+        return max(self._last_byte, oldest.since) + oldest.limit + longest
 
     def _bytes_unsent(self) -> int:
         if self._tls:
