@@ -60,7 +60,7 @@ async def test_an_asyncio_call_to_a_stopped_server_ends_in_time(server):
 
 
 async def test_a_dead_connection_is_given_up_though_calls_go_on(server):
-    """A link swallows all bytes for a moment, and closes nothing. New calls waited behind those before them, for ever."""
+    """A link swallows all bytes for a moment. New calls waited behind those before them, for ever."""
     with Proxy(server.port) as proxy:
         async with reem_async.RedisInterface(proxy.url, timeout=0.4) as interface:
             store = reem_async.KeyValueStore(interface)
