@@ -133,16 +133,16 @@ def open_log(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Log:
-    """Open a recording; one whose recorder was killed, or that was damaged, opens too.
+    """Open a recording; one whose recorder was killed, or that was damaged or rewritten by another tool, opens too.
 
-    If somebody replaces the file while it is open, the old one is read on. If somebody cuts it short, whatever
-    reads beyond its new end raises OSError.
+    What is damaged or missing is left out, and counted in `Log.damaged`. If another program replaces the file while it
+    is open, the old one is read on. If it cuts the file short, a read beyond the new end raises OSError.
 
     Args:
         path: The file.
         ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
-        progress: Is told the bytes done and all of them, where the file must be gone through: its recorder was
-            killed, or its index is damaged.
+        progress: Called with the bytes done and all of them, if the whole file is read: its recorder was killed, or its
+            summary is damaged or leaves something out.
 
     Raises:
         DamagedRecording: Not a recording of REEM.
@@ -202,7 +202,7 @@ class Log:
 
     @property
     def damaged(self) -> int:
-        """How many records of the file were found to be damaged until now; they are skipped."""
+        """How many records of the file were found to be damaged, cut off or missing until now; they are left out."""
         return self._container.damaged
 
     @property
@@ -407,7 +407,11 @@ class Log:
         return sorted(found, key=lambda it: (it.topic, it.role, it.path))
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
-        """Read all of the file; return how many records are damaged. `progress` is told the chunks done and all."""
+        """Read all of the file; return how many records are damaged.
+
+        Checksums, indexes and the count of messages are compared with the data. `progress` is called with the chunks
+        done and all of them.
+        """
         return self._container.verify(progress)
 
     def close(self) -> None:
