@@ -19,8 +19,7 @@ from reem_async.pubsub.division import Division, Heard, divided_read
 from reem_async.pubsub.gaps import Numbers
 from reem_async.tools.recording.key_queue import KeyQueue
 from reem_async.tools.recording.order import Item
-from reem_async.tools.recording.state import applied
-from reem_async.tools.recording.stored import New, Unchanged
+from reem_async.tools.recording.stored import New, Unchanged, applied
 
 PUBLISHERS = "p", "q", "r"
 STORED = "stored"

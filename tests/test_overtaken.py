@@ -11,7 +11,7 @@ from reem_async.plan.copies import is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED
 from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
 from reem_async.tools.recording.order import Item, is_replaced, settled, skipped
-from reem_async.tools.recording.state import applied
+from reem_async.tools.recording.stored import applied
 
 PLACES = [(), ("a",), ("a", "b"), ("a", "b", "c"), ("d",), ("l",), ("l", 0), ("l", 1), ("l", 0, "x")]
 MODES = ["announced", "with its value"]

@@ -24,9 +24,8 @@ from reem_async.tools.recording.layout import from_json, to_json
 from reem_async.tools.recording.log import stacked
 from reem_async.tools.recording.messages import decode, encode, schema_bytes
 from reem_async.tools.recording.sample import read_key_file
-from reem_async.tools.recording.schema import OPEN, fits, schema_text, signature
-from reem_async.tools.recording.state import planted, pruned
-from reem_async.tools.recording.stored import Stored, extract, resolve
+from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
+from reem_async.tools.recording.stored import Stored, extract, planted, pruned, resolve
 from reem_async.tools.recording.times import AFTER, STEP, Clock, nanoseconds, seconds
 from reem_async.transport.recorder import CommandRecorder
 

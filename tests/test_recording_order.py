@@ -15,7 +15,7 @@ import reem_async
 from reem_async.plan.paths import parse_pattern
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.recording import Recorder, Replayer, key_recorder, open_log
-from reem_async.tools.recording.state import pruned
+from reem_async.tools.recording.stored import pruned
 from reem_async.tools.recording.times import published
 
 LARGE = np.zeros((300, 300))

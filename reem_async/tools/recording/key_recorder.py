@@ -25,7 +25,7 @@ from .key_queue import KeyQueue
 from .key_reader import KeyReader
 from .order import Item
 from .roles import Kind, Role
-from .state import pruned
+from .stored import pruned
 from .times import Arrivals, Clock, published
 from .writer_thread import Operation, WriterThread
 

@@ -24,8 +24,7 @@ from ...transport.recorder import CommandRecorder
 from .container import Container
 from .log_reader import Past, Stream
 from .roles import Role
-from .state import pruned
-from .stored import LOST, Stored, resolve
+from .stored import LOST, Stored, pruned, resolve
 from .timeline import Ref, Totals
 from .times import Instant, nanoseconds, seconds
 

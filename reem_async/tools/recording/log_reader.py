@@ -24,8 +24,7 @@ from .mcap_reader import Numbers
 from .messages import decode
 from .roles import NEWS, Kind, Role
 from .sink import CHANNELS
-from .state import applied
-from .stored import LOST, Stored, opened
+from .stored import LOST, Stored, applied, opened
 from .timeline import Ref, Timeline, Totals
 
 __all__ = ["Past", "Stream"]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import getpass
+import os
+import platform
 import time
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
@@ -11,6 +14,9 @@ from pathlib import Path as FilePath
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+
+from ... import __version__
 from ...concurrency.queues import Last
 from ...concurrency.scheduling import give_way
 from ...concurrency.streams import arrived
@@ -20,18 +26,18 @@ from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, parse_patterns
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
-from .description import description
+from ...session import Session
 from .errors import RecordingFailed
 from .key_recorder import KeyRecorder
 from .output import FileGone
 from .recorded_keys import RecordedKeys
 from .roles import Role
-from .sample import Sampler, samples_of
+from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import HURRIED, PATIENCE, Arrivals, Clock
 from .writer_thread import Operation, WriterThread
 
-__all__ = ["Recorder", "RecorderStatus"]
+__all__ = ["Recorder", "RecorderStatus", "description"]
 
 # Seconds between looks at keyframes that are due, the disk, and keys that must be read anew.
 _TICK = 0.1
@@ -427,3 +433,31 @@ class Recorder:
         self.writer_thread.put(
             Operation(Role.STATISTICS, ("",), figures | {"waiting": self.writer_thread.waiting}, stamp), 0
         )
+
+
+def description(
+    session: Session, patterns: Sequence[str], samples: Sequence[Sample], keyframe: float
+) -> dict[str, str]:
+    """Return the metadata of a recording that begins now."""
+    return {
+        "version": __version__,
+        "format": "1",
+        "server": session.options.address,
+        "namespace": session.namespace,
+        "host": platform.node(),
+        "user": _user(),
+        "process": str(os.getpid()),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "began": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "patterns": ", ".join(patterns),
+        "samples": ", ".join([str(each) for each in samples]),
+        "keyframe": f"{keyframe:g}",
+    }
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError, ImportError):  # nobody knows the name of this user
+        return ""

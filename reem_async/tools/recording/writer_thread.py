@@ -27,8 +27,7 @@ from .layout import WRAPPER, Document, to_json
 from .messages import encode
 from .roles import Kind, Role
 from .sink import FullError, Sink
-from .state import differing, planted, pruned, without
-from .stored import LOST, NotWritten, Stored, Unchanged, extract, opened
+from .stored import LOST, NotWritten, Stored, Unchanged, differing, extract, opened, planted, pruned, without
 
 __all__ = ["Counts", "Operation", "WriterThread"]
 
