@@ -78,17 +78,17 @@ class Encoder:
             return suffix(path + inner) + (f"~{tail}" if tail else "")
 
         found = walk(value, (self._keys.name, *path), fits, name, ships.claimed)
-        # Check sizes before packing: an array that takes no memory (np.broadcast_to) is then copied out in full.
-        exact = [(self._where(each.suffix), each.size) for each in found.attachments if each.ship.describes_exactly]
-        if sum([size for _, size in exact]) > HUGE:
-            await self._check_limits(exact)
+        # The sizes that ships name are a quick check, the exact ones are taken where it comes near to what servers
+        # refuse.
+        is_huge = len(found.text) + sum([each.size for each in found.attachments]) > HUGE
+        # Before packing too: an array that takes no memory (np.broadcast_to) is copied out in full by that.
+        if is_huge and (exact := [each for each in found.attachments if each.ship.describes_exactly]):
+            await self._check_limits([(self._where(each.suffix), each.size) for each in exact])
         attachments = [
             self._packed(each) if each.ship.blob is not None else await self._recorded(each)
             for each in found.attachments
         ]
-        # The sizes that ships name are a quick look, the exact ones are taken where it comes near to what servers
-        # refuse.
-        if len(found.text) + sum([each.size for each in found.attachments]) > HUGE:
+        if is_huge:
             await self._ask_for_limits(path, [found.text], attachments)
         return found.text, tuple(attachments)
 
