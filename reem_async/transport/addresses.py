@@ -41,6 +41,8 @@ def listed(url: str, example: str) -> list[str]:
         BadValue: No host, or a port that is no number; never quotes the URL, which may hold a password.
     """
     parts = urlsplit(url)
+    if parts.fragment:
+        raise BadValue(f"the URL has a fragment (#...); write it like {example}")
     # From the right: a password may contain an @.
     login, at, hosts = parts.netloc.rpartition("@")
     urls = []

@@ -9,12 +9,13 @@ from __future__ import annotations
 import codecs
 import ipaddress
 import os
+import re
 import ssl
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
-from urllib.parse import urlsplit
+from urllib.parse import parse_qsl, urlsplit
 
 import redis
 import redis.asyncio
@@ -390,6 +391,41 @@ def _host_and_port(host: str) -> dict[str, Any]:
     raise BadValue(f"{host!r} is not a host with a port; write it like localhost:6379 or [::1]:6379")
 
 
+def check_url(url: str) -> None:
+    """Refuse the parts of a server's URL that redis-py drops in silence: another server would be meant.
+
+    Raises:
+        BadValue: There is one. The message never quotes user and password.
+    """
+    parts = urlsplit(url)
+    login, _, place = parts.netloc.rpartition("@")
+    problem, form = "", f"{parts.scheme}://{'user:password@' if login else ''}host:6379/0"
+    if parts.scheme == "unix":
+        form = "unix:///run/redis.sock?db=0"
+        if place:
+            problem = f"{place!r} stands in the place of a host; a path begins with three slashes"
+        elif parts.path in ("", "/"):
+            problem = "it has no path of a socket"
+    elif not re.fullmatch(r"/?|/[0-9]+/?", parts.path):
+        problem = f"{parts.path!r} is not the number of a database"
+    elif "," in place:
+        problem, form = (
+            "it lists several hosts",
+            "redis+cluster://host:7000,host:7001 or redis+sentinel://host:26379/name",
+        )
+    elif place.endswith((":", ":0")) or re.search(r"\s", place):
+        problem = f"{place!r} is not a host with a port"
+    if "#" in url.rpartition("@")[2]:
+        problem = "it has a fragment (#...)"
+    databases = [value for name, value in parse_qsl(parts.query) if name == "db"]
+    if any(not re.fullmatch("[0-9]+", value) for value in databases):
+        problem = f"db={databases[0]!r} is not the number of a database"
+    elif parts.scheme != "unix" and databases and parts.path.strip("/") not in ("", databases[0]):
+        problem = "it names two databases"
+    if problem:
+        raise BadValue(f"the URL of the server is wrong: {problem}; write it like {form}")
+
+
 def _address(host: Any) -> dict[str, Any]:
     """Return the connection settings that `host` stands for."""
     socket_path = getattr(host, "socket_path", None)
@@ -404,6 +440,7 @@ def _address(host: Any) -> dict[str, Any]:
         return _host_and_port(host)
     if not host.startswith(_SCHEMES):
         raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")
+    check_url(host)
     try:
         settings: dict[str, Any] = {**parse_url(host)}
     except ValueError:  # its text may hold a part of the password
