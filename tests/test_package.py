@@ -42,12 +42,16 @@ def test_importing_beside_the_original_warns(tmp_path):
     assert f"RuntimeWarning: {CLASH}; run: {CURE}\n" in done.stderr
 
 
-def test_the_doctor_fails_beside_the_original(tmp_path):
+@pytest.mark.parametrize("its_redis_py", [False, True])
+def test_the_doctor_fails_beside_the_original(tmp_path, its_redis_py):
+    if its_redis_py:
+        (tmp_path / "redis.py").write_text("")
     done = beside_the_original(
         tmp_path, "import sys; from reem_async.tools.cli import main; sys.argv = ['reem', 'doctor']; main()"
     )
     assert done.returncode == 1
-    assert f"fail\tinstallation\t{CLASH}\t{CURE}\n" in done.stdout
+    assert done.stderr == f"reem: {CLASH}; run: {CURE}\n"
+    assert its_redis_py or f"fail\tinstallation\t{CLASH}\t{CURE}\n" in done.stdout
 
 
 def test_version_and_extras_are_those_of_the_distribution():

@@ -7,6 +7,8 @@ import os
 import sys
 from typing import TYPE_CHECKING
 
+from reem_async._installation import CURE, original_reem
+
 if TYPE_CHECKING:
     import typer
 
@@ -17,6 +19,8 @@ def main() -> None:
     """Run the command line; exit code 1 and the remedy if what it needs is not installed."""
     # Before anything is printed: a shell may have closed a stream (`>&-`), and print would fail later.
     _mend_streams()
+    if clash := original_reem():
+        sys.stderr.write(f"reem: {clash}; run: {CURE}\n")
     try:
         app = build()
     except KeyboardInterrupt:
@@ -30,7 +34,13 @@ def main() -> None:
             "to do without a server\n"
         )
         raise SystemExit(1) from None
-    app(prog_name="reem")
+    try:
+        app(prog_name="reem")
+    except (AttributeError, ImportError):
+        # The original also installs redis-py 3.5, with which nothing here can be imported.
+        if not clash:
+            raise
+        raise SystemExit(1) from None
 
 
 def _mend_streams() -> None:
