@@ -18,7 +18,7 @@ from reem_async.tools.cli.running import USAGE, Refused, guarded, interface_to
 if TYPE_CHECKING:
     from reem_async.tools.browser import Source
 
-__all__ = ["browse"]
+__all__ = ["browse", "check_packages", "open_page"]
 
 _PACKAGES = {"starlette": "starlette", "uvicorn": "uvicorn", "PIL": "pillow"}
 _MEGABYTE = 1 << 20
@@ -64,7 +64,7 @@ def browse(
     """
 
     def work() -> int | None:
-        _check_packages(log)
+        check_packages(log)
         if log is not None and allow_write:
             raise Refused("a recording is not changed: leave out --allow-write, or --log", USAGE)
         source = _source(url, namespace, log, buffer, memory, named_ships(ships))
@@ -76,7 +76,8 @@ def browse(
         raise typer.Exit(code)
 
 
-def _check_packages(log: Path | None) -> None:
+def check_packages(log: Path | None) -> None:
+    """Raise Refused if a package that the page needs is not installed."""
     # Looked for before anything is imported, so that all that is missing is named at once.
     needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
     absent = [name for module, name in needed.items() if find_spec(module) is None]
@@ -112,17 +113,22 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
         await source.start()
         address = _address(host, sock.getsockname()[1], token)
         _tell(source, address, alone, allow_write)
-        if open_ and _has_screen():
-            webbrowser.open(address)
+        if open_:
+            open_page(address)
         await PageServer(app, sock).run_until_stopped()
     finally:
         sock.close()
         await source.close()
 
 
+def open_page(address: str) -> None:
+    """Open a page in the web browser, if there is a screen to show it on."""
+    # Without one, webbrowser would start a text browser in this very terminal.
+    if _has_screen():
+        webbrowser.open(address)
+
+
 def _has_screen() -> bool:
-    """Return whether a browser would open in a window, and not in this terminal."""
-    # webbrowser would start a text browser in this very terminal.
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 

@@ -136,7 +136,7 @@ export class Panes {
       if (this.panes.has(node.address)) continue;
       const pane = new Pane(this, node);
       this.panes.set(node.address, pane);
-      this.element.append(pane.element);
+      this.element.insertBefore(pane.element, this.picturesFirst && isPicture(node) ? this.element.querySelector(".pane:not(.of-picture)") : null);
     }
     this.element.hidden = !nodes.length;
     const results = await Promise.allSettled(nodes.map((node) => this.panes.get(node.address).update(node, signal)));

@@ -280,6 +280,7 @@ class Home {
     if (signal?.aborted) return;
     setText(this.title, nodes.length ? (pins.length ? "Pinned" : "Busiest keys") : "");
     this.hint.hidden = nodes.length > 0;
+    this.panes.picturesFirst = !pins.length; // pinned ones stay in the order that the visitor gave them
     await this.panes.update(nodes, signal);
   }
 
