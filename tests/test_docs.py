@@ -83,6 +83,15 @@ def shaped(expected):
     return re.compile("".join(lines))
 
 
+def ends(process):
+    """The exit code of a program that was interrupted; one that goes on is killed."""
+    try:
+        return process.wait(30)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
 class Reader:
     """Follows a page in an empty folder, beside a server that was started as the page says."""
 
@@ -112,7 +121,7 @@ class Reader:
         if name := re.match(r"# (\w+\.py)\n", code):
             (self.folder / name[1]).write_text(code, encoding="utf-8")
             return
-        done = self.run([PYTHON, "-X", "dev", "-W", "error", "-c", code])
+        done = self.run([PYTHON, "-W", "error", "-c", code])
         assert (done.returncode, SLOW_MACHINE.sub("", done.stderr)) == (0, ""), done.stderr
         expected = "\n".join(re.findall(r"^ *print\(.*\)  # (.*)$", code, re.MULTILINE))
         assert shaped(expected).fullmatch(done.stdout), f"{done.stdout}\nis not\n{expected}"
@@ -140,7 +149,7 @@ class Reader:
             said = self.redis.execute_command(*words)
             assert expected is None or shaped(expected).fullmatch(f"{said.decode()}\n"), said
             return
-        flags = ["-X", "dev", "-W", "error"]
+        flags = ["-W", "error"]
         start = {
             "reem": [str(Path(PYTHON).parent / "reem")],
             "python": [PYTHON, *flags],
@@ -163,7 +172,7 @@ class Reader:
                 words, cwd=self.folder, env=self.environment, stdout=file, stderr=subprocess.STDOUT
             )
         self.live.append((words, process, output, expected, says_something))
-        deadline = time.monotonic() + (20 if says_something else 3)  # a program may do neither
+        deadline = time.monotonic() + (20 if says_something else 1.5)  # a program may do neither
         while process.poll() is None and not output.stat().st_size and len(self.redis.client_list()) <= before:
             if time.monotonic() > deadline:
                 break
@@ -172,23 +181,24 @@ class Reader:
         assert process.poll() is None, output.read_text()
 
     def end(self):
-        """Press Ctrl-C in each terminal, the last one first, once it shows what the page says."""
-        failed = sys.exception()
-        for program in reversed(self.live):
-            self.interrupt(*program, failed=failed is not None)
-
-    def interrupt(self, words, process, output, expected, says_something, *, failed):
+        """Press Ctrl-C in each terminal once all show what the page says."""
+        failed = sys.exception() is not None
         try:
-            if not failed:
-                eventually(lambda: shaped(expected).match(output.read_text()), 20)
-                eventually(lambda: output.stat().st_size or not says_something, 20)
-            process.send_signal(signal.SIGINT)
-            assert process.wait(30) in (0, 130, -signal.SIGINT)
+            for program in self.live if not failed else ():
+                self.shows(*program)
+        finally:
+            for _, process, *_ in self.live:
+                process.send_signal(signal.SIGINT)
+            ended = [(words, ends(process), output.read_text()) for words, process, output, *_ in self.live]
+        assert [each for each in ended if each[1] not in (0, 130, -signal.SIGINT)] == []
+
+    @staticmethod
+    def shows(words, process, output, expected, says_something):
+        try:
+            eventually(lambda: shaped(expected).match(output.read_text()), 20)
+            eventually(lambda: output.stat().st_size or not says_something, 20)
         except AssertionError as wrong:
             raise AssertionError(f"{words}: {output.read_text()}\nis not\n{expected}") from wrong
-        finally:
-            process.kill()
-            process.wait()
 
     def run(self, words):
         return subprocess.run(
