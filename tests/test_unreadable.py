@@ -22,6 +22,7 @@ from reem_async.server import EmbeddedServer
 from reem_async.ships import BlobShip
 from reem_async.tools.browser import LiveSource
 from reem_async.tools.browser.trees import thawed
+from reem_async.tools.cli.browse import _source
 from reem_async.tools.cli.options import named_ships
 from reem_async.tools.recording import DamagedRecording, Recorder, Replayer, open_log
 
@@ -256,6 +257,21 @@ async def test_a_document_that_is_no_document_any_more_is_not_what_it_was(server
                 log["b"].at(damaged_until)
             assert log["b"].at(log.end) == {"s": 2}
         await kvs["b"].delete()
+
+
+async def test_the_page_and_its_recordings_are_read_with_ships_of_the_users_own(server, tmp_path):
+    """As `reem browse --ship` gives them."""
+    ships = named_ships([f"{__name__}:Pose"])
+    async with reem_async.RedisInterface(server, ships=ships) as interface:
+        await reem_async.KeyValueStore(interface)["b"].write({"pose": 1 + 2j})
+        async with Recorder(interface, ["*"], tmp_path / "run.mcap"):
+            pass
+    for log in (None, tmp_path / "run.mcap"):
+        source = _source(server.url, "", log, 60, 8, ships)
+        await source.start()
+        at = None if log is None else source.status().end
+        assert (await source.value(("b", "pose"), at)).value == 1 + 2j
+        await source.close()
 
 
 USES = {
