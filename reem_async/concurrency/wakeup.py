@@ -5,9 +5,42 @@ from __future__ import annotations
 import os
 import queue
 import sys
-from typing import Protocol
+from typing import NoReturn, Protocol
 
-__all__ = ["Wakeups", "wakeups"]
+__all__ = ["Descriptor", "Wakeups", "wakeups"]
+
+
+class Descriptor:
+    """A file descriptor that is closed with this object, unless its number is another file's by then.
+
+    A program that becomes a daemon closes all descriptors, and the numbers are its own files' afterwards.
+
+    Args:
+        number: What the operating system has given.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self._file = self._now()
+
+    def _now(self) -> tuple[int, int]:
+        found = os.fstat(self.number)
+        return found.st_dev, found.st_ino
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the number still stands for the same file."""
+        try:
+            return self._now() == self._file
+        except OSError:
+            return False
+
+    def __reduce__(self) -> NoReturn:
+        raise TypeError("what owns a file descriptor cannot be copied or pickled; make another watch or mirror")
+
+    def __del__(self) -> None:
+        if self.is_own:
+            os.close(self.number)
 
 
 class Wakeups(Protocol):
@@ -37,14 +70,11 @@ class _Descriptor:
     """
 
     def __init__(self) -> None:
-        self._descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_SEMAPHORE)
+        self._descriptor = Descriptor(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_SEMAPHORE))
 
     def put(self, wakeup: None) -> None:
-        os.write(self._descriptor, (1).to_bytes(8, sys.byteorder))
+        if self._descriptor.is_own:
+            os.write(self._descriptor.number, (1).to_bytes(8, sys.byteorder))
 
     def get(self) -> None:
-        os.read(self._descriptor, 8)
-
-    def __del__(self) -> None:
-        if hasattr(self, "_descriptor"):
-            os.close(self._descriptor)
+        os.read(self._descriptor.number, 8)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..concurrency.wakeup import Descriptor
 from ..plan.notices import Slot
 from .locks import lock_for_reading
 from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, stamp_at
@@ -73,7 +74,7 @@ class _Mapping:
         self.pins: list[_Pin] = []
         self.used = 0.0
         self._descriptor = _opened(slot)
-        weakref.finalize(self, os.close, self._descriptor).atexit = False
+        self._owner = Descriptor(self._descriptor)
         self._shape = _checked(self._descriptor, slot)
         self._map = mmap.mmap(self._descriptor, self._shape.size, prot=mmap.PROT_READ)
 

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..concurrency.wakeup import Descriptor
 from ..plan.notices import starts
 from .locks import lock_for_writing, unlock
 
@@ -111,7 +112,7 @@ class Segment:
         self._written: dict[int, weakref.ref[_Writing]] = {}
         self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         # Closed with the last reference: another thread may be writing when the interface is closed.
-        weakref.finalize(self, os.close, self.descriptor).atexit = False
+        self._owner = Descriptor(self.descriptor)
         os.fchmod(self.descriptor, 0o600)
         # All of it now: where memory is short this fails, and no write later is met by SIGBUS. (A cgroup's limit may
         # still end the program, as it may wherever a program takes memory.)
