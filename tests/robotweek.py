@@ -91,12 +91,12 @@ class Program:
             raise Wrong(f"the {self.name} does not end after signal {number}:\n{self.said()[-3000:]}") from None
 
     def check_output(self) -> None:
-        """Complain of what a clean program does not print. Errors of REEM are due."""
+        """Complain of what a clean program does not print. Errors of REEM are due, and Ctrl-C as it imports modules."""
         said = self.said()
         found = [line for line in said.splitlines() if any(words in line for words in COMPLAINTS[:3] + COMPLAINTS[4:])]
         for block in said.split("Traceback (most recent call last):\n")[1:]:
             last = next((line for line in block.splitlines() if re.match(r"[\w.]+: |[\w.]+$", line)), "")
-            if not last.startswith(("reem_async.", "reem.", "KeyboardInterrupt")):
+            if not last.startswith(("reem_async.", "reem.", "KeyboardInterrupt", "ImportError")):
                 found.append(f"{last} in\n{block[:2000]}")
         if found:
             raise Wrong(f"the {self.name} said: {found[0]}")
