@@ -42,14 +42,6 @@ class RedisInterface:
             separator, any character but a letter or digit: "robot1:", "robots/r1:".
         timeout: Seconds without a byte moving after which a call is given up; `reem_async.timeout` sets
             another limit for some calls.
-        read_from_replicas: Have replicas answer `read`, `get`, `length` and `type`, to spare primaries; for a
-            cluster or behind sentinels. What it gives up: replicas get updates some time later, usually
-            milliseconds, but without any bound if one lags or has lost its primary. A read may bring what was
-            there before this very program's last write, and, once another server had to be asked (one replica
-            is kept to as long as it answers), even what was there before its last read. What stays: each read
-            is of one instant, document and arrays together, and what a replica does not have is asked of the
-            primary, so that MissingKey is as true as ever. Writes, `edit()`, arithmetic, subscribers, `watch()`
-            and recordings stay with primaries, and `state` tells of them alone. See docs/fleet.md.
         local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
             through shared memory, where that can be had; the server has every update all the same, and whatever goes
             wrong on the way, the subscriber fetches it there. "off": always from the server. "early": what this
@@ -75,7 +67,6 @@ class RedisInterface:
         *,
         namespace: str = "",
         timeout: float = 1.0,
-        read_from_replicas: bool = False,
         local: Literal["auto", "off", "early"] = "auto",
         local_memory: int = MEMORY,
         **options: Any,
@@ -86,7 +77,7 @@ class RedisInterface:
             options["port"], ships = ships, None
         if host is None:
             host = os.environ.get("REEM_URL") or "localhost"
-        settings = {"namespace": namespace, "timeout": timeout, "read_from_replicas": read_from_replicas}
+        settings = {"namespace": namespace, "timeout": timeout}
         settings |= {"local": local, "local_memory": local_memory}
         self._given = (getattr(host, "url", host), ships, {**settings, **options})
         self.session = Session(
@@ -96,7 +87,6 @@ class RedisInterface:
             timeout,
             options,
             self._new_transport,
-            replicas=read_from_replicas,
             local=LocalPath(local, local_memory),
         )
         self.session.interface = self

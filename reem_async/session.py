@@ -140,7 +140,6 @@ class Session:
         timeout: Seconds without a byte moving after which a call is given up.
         options: redis-py's connection options.
         new_transport: Makes the transport to one server.
-        replicas: What a user reads comes from replicas.
         local: The shared memory of publishers, and of those who listen to them; None for the usual.
 
     Attributes:
@@ -148,7 +147,6 @@ class Session:
         cache: What is known of the server.
         local: The shared memory of publishers, and of those who listen to them.
         transport: The way to the server.
-        readers: The way for what a user reads for its own sake, not to act on it; the same if it is not for replicas.
         interface: The interface this belongs to: what is pickled in its place.
         subscriptions: The subscription manager, made when something is first followed; see `pubsub.manager.manager_of`.
         tasks: What runs in the background for publishers; ended by `close`.
@@ -165,7 +163,6 @@ class Session:
         options: dict[str, Any],
         new_transport: NewTransport,
         *,
-        replicas: bool = False,
         local: LocalPath | None = None,
     ) -> None:
         self.namespace = check_namespace(namespace)
@@ -173,7 +170,7 @@ class Session:
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
-        self.options, self.transport, self.readers = way_to(host, timeout, options, new_transport, replicas=replicas)
+        self.options, self.transport = way_to(host, timeout, options, new_transport)
         self.local = local or LocalPath()
         self.interface: Any = None
         self._numbers = _Numbers()
@@ -261,8 +258,7 @@ class Session:
         subscriptions, self.subscriptions = self.subscriptions, None
         # The last comes first, and each is taken, also if one is cancelled.
         async with contextlib.AsyncExitStack() as steps:
-            # `readers` may be the way to replicas, which closes the one to the primary with it.
-            steps.push_async_callback(self.readers.release)
+            steps.push_async_callback(self.transport.release)
             steps.push_async_callback(self.tasks.end)
             if subscriptions is not None:
                 steps.push_async_callback(subscriptions.close)
@@ -276,7 +272,7 @@ class Session:
             steps.callback(self._tell_of_end)
             # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has
             # kept.
-            steps.push_async_callback(self.readers.close)
+            steps.push_async_callback(self.transport.close)
             if self.subscriptions is not None:
                 steps.push_async_callback(self.subscriptions.close)
 

@@ -27,7 +27,6 @@ ARGUMENT = re.compile(r"(?<![?&\w])[a-z][a-z_]+=(?!\{\})|RedisInterface\((?!\{\}
 """What a message advises a program: `timeout=`, `RedisInterface(...)`. `timeout={}` complains of what was given."""
 
 OF_PROGRAMS = {
-    "transport/endpoints.py": ["read_from_replicas=True: the address"],  # no command has it
     "transport/options.py": [
         "leave protocol= out",  # named as it stands in the URL
         "leave ssl= out",  # likewise

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import BadData, MissingKey, WrongType
+from ..errors import MissingKey, WrongType
 from ..plan import Plan
 from ..plan.paths import Path, check_name, show
 from ..plan.reads import RawRead, awaited, exists, first_read, has_key, interpreted, keys_at, length, read, type_of
@@ -31,19 +31,8 @@ class DocumentReader:
 
     async def read(self, path: Path) -> Any:
         """Return the value at `path`; raises MissingKey."""
-        session = self.session
-        at = session.readers
-        if session.ships.asynchronous:
-            await session.ships.ready()
-        try:
-            raw_read: RawRead = await session.run(self._reading(path), at)
-            return await opened(raw_read) if raw_read.slots else raw_read.holder[0]
-        except BadData:
-            # The primary itself has a document that names arrays which are not there: that is damage, not lag.
-            if at is session.transport:
-                raise
-        # From a replica of a node that gives up a slot, arrays may have gone before their document.
-        return await opened(await self.raw_read(path))
+        raw_read = await self.raw_read(path)
+        return await opened(raw_read) if raw_read.slots else raw_read.holder[0]
 
     async def no_item(self, path: Path) -> MissingKey:
         """Return the error for an item that is not there: it may be one of an array."""
@@ -61,7 +50,7 @@ class DocumentReader:
 
     async def exists(self) -> bool:
         """Return whether there is a document under the key."""
-        found: bool = await self.session.run(exists(self.keys), self.session.readers)
+        found: bool = await self.session.run(exists(self.keys))
         return found
 
     async def raw_read(self, path: Path) -> RawRead:
@@ -74,12 +63,12 @@ class DocumentReader:
     async def contains_at(self, path: Path, key: object) -> bool:
         """Return whether the dict at `path` has the key."""
         name = check_name(key, (self.name, *path))
-        found: bool = await self.session.run(has_key(self.keys, path, name), self.session.readers)
+        found: bool = await self.session.run(has_key(self.keys, path, name))
         return found
 
     async def keys_at(self, path: Path) -> list[str]:
         """Return the keys of the dict at `path`."""
-        names: list[str] = await self.session.run(keys_at(self.keys, path), self.session.readers)
+        names: list[str] = await self.session.run(keys_at(self.keys, path))
         return names
 
     def _reading(self, path: Path) -> Plan:
@@ -91,12 +80,12 @@ class DocumentReader:
     async def type_at(self, path: Path) -> type:
         """Return the Python type of the value at `path`."""
         await self.session.ships.ready()
-        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships), self.session.readers)
+        kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships))
         return type(await self.read(path)) if kind is None else kind
 
     async def length_at(self, path: Path) -> int:
         """Return the length of the value at `path`."""
-        count: int | None = await self.session.run(length(self.keys, path), self.session.readers)
+        count: int | None = await self.session.run(length(self.keys, path))
         if count is not None:
             return count
         # A text or an array: the server knows the length of its placeholder only.

@@ -94,7 +94,6 @@ class ClusterTransport(Rooted):
         # By slot; None before the first look, and for slots that no node has.
         self._owners: list[Transport | None] = [None] * SLOTS
         self._primaries: tuple[Address, ...] = ()
-        self._replicas: dict[Transport, tuple[Address, ...]] = {}
         # When a node did not answer last: it is asked for the layout behind all others.
         self._failed: dict[Address, float] = {}
         # Nodes that a connection was lost to, and that nobody has reached since.
@@ -192,18 +191,6 @@ class ClusterTransport(Rooted):
             raise NotConnected(f"no node of the cluster at {self._options.address} has slot {slot} at the moment")
         return found
 
-    async def replicas(
-        self, slot: int | None, *, anew: bool = False, suspects: Collection[Address] = ()
-    ) -> Sequence[Address]:
-        """Return where the replicas are of the node that has `slot`; `anew` to look, rather not through `suspects`.
-
-        Raises:
-            NotConnected: No node answers, or none has it.
-        """
-        if anew:
-            await self.look(suspects)
-        return () if slot is None else self._replicas.get(await self.owner_of(slot), ())
-
     # The layout.
 
     async def look(self, suspects: Collection[Address] = ()) -> None:
@@ -266,15 +253,14 @@ class ClusterTransport(Rooted):
     def _learn(self, ranges: Sequence[Any], asked: str) -> None:
         owners: list[Transport | None] = [None] * SLOTS
         primaries: dict[Address, None] = {}
-        replicas: dict[Transport, tuple[Address, ...]] = {}
         for first, last, *rows in ranges:
-            address, *others = [_address(host, port, asked) for host, port, *_ in rows]
+            host, port, *_ = rows[0]
+            address = _address(host, port, asked)
             primaries[address] = None
             owner = self._node(address)
             # CLUSTER SLOTS names ranges, both ends included; of each the primary first.
             owners[first : last + 1] = [owner] * (last + 1 - first)
-            replicas[owner] = tuple(others)
-        self._owners, self._primaries, self._replicas = owners, tuple(primaries), replicas
+        self._owners, self._primaries = owners, tuple(primaries)
         if self._gone:
             self._gone.intersection_update(primaries)  # the others are not needed any more
             if not self._gone:

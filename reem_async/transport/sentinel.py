@@ -13,7 +13,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Awaitable, Callable, Collection, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import AbstractAsyncContextManager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
@@ -209,12 +209,6 @@ def _check_role(role: Any, connection: Any) -> None:
         raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
 
 
-def _is_up(row: dict[bytes, bytes]) -> bool:
-    """Return whether a replica is up, and hears from its primary, as far as the sentinel knows."""
-    flags = row.get(b"flags", b"")
-    return row.get(b"master-link-status") == b"ok" and not any(word in flags for word in _UNFIT)
-
-
 class SentinelTransport(Standing):
     """Connections to the primary of the moment.
 
@@ -238,7 +232,6 @@ class SentinelTransport(Standing):
         self._listening: list[weakref.ref[Wire]] = []
         self._lookout: _Lookout | None = None
         self._moved = False
-        self._replicas: tuple[Address, ...] = ()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` to the primary and return their replies.
@@ -324,29 +317,6 @@ class SentinelTransport(Standing):
     async def nodes(self) -> Sequence[Transport]:
         """Return the way to the primary alone."""
         return (self,)
-
-    async def replicas(
-        self, slot: int | None, *, anew: bool = False, suspects: Collection[Address] = ()
-    ) -> Sequence[Address]:
-        """Return where the replicas are that the sentinels said to be up; `anew` asks them once more."""
-        if anew:
-            self._replicas = await self._asked_for_replicas()
-        return self._replicas
-
-    async def _asked_for_replicas(self) -> tuple[Address, ...]:
-        for options in self._options.sentinels():
-            sentinel = self._new_transport(options)
-            try:
-                (reply,) = await sentinel.roundtrip([("SENTINEL", "REPLICAS", self._options.service)])
-            except (NotConnected, ConnectionLost):
-                continue
-            finally:
-                await sentinel.close()
-            if isinstance(reply, Refused):
-                raise reply.at(options.address)
-            if isinstance(reply, list):  # else it does not know the service, or is no sentinel
-                return tuple([(row[b"ip"].decode(), int(row[b"port"])) for row in reply if _is_up(row)])
-        return ()
 
     async def close(self) -> None:
         """Close all connections."""
