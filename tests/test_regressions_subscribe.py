@@ -120,46 +120,6 @@ async def test_a_cancelled_large_publish_and_a_later_small_one_keep_their_order(
             await aeventually(lambda number=number: repr(mirror.value()) == repr(number))
 
 
-class ComplexShip(reem_async.SpecialDatatypeShip):
-    """One that not everybody has."""
-
-    def check_fit(self, value):
-        return isinstance(value, complex)
-
-    def write(self, key, value, client):
-        client.set(key, str(value))
-
-    def read(self, key, client):
-        client.get(key)
-
-    def interpret_read(self, responses):
-        return complex(responses[0].decode())
-
-    def get_label(self):
-        return "complex"
-
-
-async def test_after_an_unreadable_update_a_mirror_ends_equal_and_a_gap_is_told(server_url, ainterface, akvs, key):
-    """A small update that comes later is not applied to what is out of date."""
-    async with RedisInterface(server_url, ships=[ComplexShip()]) as knowing:
-        space = PublishSpace(knowing)
-        await space[key()].write({"a": 1})
-        updates = akvs[key()].watch(Every(100))
-        async with Mirror(key(), ainterface) as mirror, updates:
-            await space[key()].write({"a": 2, "x": 1j})
-            await space[key()]["b"].write(3)
-            await space[key()]["x"].write(0)
-            await aeventually(lambda: mirror.value() == {"a": 2, "x": 0, "b": 3})
-            await aeventually(lambda: len(updates.queue._items) >= 2)
-            await space[key()]["b"].write(4)
-            await aeventually(lambda: mirror["b"].read() == 4)
-        heard = taken(updates)
-        assert [update.data for update in heard[:2]] == [{"a": 1}, {"a": 2, "x": 0, "b": 3}]
-        assert [update.gap for update in heard[:2]] == [False, True]
-        assert heard[-1].data == {"a": 2, "x": 0, "b": 4}
-        assert not heard[-1].gap
-
-
 # --- closing --------------------------------------------------------------------------------------
 
 
