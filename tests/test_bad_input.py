@@ -315,6 +315,20 @@ def test_the_server_never_calculates_near_the_end_of_its_range(front, key, raw):
     assert front.read(path) == 10
 
 
+@pytest.mark.parametrize(("method", "operand"), [("increment", 5), ("multiply", 10)])
+def test_a_number_that_others_made_large_meanwhile_is_put_back(front, open_front, key, method, operand):
+    """The interface last saw a small one, so it has the server calculate."""
+    path, other = [key(), "n"], open_front()
+    for large in (2**63 - 1, 2**64 - 1):
+        front.write([key()], {"n": 1})
+        for _ in range(2):
+            front.multiply(path, 2)
+        other.write(path, large)
+        with pytest.raises(Overflow, match=str(large)):
+            getattr(front, method)(path, operand)
+        assert_same(other.read(path), large)
+
+
 # --- the interface ---------------------------------------------------------------------------------
 
 

@@ -20,7 +20,7 @@ from test_connection import stopped
 
 import reem
 import reem_async
-from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected
+from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected, PartialWrite
 from reem_async.server import EmbeddedServer
 from reem_async.transport.blocking import BlockingTransport
 from reem_async.transport.options import Options
@@ -198,6 +198,22 @@ async def test_what_greets_and_hangs_up_is_not_connected_to_without_end():
         await interface.close()
     assert len(asked) <= 2
     assert states == ["lost", "closed"]
+
+
+async def test_a_write_that_loses_the_server_before_its_last_step_says_so(server):
+    """The document is written; arrays of which this interface did not know need one more connection."""
+    with redis.Redis(port=server.port) as admin:
+        async with reem_async.RedisInterface(server) as one, reem_async.RedisInterface(server) as two:
+            await reem_async.KeyValueStore(one)["cam"].write({"image": np.arange(5)})
+            cam = reem_async.KeyValueStore(two)["cam"]
+            await reem_async.KeyValueStore(two)["warm"].write(1)
+            admin.config_set("maxclients", admin.info("clients")["connected_clients"])
+            with pytest.raises(PartialWrite, match="the document was written, but arrays"):
+                await cam.write({})
+            admin.config_set("maxclients", 10_000)
+            assert await cam.read() == {}
+            await cam.write({})
+        assert {name for name in admin.scan_iter() if b"cam" in name} == {b"cam"}
 
 
 @pytest.mark.parametrize("turns", [0, 1, 2, 5])
