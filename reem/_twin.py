@@ -12,7 +12,8 @@ Class = TypeVar("Class", bound=type)
 
 def for_plain_code(text: str) -> str:
     """Return a docstring of the core in the words of plain code: its loops and blocks wait by themselves."""
-    for of_asyncio, plain in (("an async iterator", "an iterator"), ("async for", "for"), ("async with", "with")):
+    words = (("an async iterator", "an iterator"), ("async ", ""), ("await ", ""), ("reem_async", "reem"))
+    for of_asyncio, plain in words:
         text = text.replace(of_asyncio, plain)
     return text
 

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import array
 import asyncio
+import collections
 import dataclasses
 import datetime
 import decimal
 import enum
 import fractions
+import pathlib
 import uuid
 
 import numpy as np
@@ -378,3 +380,36 @@ def test_housekeeping_is_all_that_is_not_counted(front, key, raw):
     before = commands_run(raw)
     front.write([key()], 1)
     assert commands_run(raw) != before
+
+
+@dataclasses.dataclass
+class Pose:
+    x: float = 1.0
+
+
+def of_library(module, name):
+    """An object of a class of that name, as a library has it, or one derived from it."""
+    return type("Derived", (type(name, (), {"__module__": module}),), {"__module__": "mine"})()
+
+
+@pytest.mark.parametrize(
+    ("value", "instead"),
+    [
+        (Pose(), "use dataclasses.asdict(value)"),
+        (pathlib.Path("/x"), "use str(value)"),
+        (uuid.uuid4(), "use str(value)"),
+        (memoryview(b"abc"), "use bytes(value), or np.asarray(value)"),
+        (range(3), "use list(value)"),
+        (collections.UserDict(a=1), "use dict(value)"),
+        (of_library("PIL.Image", "Image"), "use np.asarray(value)"),
+        (of_library("pandas.core.frame", "DataFrame"), "use value.to_dict('list'), or value.to_numpy()"),
+        (of_library("polars.dataframe.frame", "DataFrame"), "use value.to_dict(as_series=False), or value.to_numpy()"),
+        (of_library("torch", "Tensor"), "use value.numpy(force=True)"),
+        (Pose, "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"),
+    ],
+    ids=lambda it: type(it).__name__,
+)
+def test_a_refusal_says_the_line_to_write(kvs, key, value, instead):
+    with pytest.raises(BadType) as caught:
+        kvs[key()] = {"a": [value]}
+    assert str(caught.value).endswith(f"cannot be stored; {instead}")

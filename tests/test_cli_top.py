@@ -154,3 +154,9 @@ def test_a_server_on_the_port_is_named(cli, server_url):
     run = subprocess.run([REEM, "up", "--port", port], capture_output=True, text=True, timeout=30, check=False)
     assert run.returncode == 1
     assert f"connect to redis://localhost:{port}" in run.stderr
+
+
+def test_q_ends_top_and_gives_the_terminal_back(cli, robot):
+    shown, code = cli.in_terminal("top", keys=[(b"cam", b"x"), (b"cam", b"q")])
+    assert code == 0
+    assert "updates of 2 paths" in shown

@@ -130,6 +130,21 @@ def test_the_newest_of_each_place_is_sent_when_the_server_is_back(publisher, ser
     assert caplog.text.count("until the server is back") == 1
 
 
+def test_closing_in_an_outage_does_not_say_that_the_server_answers(publisher, server, caplog):
+    front = publisher("drop")
+    front.write(["a"], 1)
+    lose(front, server)
+    outages = getattr(front.kvs, "_core", front.kvs)._outages
+
+    async def closed_meanwhile(out):
+        outages.close()
+        return False
+
+    outages._answers = closed_meanwhile
+    front.eventually(lambda: outages._asking is False)
+    assert "the server answers again" not in caplog.text
+
+
 def test_updates_are_dropped_and_counted(publisher, server, reader, caplog):
     front = publisher("drop")
     front.write(["a"], 1)

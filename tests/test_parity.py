@@ -121,7 +121,9 @@ def test_twins_promise_the_same(name):
             assert summary(getattr(blocking, method)), f"{name}.{method} has no docstring"
             promised = for_plain_code(summary(getattr(core, method)))
             assert summary(getattr(blocking, method)) == promised, f"{name}.{method}"
-            assert "async" not in (getattr(blocking, method).__doc__ or "").replace("asyncio", ""), f"{name}.{method}"
+            said = (getattr(blocking, method).__doc__ or "").replace("asyncio", "")
+            assert "async" not in said, f"{name}.{method}"
+            assert "await " not in said, f"{name}.{method}"
 
 
 def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():

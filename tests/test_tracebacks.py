@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import traceback
 
 import numpy as np
@@ -103,3 +104,18 @@ async def test_of_several_calls_that_share_a_failure_each_says_so_in_one_line():
             assert isinstance(error, NotConnected)
             assert error.__cause__ is None
             assert len(shown(error)[1]) <= 3
+
+
+FOLLOWING = {
+    "mirror": lambda interface: reem.SilentSubscriber("a", interface).listen(),
+    "callback": lambda interface: reem.CallbackSubscriber("a", interface, print, {}).listen(),
+    "watch": lambda interface: next(iter(reem.KeyValueStore(interface)["a"].watch())),
+}
+
+
+@pytest.mark.parametrize("begin", FOLLOWING.values(), ids=FOLLOWING)
+def test_a_subscriber_that_starts_before_its_server_says_so_in_a_few_lines(begin):
+    interface = reem.RedisInterface("redis://127.0.0.1:1")
+    with contextlib.closing(interface), pytest.raises(NotConnected) as caught:
+        begin(interface)
+    check(caught.value, 7)

@@ -13,7 +13,7 @@ import datetime
 import enum
 import marshal
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -360,9 +360,25 @@ class _AskingWalker(_Walker):
         return [self.convert(item, (*path, index)) for index, item in enumerate(value)]
 
 
+# By library and class, since none of them is imported here: what to store in place of an object.
+_LIBRARIES = {
+    ("pandas", "DataFrame"): "value.to_dict('list'), or value.to_numpy()",
+    ("pandas", "Series"): "value.to_numpy()",
+    ("polars", "DataFrame"): "value.to_dict(as_series=False), or value.to_numpy()",
+    ("polars", "Series"): "value.to_numpy()",
+    ("pyarrow", "Table"): "value.to_pydict()",
+    ("PIL", "Image"): "np.asarray(value)",
+    ("torch", "Tensor"): "value.numpy(force=True)",
+}
+
+
 def _remedy(value: Any) -> str:
     """Return what to do with a value that cannot be stored."""
-    import numbers  # whoever stores what can be stored need not wait for it
+    # Imported here: a program whose values can all be stored does not wait for them.
+    import dataclasses
+    import numbers
+    import pathlib
+    import uuid
 
     remedies: tuple[tuple[Any, str], ...] = (
         (enum.Enum, "store its .value or .name"),
@@ -373,10 +389,20 @@ def _remedy(value: Any) -> str:
         (datetime.timedelta, "use value.total_seconds()"),
         (np.ma.MaskedArray, "use {'data': x.filled(0), 'mask': np.ma.getmaskarray(x)}, or a ship for its class"),
         ((np.ndarray, array.array), _array_remedy(value)),
-        ((bytes, bytearray, memoryview), "add BytesShip() to the interface's ships, or use bytes(value)"),
+        ((bytes, bytearray), "add BytesShip() to the interface's ships, or use bytes(value)"),
+        (memoryview, "use bytes(value), or np.asarray(value)"),
+        (pathlib.PurePath, "use str(value)"),
+        (uuid.UUID, "use str(value)"),
+        (Mapping, "use dict(value)"),
+        (Iterable, "use list(value)"),
     )
     if (how := getattr(value, "_how_to_read", None)) is not None:
         return f"it is a handle: store the value there, with {how}"
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return "use dataclasses.asdict(value)"
+    for kind in type(value).__mro__:
+        if (how := _LIBRARIES.get((kind.__module__.partition(".")[0], kind.__name__))) is not None:
+            return f"use {how}"
     anything = "convert it to plain values, or write a ship for this type (see SpecialDatatypeShip)"
     return next((text for kinds, text in remedies if isinstance(value, kinds)), anything)
 

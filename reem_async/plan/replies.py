@@ -205,7 +205,8 @@ def settable(keys: Keys, path: Path) -> Plan:
                 raise refusal(f"{whole}: there is no {outer} to write into")
             if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
                 # To the server an array is a short text.
-                hint = "; write an array as a whole" if kind == "string" and isinstance(inner, int) else ""
+                is_array = kind == "string" and isinstance(inner, int)
+                hint = "; or it is an array: change a copy and write an array as a whole" if is_array else ""
                 raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}{hint}")
         if kinds[-1] is None and isinstance(path[-1], int):
             raise out_of_range(keys, path)

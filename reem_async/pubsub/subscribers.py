@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, chosen
 from ..concurrency.streams import Following, Stream
 from ..connection import RedisInterface
-from ..errors import BadType, InterfaceClosed, MissingKey, ReadOnly
+from ..errors import BadType, InterfaceClosed, MissingKey, NotConnected, ReadOnly
 from ..plan.arguments import check_instance
 from ..plan.handles import Handle
 from ..plan.keys import Keys
@@ -100,8 +100,10 @@ class Link:
                     if self.closed:  # meanwhile
                         await manager.unfollow(self.follower)
                         raise InterfaceClosed("this subscription was closed before it began")
-                except BaseException:
+                except BaseException as error:
                     self.follower = None
+                    if isinstance(error, NotConnected):  # its message says it all
+                        raise error.with_traceback(None) from None
                     raise
 
     async def unfollow(self) -> None:

@@ -402,15 +402,23 @@ class Accessor(Handle):
         return Edit(self._reader, self._writer, self._path)
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
-        """Return an async iterator over the value here, first as it is, then each time it is changed, by whomever.
+        """Return an async iterator over the value here, first as it is, then each time any client changes it.
 
-        What is published is told update by update. What is only stored (by a KeyValueStore, another language,
-        redis-cli, an expiry, ...) is told as the state that it led to; `update.origin` says so. Several changes in a
-        short time may be one update, the last state is always told, and nothing if nothing differs.
+        Example:
+            async for update in kvs["arm"].watch():
+                print(update.path, update.value, update.data)
+
+        An update holds `path` (what changed, such as "arm.joint"), `value` (what was written there), `data` (all that
+        is here now), `time`, `origin` ("published" or "stored"), `deleted`, `initial` (the value that was here
+        already), and `gap` and `missed` (updates before it were lost).
+
+        Published updates arrive one by one. Plain writes (by a KeyValueStore, another language, redis-cli, an expiry,
+        ...) arrive as the state they led to: several in a short time may be one update, and the last state always
+        arrives.
 
         Args:
             policy: What to keep for a loop that is slower than the updates: `Newest()` (the
-                default), `Last(n)` or `Every(bound)`.
+                default), `Last(n)` or `Every(bound)`, all from `reem_async`, such as `reem_async.Last(100)`.
             stored: Yield what is only stored, too. It needs the right to use CLIENT TRACKING; without, a warning is
                 logged, and what is published is told.
         """

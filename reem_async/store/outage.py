@@ -146,6 +146,7 @@ class Outage:
         """Know of no outage, as a forked child does: what is kept is for its parent to send."""
         self._out: dict[str, _Out] = {}  # by document
         self._dropped: dict[str, int] = {}  # likewise: counted in a key's turn, so that threads lose no count
+        self._is_closed = False
         self._told = 0  # how many were dropped when the last outage began
         self._asking: asyncio.AbstractEventLoop | bool = (
             False  # a task asks whether the server is back, in this event loop
@@ -283,6 +284,7 @@ class Outage:
                 self._asking = False
         if self._out:  # a call has come just before
             self._have_asked()
+        if self._out or self._is_closed:
             return
         logger.warning("the server answers again; %d updates were dropped", self.dropped - self._told)
 
@@ -346,6 +348,7 @@ class Outage:
 
     def close(self) -> None:
         """Give up what is kept."""
+        self._is_closed = True
         left, self._out = self._out, {}
         for out in left.values():
             self._count(out.writer.keys, len(out.kept))

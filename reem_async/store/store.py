@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 from ..concurrency.queues import Policy
 from ..connection import RedisInterface
-from ..errors import BadType, MissingKey
+from ..errors import BadType, MissingDocument, MissingKey
 from ..plan.paths import parse
 from ..pubsub.pattern_watch import PatternWatch
 from ..session import Session
@@ -101,10 +101,12 @@ class KeyValueStore:
         place = self.at(path)
         try:
             return await place._reader.read(place._path)
-        except MissingKey:
-            if default is _NOTHING:
+        except MissingKey as error:
+            if default is not _NOTHING:
+                return default
+            if isinstance(error, MissingDocument) or not isinstance(place.full_path[-1], int):
                 raise
-            return default
+        raise await place._reader.no_item(place._path)
 
     async def contains(self, key: str) -> bool:
         """Return whether a top-level key is there. One round trip.

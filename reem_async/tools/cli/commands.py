@@ -37,7 +37,13 @@ class Entry(NamedTuple):
 
 COMMANDS = (
     Entry("up", "up", "up", SERVER, "Start a private server and keep it up until Ctrl-C."),
-    Entry("demo", "demo", "demo", SERVER, "Start a simulated robot, and show it in the web browser."),
+    Entry(
+        "demo",
+        "demo",
+        "demo",
+        SERVER,
+        "Start a simulated robot and show it on a page in the web browser, until Ctrl-C.",
+    ),
     Entry("doctor", "doctor", "doctor", SERVER, "Check server, connection and installation, and say what to do."),
     Entry("migrate", "legacy.command", "migrate", SERVER, "Convert what REEM 0.1 or older has stored, in place."),
     Entry("ls", "listing", "ls", LOOK, "List keys with type and size."),

@@ -45,8 +45,8 @@ def demo(
     another terminal. The server is private and in memory; its data is gone when the command ends.
 
     Examples:
-      reem demo
-      reem demo --no-open     on a machine without a screen
+        reem demo
+        reem demo --no-open     on a machine without a screen
     """
     code = guarded("demo", lambda: _run(port, page_port, open_), live=True)
     if code:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,6 +19,7 @@ from reem_async.tools.cli.output import (
     emit_json,
     is_terminal,
     json_text,
+    note,
     size_text,
     styled,
     typed,
@@ -28,7 +30,7 @@ from reem_async.tools.cli.wording import for_users
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
-    from reem_async.plan.paths import Pattern
+    from reem_async.plan.paths import Path, Pattern
     from reem_async.pubsub.monitor import Event
 
 __all__ = ["echo"]
@@ -52,7 +54,7 @@ def echo(
     Every update that is published, with the time of the publisher's clock. What is only stored, by whomever, is marked
     so and printed as what it led to, with the time at which it was found ("stored" in JSON): several changes in a
     moment may be one line. Of a path that is asked for, only what is there is printed. Values over 16 KB do not
-    travel with the notice: their size is printed; of stored arrays, type and shape. Updates that were lost or
+    travel with the notice: their size is printed, and of arrays type and shape. Updates that were lost or
     skipped are told in a line that begins with #; in JSON they are "missed", "gap" and "skipped". With --fetch, what
     cannot be read has the reason in its place, in JSON as "error".
 
@@ -90,13 +92,45 @@ def echo(
             if as_json:
                 emit_json(_for_programs(event, value if known else None, known, problem, new))
                 return
-            for line in _for_people(event, value, known, problem, new, cut_lines=is_terminal() and not full):
+            kind = "" if known or not event.size else await _kind(interface, event.path)
+            for line in _for_people(event, value, known, problem, new, kind, cut_lines=is_terminal() and not full):
                 emit(line)
             sys.stdout.flush()
 
+        await _say_what_is_waited_for(interface, patterns or ())
         return (await follow(interface, patterns or (), take, count=count, seconds=timeout, stored=True)).tell()
 
     run("echo", work, url, namespace, live=True)
+
+
+async def _kind(interface: RedisInterface, path: Path) -> str:
+    """Return what is at a path now, arrays as type and shape: one round trip, in which none is fetched."""
+    from reem_async.errors import RedisError, ReemError
+    from reem_async.store.catalog import outline
+    from reem_async.tools.cli.outlines import as_data, describe
+
+    try:
+        node = await outline(interface, path)
+    except (ReemError, RedisError):
+        return ""
+    text = describe(node, 200)
+    if node.kind == "dict" and len(shown := json_text(as_data(node))) <= 1000:
+        text = shown
+    return f"{text}, "
+
+
+async def _say_what_is_waited_for(interface: RedisInterface, patterns: Sequence[str]) -> None:
+    """Say which of the paths are not there yet: nothing is printed until they are written."""
+    from reem_async.errors import MissingKey, RedisError, ReemError
+    from reem_async.store.catalog import outline
+
+    for path in patterns:
+        if not any(mark in path for mark in "*?"):
+            with suppress(ReemError, RedisError):
+                try:
+                    await outline(interface, path)
+                except MissingKey:
+                    note(f"nothing is stored at {path} yet: waiting for it")
 
 
 def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
@@ -138,7 +172,9 @@ def _for_programs(event: Event, value: Any, known: bool, problem: str, skipped: 
     return entry | {"missed": event.missed, "gap": event.gap, "skipped": skipped}
 
 
-def _for_people(event: Event, value: Any, known: bool, problem: str, skipped: int, *, cut_lines: bool) -> list[str]:
+def _for_people(
+    event: Event, value: Any, known: bool, problem: str, skipped: int, kind: str, *, cut_lines: bool
+) -> list[str]:
     lines = []
     if event.missed:
         # In the place where they were lost, so that the order of what is printed is the order of what happened.
@@ -155,7 +191,7 @@ def _for_people(event: Event, value: Any, known: bool, problem: str, skipped: in
     elif problem:
         what = f"<{clean(problem)}>"
     else:
-        what = f"<{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
+        what = f"<{kind}{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
     # The path has at most half of the line, the value the rest.
     if cut_lines:
         room = width() - len(moment) - 4 - 10 * event.stored

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from pathlib import Path
+from contextlib import suppress
+from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Url
 from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width
-from reem_async.tools.cli.running import Refused, run
+from reem_async.tools.cli.running import NOTHING, Refused, run
 from reem_async.tools.cli.values import FILES
 from reem_async.tools.partfile import there_already
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
+    from reem_async.errors import MissingKey
+    from reem_async.plan.paths import Path
     from reem_async.store.catalog import Outline
 
 __all__ = ["get"]
@@ -30,7 +33,7 @@ _MOST_FOR_PREVIEW = 256_000_000
 def get(
     path: PathArgument,
     output: Annotated[
-        Path | None,
+        FilePath | None,
         typer.Option(
             "--output",
             "-o",
@@ -59,7 +62,7 @@ def get(
 
     Examples:
         reem get foo.bar.subkey
-        reem get robot.joints[0]
+        reem get robot.joints[0]     an element of a list or of an array
         reem get robot.name --raw
         reem get cam.image -o image.png
         reem get pose --json | jq .x
@@ -70,18 +73,30 @@ def get(
         raise typer.BadParameter(f"{output}: the name of a file ends in one of {', '.join(FILES)}")
 
     async def work(interface: RedisInterface) -> None:
+        import numpy as np
+
+        from reem_async.errors import MissingKey
         from reem_async.store.catalog import outline
         from reem_async.store.store import KeyValueStore
-        from reem_async.tools.cli.values import save
+        from reem_async.tools.cli.values import preview, save
 
         if output is not None and output.exists() and not force:
             raise there_already(output)
         store = KeyValueStore(interface)
+        # First what it is, without arrays: then what is too large to be shown is not fetched.
+        try:
+            node = await outline(interface, store.at(path).full_path)
+        except MissingKey as missing:
+            item = await _item(interface, store.at(path).full_path, missing)
+            if output is not None:
+                note(save(item, output, path, replace=force))
+            else:
+                shown = isinstance(item, np.ndarray) and not as_json
+                emit(preview(item, width() if is_terminal() else 100) if shown else json_text(item))
+            return
         if output is not None:
             note(save(await store.get(path), output, path, replace=force))
             return
-        # First what it is, without arrays: then what is too large to be shown is not fetched.
-        node = await outline(interface, store.at(path).full_path)
         if not as_json:
             emit(await _shown(lambda: store.get(path), node, raw=raw))
             return
@@ -89,6 +104,27 @@ def get(
         emit(json_text(await store.get(path)))
 
     run("get", work, url, namespace)
+
+
+async def _item(interface: RedisInterface, path: Path, missing: MissingKey) -> Any:
+    """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
+    from reem_async.errors import MissingKey
+    from reem_async.plan.paths import show
+    from reem_async.store.catalog import outline
+    from reem_async.store.reader import DocumentReader
+
+    for end in range(len(path) - 1, 0, -1):
+        if not isinstance(path[end], int):
+            break
+        with suppress(MissingKey):
+            if (await outline(interface, path[:end])).kind != "numpy":
+                break
+            array = await DocumentReader(interface.session, path[0]).read(path[1:end])
+            try:
+                return array[path[end:]]
+            except IndexError as error:
+                raise Refused(f"{show(path)}: {error}", NOTHING) from None
+    raise missing
 
 
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:

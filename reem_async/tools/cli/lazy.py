@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
+from itertools import takewhile
 from typing import Any
 
 import typer
@@ -44,8 +46,22 @@ def command_of(entry: Entry) -> Any:
         return group.commands[entry.name]
     # Else -1.5 would be taken for an option; real options still come first.
     settings = {"ignore_unknown_options": True} if entry.takes_minus else {}
-    holder.command(entry.name, help=help_text(thing.__doc__ or ""), context_settings=settings)(thing)
+    kind = _MinusCommand if entry.takes_minus else TyperCommand
+    holder.command(entry.name, cls=kind, help=help_text(thing.__doc__ or ""), context_settings=settings)(thing)
     return typer.main.get_command(holder)
+
+
+class _MinusCommand(TyperCommand):
+    """Takes values such as -1.5. No value begins with two minus signs, unless it stands behind `--`."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        known = {name for parameter in self.params for name in (*parameter.opts, *parameter.secondary_opts)}
+        for word in takewhile(lambda each: each != "--", args):
+            name = word.partition("=")[0]
+            if name.startswith("--") and name not in known and name != "--help":
+                close = get_close_matches(name, known, 1)
+                ctx.fail(f"there is no option {name}" + (f"; did you mean {close[0]}?" if close else ""))
+        return super().parse_args(ctx, args)
 
 
 def help_text(docstring: str) -> str:

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+import sys
 import textwrap
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -19,7 +24,7 @@ if TYPE_CHECKING:
     from reem_async.tools.cli.board import Board
     from reem_async.tools.cli.windows import Window
 
-__all__ = ["Picture"]
+__all__ = ["Picture", "ended_by_q"]
 
 # Seconds of silence after which a row is dimmed.
 _STALE_SECONDS = 2.0
@@ -27,6 +32,30 @@ _SHORTEST_PATH = 12
 """Characters of a path that are kept before columns are left out for it."""
 _BETWEEN = 2
 """Blanks between two columns."""
+
+
+@contextmanager
+def ended_by_q() -> Iterator[None]:
+    """Cancel this task when `q` is typed, if the terminal is this program's own to read from."""
+    if not sys.stdin.isatty() or sys.platform == "win32" or os.tcgetpgrp(fd := sys.stdin.fileno()) != os.getpgrp():
+        yield
+        return
+    import termios
+    import tty
+
+    task, loop, before = asyncio.current_task(), asyncio.get_running_loop(), termios.tcgetattr(fd)
+
+    def typed() -> None:
+        if b"q" in os.read(fd, 64).lower() and task is not None:
+            task.cancel()
+
+    tty.setcbreak(fd)  # keys come at once and are not shown; Ctrl-C stays a signal
+    loop.add_reader(fd, typed)
+    try:
+        yield
+    finally:
+        loop.remove_reader(fd)
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
 class Picture:
@@ -55,7 +84,7 @@ class Picture:
 
     def _drawn(self) -> RenderableType:
         if not self._board.windows:
-            return Text(f"{self._waiting} (Ctrl-C ends)", style="dim")
+            return Text(f"{self._waiting} (q or Ctrl-C ends)", style="dim")
         rows = sorted(self._board.windows.items(), key=lambda pair: pair[0])
         notes = self._notes()
         # One line is the table's head, and one is left for the cursor: what lies lower is cut off.

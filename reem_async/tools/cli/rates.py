@@ -66,10 +66,10 @@ def _command(
 
         async def work(interface: RedisInterface) -> int:
             if is_terminal() and not as_json:
-                from reem_async.tools.cli.picture import Picture
+                from reem_async.tools.cli.picture import Picture, ended_by_q
 
                 waiting = f"waiting for updates of {', '.join(wanted) or 'any key'}"
-                with Picture(board, waiting) as picture:
+                with ended_by_q(), Picture(board, waiting) as picture:
                     ending = await follow(
                         interface, wanted, board.take, count=count, seconds=timeout, every=_SECONDS_PER_PICTURE,
                         tick=lambda _: picture.draw(), stored=stored,
@@ -103,7 +103,7 @@ def _command(
 top = _command(
     "top",
     ALL,
-    """Show what is published: a live table of keys, until Ctrl-C (exit code 0).
+    """Show what is published: a live table of keys, until q or Ctrl-C (exit code 0).
 
 Of each top-level key: updates a second, bytes a second, delay, seconds since the last update, and how many
 programs publish it. Two that publish one key at once are marked, since each overwrites the other. "shared" says that
