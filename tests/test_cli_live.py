@@ -186,6 +186,7 @@ def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
         before = subscriptions(raw)
         for connection in subscribed(raw):
             raw.client_kill_filter(_id=connection)
+        assert "waiting for it" in process.stderr.readline()
         assert "made again" in process.stderr.readline()
         eventually(lambda: subscriptions(raw) == before)
         space["foo"] = 2
@@ -269,7 +270,7 @@ def test_a_pipe_that_has_seen_enough(space, listening):
         process.stdout.close()
         space["foo"] = 2
         assert process.wait(10) == 0
-        assert process.stderr.read() == ""
+        assert process.stderr.read() == "nothing is stored at foo yet: waiting for it\n"
 
 
 async def test_what_comes_too_fast_is_counted(cli, space, monkeypatch):

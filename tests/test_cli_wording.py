@@ -27,6 +27,7 @@ ARGUMENT = re.compile(r"(?<![?&\w])[a-z][a-z_]+=(?!\{\})|RedisInterface\((?!\{\}
 """What a message advises a program: `timeout=`, `RedisInterface(...)`. `timeout={}` complains of what was given."""
 
 OF_PROGRAMS = {
+    "plan/documents.py": ["value.to_dict(as_series=False)"],  # of a data frame, which no command can hold
     "transport/options.py": [
         "leave protocol= out",  # named as it stands in the URL
         "leave ssl= out",  # likewise
