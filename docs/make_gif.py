@@ -2,7 +2,7 @@
 
     python docs/make_gif.py [FILE]
 
-It starts a server, a simulated arm with a camera, and `reem browse`; types real statements into a real Python console;
+It starts `reem demo`, types real statements into a real Python console,
 and takes pictures of the page in headless Chromium about eight times a second. Needs chromium, playwright and pillow.
 """
 
@@ -12,65 +12,24 @@ import code
 import contextlib
 import html
 import io
-import math
+import itertools
 import re
 import shutil
+import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
-import numpy as np
-from PIL import Image, ImageDraw
+from PIL import Image
 from playwright.sync_api import Page, sync_playwright
-
-import reem
-from reem.server import EmbeddedServer
 
 OUT = Path(__file__).parent / "images" / "reem.gif"
 WIDTH, PAGE_HEIGHT, TERMINAL_HEIGHT = 1080, 476, 118
 RATE = 8.0  # pictures a second
-COLOURS = 96
+COLOURS = 128
 TERMINAL = """<body style="margin:0;background:#10171f;color:#d7e0ea;font:15px/21px 'DejaVu Sans Mono',monospace">
 <pre style="margin:0;padding:12px 16px">{}<span style="background:#d7e0ea"> </span></pre></body>"""
-
-
-class Arm:
-    """Two links that swing to their target, and a camera that looks at them."""
-
-    def __init__(self, url: str) -> None:
-        self.interface = reem.RedisInterface(url)
-        self.space, self.running = reem.PublishSpace(self.interface), True
-        self.space["arm"] = {"target": [0.4, 0.5], "q": [0.4, 0.5]}
-        self.thread = threading.Thread(target=self.run)
-
-    def run(self) -> None:
-        with reem.KeyValueStore(self.interface)["arm"]["target"].mirror() as target:
-            q, number = np.array([0.4, 0.5]), 0
-            while self.running:
-                q += 0.12 * (np.array(target.value()) - q)
-                wave = 0.04 * math.sin(6 * time.time())
-                self.space["arm"]["q"] = [round(float(angle) + wave, 4) for angle in q]
-                if number % 2 == 0:
-                    self.space["camera"] = {"image": self.picture(*(q + wave)), "stamp": time.time()}
-                number += 1
-                time.sleep(0.03)
-
-    @staticmethod
-    def picture(first: float, second: float) -> np.ndarray:
-        image = Image.new("RGB", (320, 240), (38, 50, 64))
-        draw = ImageDraw.Draw(image)
-        draw.rectangle((0, 200, 320, 240), fill=(58, 74, 92))
-        points, angle = [(160.0, 200.0)], 0.0
-        for link, turn in ((95, first), (75, second)):
-            angle += turn
-            x, y = points[-1]
-            points.append((x + link * math.sin(angle), y - link * math.cos(angle)))
-        draw.line(points, fill=(240, 165, 60), width=13, joint="curve")
-        for x, y in points:
-            draw.ellipse((x - 10, y - 10, x + 10, y + 10), fill=(236, 240, 245))
-        return np.asarray(image)
 
 
 class Terminal:
@@ -98,7 +57,7 @@ class Film:
     """Pictures of both, one above the other, at a steady rate."""
 
     def __init__(self, terminal: Terminal, page: Page) -> None:
-        self.terminal, self.page, self.frames = terminal, page, []
+        self.terminal, self.page, self.frames, self.times = terminal, page, [], []
         self.above: Image.Image | None = None
         self.next = time.monotonic()
 
@@ -113,6 +72,7 @@ class Film:
             frame.paste(self.above, (0, 0))
             frame.paste(below, (0, TERMINAL_HEIGHT))
             self.frames.append(frame)
+            self.times.append(time.monotonic())
             self.next = max(self.next + 1 / RATE, time.monotonic() - 1 / RATE)
             self.page.wait_for_timeout(max(0.0, self.next - time.monotonic()) * 1000)
             if time.monotonic() >= end:
@@ -145,39 +105,40 @@ class Film:
             sheet.paste(frame, (0, index * frame.height))
         palette = sheet.quantize(COLOURS, dither=Image.Dither.NONE)
         small = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in self.frames]
-        spans = [round(1000 / RATE)] * (len(small) - 1) + [1800]
+        spans = [round(1000 * (after - before)) for before, after in itertools.pairwise(self.times)] + [1800]
         small[0].save(path, save_all=True, append_images=small[1:], duration=spans, loop=0, optimize=True)
 
 
-def browse(url: str) -> tuple[subprocess.Popen[str], str]:
-    """`reem browse`, and the address of its page."""
-    command = [str(Path(sys.executable).parent / "reem"), "browse", "--no-open", "--port", "0", "--url", url]
+def demo() -> tuple[subprocess.Popen[str], str, str]:
+    """`reem demo`, the address of its page and that of its server."""
+    command = [str(Path(sys.executable).parent / "reem"), "demo", "--no-open", "--port", "0", "--page-port", "0"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
-        if found := re.search(r"http://\S+", line):
-            return process, found[0]
-    raise SystemExit("reem browse did not start")
+    found: dict[str, str] = {}
+    for line in process.stdout or ():
+        found |= dict(re.findall(r"^ +(page|server) +(\S+)$", line))
+        if len(found) == 2:
+            return process, found["page"], found["server"]
+    raise SystemExit("reem demo did not start")
 
 
 def main() -> None:
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else OUT
     flags = ["--no-sandbox", "--disable-gpu"]
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    with EmbeddedServer() as server, sync_playwright() as driver:
-        process, address = browse(server.url)
-        arm = Arm(server.url)
-        arm.thread.start()
-        try:
+    process, address, server = demo()
+    try:
+        with sync_playwright() as driver:
             window = driver.chromium.launch(executable_path=chromium, args=flags)
             console = window.new_page(viewport={"width": WIDTH, "height": TERMINAL_HEIGHT})
             page = window.new_page(viewport={"width": WIDTH, "height": PAGE_HEIGHT}, color_scheme="light")
             terminal = Terminal(console)
             terminal.console.push("from reem import KeyValueStore, RedisInterface")
-            terminal.console.push(f"kvs = KeyValueStore(RedisInterface({server.url!r}))")
+            terminal.console.push(f"kvs = KeyValueStore(RedisInterface({server!r}))")
             terminal.lines = [">>> kvs = KeyValueStore(RedisInterface())"]
             page.goto(address)
-            page.locator('#tree .row[data-address="arm"] .twist').click()
+            for pane in ("camera.rgb", "arm.joints"):  # pin what is to be seen
+                page.locator(f'button.pin[aria-label$="{pane}"]').click()
+            page.reload()
             edge = page.locator("#edge").bounding_box()
             assert edge is not None
             page.mouse.move(edge["x"] + 2, 300)
@@ -188,23 +149,20 @@ def main() -> None:
             page.wait_for_timeout(9000)  # so that there is a past
             film = Film(terminal, page)
             film.take(0.7)
-            film.type('kvs["arm"]["target"] = [-0.9, 1.4]')
-            film.take(2.0)
-            film.type('kvs["arm"]["q"].read()')
+            film.type('kvs["goal"] = {"x": -0.1, "y": -0.4}')
+            film.take(3.0)
+            film.type('kvs["goal"].read()')
             film.take(0.8)
-            film.type('kvs["arm"]["target"] = [1.1, -1.3]')
-            film.take(1.8)
+            film.type('kvs["goal"] = {"x": 0.3, "y": 0.4}')
+            film.take(2.5)
             film.drag([0.97, 0.93, 0.88, 0.82, 0.75, 0.67, 0.58, 0.5, 0.42, 0.5, 0.6, 0.7, 0.8])
             page.locator("#live").click()
             film.take(0.7)
             film.save(path)
             window.close()
-        finally:
-            arm.running = False
-            arm.thread.join()
-            arm.interface.close()
-            process.terminate()
-            process.wait()
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.wait()
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {len(film.frames)} pictures")
 
 
