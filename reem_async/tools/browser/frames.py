@@ -9,7 +9,7 @@ from operator import attrgetter
 from typing import Any
 
 from ...plan.paths import Path
-from .places import concerns
+from .timeline import concerns
 from .trees import Frame, walk
 
 __all__ = ["Frames"]

@@ -14,7 +14,7 @@ from ...plan.trees import MISSING
 from .clock import Clock
 from .frames import Frames
 from .source import rate_span
-from .timeline import PENDING, UNKNOWN, Change, Kept, Timeline
+from .timeline import PENDING, UNKNOWN, BufferedPast, Change, Kept
 from .trees import Frame, Leaf, same, tree_of, weight
 
 __all__ = ["History"]
@@ -57,7 +57,7 @@ class History:
         self.frames = Frames(seconds)
         self.dropped = 0
         self._bytes = 0  # of all but the frames
-        self._lines: dict[str, Timeline] = {}
+        self._lines: dict[str, BufferedPast] = {}
         # The same changes twice: by key, to know what a key held; all in order, to forget the oldest first.
         self._all: deque[Change] = deque()
         self._heavy: set[str] = set()  # keys whose base may hold arrays
@@ -94,7 +94,7 @@ class History:
             return
         # Of a long document only a mark is kept: what it held before its first change is unknown.
         base = MISSING if text is None else text if len(text) <= _LARGEST_TEXT else UNKNOWN
-        line = self._lines[name] = Timeline(base, None if base is UNKNOWN else text)
+        line = self._lines[name] = BufferedPast(name, base, None if base is UNKNOWN else text)
         self._bytes += line.base_size + _OVERHEAD
 
     def differs(self, name: str, text: Text | None, when: float) -> bool:
@@ -121,9 +121,9 @@ class History:
         if line is not None:
             line.text = None if text is None else _mark(text)
 
-    def _line(self, name: str) -> Timeline:
+    def _line(self, name: str) -> BufferedPast:
         if name not in self._lines:
-            self._lines[name] = Timeline(UNKNOWN)
+            self._lines[name] = BufferedPast(name, UNKNOWN)
             self._bytes += _OVERHEAD
         return self._lines[name]
 

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 from ...errors import BadData
-from ...plan.paths import Path
+from ...plan.past import Past
+from ...plan.paths import Path, below
 from ...plan.trees import MISSING, get
-from .places import Places, concerns
 from .trees import changed, strip, tree_of, weight
 
-__all__ = ["PENDING", "UNKNOWN", "Change", "Kept", "Timeline"]
+__all__ = ["PENDING", "UNKNOWN", "BufferedPast", "Change", "Kept", "concerns"]
 
 PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
 """In place of a value that was announced, and is not known."""
@@ -54,10 +54,57 @@ class Kept(NamedTuple):
     late: float = 0.0
 
 
-class Timeline:
-    """What is known of one top-level key.
+def concerns(where: Path, path: Path) -> bool:
+    """Return whether a change at one path changes what is at the other."""
+    return below(path, where) or below(where, path)
+
+
+class Places:
+    """The numbers of changes by their paths."""
+
+    __slots__ = ("_numbers",)
+
+    def __init__(self) -> None:
+        self._numbers: dict[Path, list[int]] = {}
+
+    def add(self, path: Path, number: int) -> None:
+        """Note a change; its number is larger than all before."""
+        self._numbers.setdefault(path, []).append(number)
+
+    def drop(self, end: int) -> None:
+        """Forget all numbers below `end`."""
+        # Numbers of changes that are forgotten; a path without any is forgotten too.
+        for path in list(self._numbers):
+            numbers = self._numbers[path]
+            del numbers[: bisect_left(numbers, end)]
+            if not numbers:
+                del self._numbers[path]
+
+    def last(self, path: Path, end: int) -> int:
+        """Return the last number below `end` of a change at just this path, -1 if there is none."""
+        numbers = self._numbers.get(path, [])
+        index = bisect_left(numbers, end)
+        return numbers[index - 1] if index else -1
+
+    def lasts(self, end: int, path: Path = ()) -> Iterator[int]:
+        """Yield the last number below `end` of each path that concerns `path`; of all for the root."""
+        for where in self._numbers:
+            if not path or concerns(where, path):
+                number = self.last(where, end)
+                if number >= 0:
+                    yield number
+
+    def of(self, path: Path) -> list[int]:
+        """Return the numbers of all changes that concern `path`, in order."""
+        found = [numbers for where, numbers in self._numbers.items() if concerns(where, path)]
+        return found[0].copy() if len(found) == 1 else sorted([number for numbers in found for number in numbers])
+
+
+class BufferedPast(Past[int]):
+    """What is known of one top-level key. Positions of changes are their numbers, from the first one ever.
 
     Args:
+        name: The key.
         base: What it held at first: a document's text, a tree, MISSING or UNKNOWN.
 
     Attributes:
@@ -67,9 +114,22 @@ class Timeline:
         whole: All of the key is known, after the last change at least.
     """
 
-    __slots__ = ("_base", "_gone", "_known", "_moves", "_pending", "_times", "base_size", "changes", "text", "whole")
+    __slots__ = (
+        "_base",
+        "_gone",
+        "_known",
+        "_moves",
+        "_name",
+        "_pending",
+        "_times",
+        "base_size",
+        "changes",
+        "text",
+        "whole",
+    )
 
-    def __init__(self, base: Any, text: bytes | None = None) -> None:
+    def __init__(self, name: str, base: Any, text: bytes | None = None) -> None:
+        self._name = name
         self._base = base
         self._times: list[float] = []
         self._gone = 0  # the number of the first change that is still here
@@ -123,26 +183,41 @@ class Timeline:
             self.base_size = weight(self._base)
         return before - self.base_size
 
-    def state(self, at: float) -> Any:
+    def state(self, when: float) -> Any:
         """Return the tree at an instant, MISSING or UNKNOWN. Not to be changed."""
-        return self._state(self.upto(at))
+        return self._state(self.upto(when))
 
     def _state(self, count: int) -> Any:
-        """Return the tree after the first `count` changes: the last of each path, in order."""
-        end = self._gone + count
-        moved = bool(self._moves) and self._moves[0] < end
-        # Once items have moved, what a path meant before is not what it means now: nothing can be left out.
-        numbers = range(self._gone, end) if moved else sorted(self._known.lasts(end))
-        chosen = [self.changes[number - self._gone] for number in numbers]
-        # What came before the last change of the whole key does not matter.
-        whole = next((index for index in reversed(range(len(chosen))) if _replaces_all(chosen[index])), None)
-        tree = self._first() if whole is None else chosen[whole].value
-        for change in chosen[0 if whole is None else whole + 1 :]:
-            if change.value is not PENDING:
-                tree = changed(tree, change.path[1:], change.value)
-        return tree
+        """Return the tree after the first `count` changes."""
+        return self.at((self._name,), self._gone + count - 1)
 
-    def _first(self) -> Any:
+    def _path(self, change: int) -> Path:
+        return self.changes[change - self._gone].path
+
+    def _value(self, change: int) -> Any:
+        return self.changes[change - self._gone].value
+
+    def _anchor(self, path: Path) -> Path:
+        return path[:1]
+
+    def _newest_whole(self, path: Path, until: int) -> tuple[int, int] | None:
+        number = self._known.last(path, until + 1)
+        return None if number < 0 else (number, number)
+
+    def _has_moves(self, path: Path, after: int, until: int) -> bool:
+        return bisect_right(self._moves, until) > bisect_right(self._moves, after)
+
+    def _inner(self, path: Path, after: int, until: int) -> Iterator[int]:
+        numbers = range(max(after + 1, self._gone), until + 1)
+        return (number for number in numbers if self._value(number) is not PENDING)
+
+    def _inner_lasts(self, path: Path, after: int, until: int) -> Iterator[tuple[int, int]]:
+        return ((number, number) for number in self._known.lasts(until + 1) if number > after)
+
+    def _applied(self, tree: Any, path: Path, change: int, value: Any) -> Any:
+        return changed(tree, path, value)
+
+    def _first(self, path: Path) -> Any:
         if not isinstance(self._base, bytes):
             return self._base
         try:
@@ -150,12 +225,13 @@ class Timeline:
         except BadData:
             return UNKNOWN
 
+    def _inside(self, tree: Any, path: Path) -> Any:
+        return tree if tree is UNKNOWN else get(tree, path)
+
     def kept(self, path: Path, at: float) -> Kept:
         """Return what was at `path`, and how old it is if the value of that very instant was not kept."""
-        count = self.upto(at)
-        state = self._state(count)
-        value = state if state is UNKNOWN else get(state, path[1:])
-        end = self._gone + count
+        end = self._gone + self.upto(at)
+        value = self.at(path, end - 1)
         waiting = [number for number in self._pending.lasts(end, path) if not self._answered(number, end, path)]
         if not waiting:
             return Kept(value)
@@ -207,20 +283,10 @@ class Timeline:
 
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
         """Yield what was at `path`, at `start` and after each change that may have changed it."""
-        state = self.state(start)
-        value = state if state is UNKNOWN else get(state, path[1:])
+        first = self._gone + self.upto(start)
+        value = self.at(path, first - 1)
         yield start, value
         numbers, last = self._known.of(path), self._gone + self.upto(end)
-        for number in numbers[bisect_left(numbers, self._gone + self.upto(start)) :]:
-            if number >= last:
-                return
-            change = self.changes[number - self._gone]
-            if len(change.path) <= len(path):
-                value = MISSING if change.value is MISSING else get(change.value, path[len(change.path) :])
-            else:
-                value = changed(value, change.path[len(path) :], change.value)
-            yield change.time, value
-
-
-def _replaces_all(change: Change) -> bool:
-    return len(change.path) == 1 and change.value is not PENDING
+        for number in numbers[bisect_left(numbers, first) : bisect_left(numbers, last)]:
+            value = self.after(value, path, number, self._value(number))
+            yield self.changes[number - self._gone].time, value

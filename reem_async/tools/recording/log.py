@@ -22,7 +22,7 @@ from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.recorder import CommandRecorder
 from .container import Container
-from .log_reader import Past, Stream
+from .log_reader import RecordedPast, Stream
 from .roles import Role
 from .stored import LOST, Stored, pruned, resolve
 from .timeline import Ref, Totals
@@ -87,7 +87,7 @@ class ArrayHandle:
     size: int
     summary: str
     _stored: Stored
-    _past: Past
+    _past: RecordedPast
 
     def read(self) -> Any:
         """Return the value, read-only; raises DamagedRecording if it is."""
@@ -172,7 +172,9 @@ class Log:
         self.path = FilePath(path)
         self._container = Container(self.path, progress)
         try:
-            self._past = Past(self._container, Ships(default_ships() if ships is None else ships, CommandRecorder))
+            self._past = RecordedPast(
+                self._container, Ships(default_ships() if ships is None else ships, CommandRecorder)
+            )
         except BaseException:
             self._container.close()
             raise

@@ -13,6 +13,7 @@ import orjson
 from mcap.records import Channel, Metadata
 
 from ...errors import BadData
+from ...plan.past import Past
 from ...plan.paths import Path, Pattern, below
 from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
@@ -27,7 +28,7 @@ from .sink import CHANNELS
 from .stored import LOST, Stored, applied, opened
 from .timeline import Ref, Timeline, Totals
 
-__all__ = ["Past", "Stream"]
+__all__ = ["RecordedPast", "Stream"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +48,12 @@ class Stream:
     channels: list[int] = field(compare=False)
 
 
-class Past:
-    """The contents of a recording.
+class _FoundDamage(Exception):
+    """A part of the file turned out to be damaged and was left out: what needs it is to be found again."""
+
+
+class RecordedPast(Past[tuple[Ref, Stream]]):
+    """The contents of a recording. Positions of changes are log times, in ns.
 
     Args:
         container: The file.
@@ -107,40 +112,63 @@ class Past:
 
     def tree(self, path: Path, until: int) -> Any:
         """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
-        streams = self.names.get(str(path[0]), [])
-        # Where a list lost items, only the list as a whole can be rebuilt; the path is looked up in it afterwards.
-        anchor = _anchor(path, streams)
         while True:
             # Each try that fails has taken a damaged chunk out, so this ends.
-            found = self._rebuilt(anchor, streams, until)
-            if found is not None:
-                return self._inside(found[0], path[len(anchor) :])
+            with contextlib.suppress(_FoundDamage):
+                return self.at(path, until)
 
-    def _rebuilt(self, path: Path, streams: list[Stream], until: int) -> list[Any] | None:
-        """Return a list of what was at `path`; None if something turned out to be damaged: try again."""
-        base, tree = -1, MISSING
-        # First the newest message that has all of the path in it, then what was updated inside it since then.
-        bases = [it for it in streams if it.role in (*NEWS, Role.KEYFRAME) and below(path, it.path)]
+    def _path(self, change: tuple[Ref, Stream]) -> Path:
+        return change[1].path
+
+    def _value(self, change: tuple[Ref, Stream]) -> Any:
+        """Return what a message says; a value that cannot be read is represented by a `Stored`: the rest can be read.
+
+        Raises:
+            _FoundDamage: It turned out to be damaged, so it has to be left out.
+            BadData: It is unreadable and had parts of its own.
+        """
+        ref, stream = change
+        try:
+            loaded = self._load(ref, stream)
+        except BadData:
+            label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
+            if label in ("", "list"):  # it has places of its own, and nobody could tell whether something was there
+                raise
+            return Stored(label, stream.path, ref.time, 0, label)
+        if loaded is None:
+            raise _FoundDamage
+        return loaded[0]
+
+    def _anchor(self, path: Path) -> Path:
+        return _anchor(path, self._streams_of(path))
+
+    def _streams_of(self, path: Path) -> list[Stream]:
+        return self.names.get(str(path[0]), []) if path else []
+
+    def _newest_whole(self, path: Path, until: int) -> tuple[int, tuple[Ref, Stream]] | None:
+        roles = (*NEWS, Role.KEYFRAME)
+        bases = [it for it in self._streams_of(path) if it.role in roles and below(path, it.path)]
         newest = self._newest(bases, until, -1)
-        if newest is not None:
-            ref, stream = newest
-            loaded = self._load_or_name(ref, stream)
-            if loaded is None:
-                return None
-            base = ref.time
-            tree = self._inside(loaded[0], path[len(stream.path) :])
-        # Roles that only repeat are left out here: they say nothing that is not in the updates.
-        inner = [it for it in streams if it.role in NEWS and len(it.path) > len(path) and below(it.path, path)]
-        for ref, stream in self._later(inner, base, until):
-            loaded = self._load_or_name(ref, stream)
-            if loaded is None:
-                return None
-            tree = self._applied(tree, path, stream, loaded[0])
-        return [tree]
+        return None if newest is None else (newest[0].time, newest)
 
-    def _applied(self, tree: Any, anchor: Path, stream: Stream, value: Any) -> Any:
-        """Return what is at `anchor` after an update of a stream below it."""
-        path = stream.path[len(anchor) :]
+    def _streams_inside(self, path: Path) -> list[Stream]:
+        # Roles that only repeat are left out here: they say nothing that is not in the updates.
+        streams = self._streams_of(path)
+        return [it for it in streams if it.role in NEWS and len(it.path) > len(path) and below(it.path, path)]
+
+    def _has_moves(self, path: Path, after: int, until: int) -> bool:
+        return any(it.role == Role.DELETE and isinstance(it.path[-1], int) for it in self._streams_inside(path))
+
+    def _inner(self, path: Path, after: int, until: int) -> Iterable[tuple[Ref, Stream]]:
+        channels = [channel for stream in self._streams_inside(path) for channel in stream.channels]
+        return [(ref, self._of_channel[ref.channel]) for ref in self._between(channels, after, until)]
+
+    def _inner_lasts(self, path: Path, after: int, until: int) -> Iterable[tuple[int, tuple[Ref, Stream]]]:
+        lasts = [self._newest([stream], until, after) for stream in self._streams_inside(path)]
+        return [(it[0].time, it) for it in lasts if it is not None]
+
+    def _applied(self, tree: Any, path: Path, change: tuple[Ref, Stream], value: Any) -> Any:
+        stream = change[1]
         return applied(opened(tree, path, self._list), path, stream.role, stream.kind, value)
 
     def _inside(self, tree: Any, path: Path) -> Any:
@@ -163,19 +191,6 @@ class Past:
                     best = ref, stream
         return best
 
-    def _later(self, streams: list[Stream], after: int, until: int) -> Iterable[tuple[Ref, Stream]]:
-        """Return the updates that matter between two instants, in order.
-
-        That is the last one of each path, since it covers those before it, unless an item was deleted from
-        a list: then other paths moved, and all are needed.
-        """
-        if any(it.role == Role.DELETE and isinstance(it.path[-1], int) for it in streams):
-            channels = [channel for stream in streams for channel in stream.channels]
-            return [(ref, self._of_channel[ref.channel]) for ref in self._between(channels, after, until)]
-        # One message for each path, however often it was updated: this is what makes going back in time quick.
-        lasts = [self._newest([stream], until, after) for stream in streams]
-        return sorted([it for it in lasts if it is not None], key=lambda it: it[0].time)
-
     def _between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
         """Yield the messages between two instants in order."""
         for refs in self._instants(channels, after, until):
@@ -197,16 +212,6 @@ class Past:
         if channel.message_encoding == "json":
             return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
         return [self._stored(channel, ref.time, stream.path, message.data)]
-
-    def _load_or_name(self, ref: Ref, stream: Stream) -> list[Any] | None:
-        """Do as `_load`, but have a value that cannot be read stand for itself: what is beside it can be read."""
-        try:
-            return self._load(ref, stream)
-        except BadData:
-            label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
-            if label in ("", "list"):  # it has places of its own, and nobody could tell whether something was there
-                raise
-            return [Stored(label, stream.path, ref.time, 0, label)]
 
     def _readable(self, ref: Ref, stream: Stream) -> list[Any] | None:
         """Return a list of the value of a message; None, and it is counted, if it is damaged."""
@@ -297,8 +302,7 @@ class Past:
 
         If a part of the file is damaged, keyframes are news too.
         """
-        streams = self.names.get(str(path[0]), []) if path else []
-        anchor = _anchor(path, streams)
+        anchor, streams = self._anchor(path), self._streams_of(path)
         roles = (*NEWS, Role.KEYFRAME)
         related = [it for it in streams if it.role in roles and (below(it.path, anchor) or below(anchor, it.path))]
         tree = self.tree(anchor, after) if related and after >= 0 else MISSING
@@ -314,11 +318,7 @@ class Past:
                 if loaded is None:
                     continue
                 is_read, is_whole = True, is_whole and stream.role in (Role.STATE, Role.KEYFRAME)
-                # An update of the path or of what is around it brings all of it; one from inside changes a part.
-                if len(stream.path) <= len(anchor):
-                    tree = self._inside(loaded[0], anchor[len(stream.path) :])
-                else:
-                    tree = self._applied(tree, anchor, stream, loaded[0])
+                tree = self.after(tree, anchor, (ref, stream), loaded[0])
             if is_read:
                 value = self._inside(tree, path[len(anchor) :])
                 repeats = is_whole and value is not MISSING and last is not MISSING and same(value, last)
