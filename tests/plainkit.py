@@ -15,7 +15,7 @@ import redis
 from reem_async.plain.documents import MARK, Document
 from reem_async.plain.paths import Refusal
 from reem_async.plan.paths import to_jsonpath
-from reem_async.tools.snapshots.values import settable
+from reem_async.tools.snapshots.plans import settable
 
 NAMES = [*"abcd", "a.b", "x y", "it's", 'say "hi"', "ä", "键一", "\U0001f600", "", "$", "[0]", "]", "a\nb"]
 """Keys of dicts; few, so that paths meet them."""

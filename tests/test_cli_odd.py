@@ -37,8 +37,8 @@ from reem_async.tools.cli.values import FILES, parse_value, save
 from reem_async.tools.snapshots import described
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import NewFile, prune
+from reem_async.tools.snapshots.plans import KeyContent, Value
 from reem_async.tools.snapshots.rdb import describe_rdb
-from reem_async.tools.snapshots.values import Entry, Value
 
 
 @pytest.fixture
@@ -225,7 +225,7 @@ def test_a_member_that_unpacks_to_more_than_the_index_says_is_not_unpacked(tmp_p
         put(self, name, *(bytes(1 << 24), zipfile.ZIP_DEFLATED) if name.endswith(member) else (data, *method))
 
     monkeypatch.setattr(ArchiveWriter, "_put", bomb)
-    entry = Entry("foo", b'{"a":1}', (".z",), (Value(".z", kind, (b"a", b"1") if kind == "hash" else (b"1",)),))
+    entry = KeyContent("foo", b'{"a":1}', (".z",), (Value(".z", kind, (b"a", b"1") if kind == "hash" else (b"1",)),))
     file = made(tmp_path / "a.zip", [entry])
     assert file.stat().st_size < 100_000
     read = zipfile.ZipFile.read
@@ -237,7 +237,7 @@ def test_a_member_that_unpacks_to_more_than_the_index_says_is_not_unpacked(tmp_p
 
 @pytest.mark.parametrize(("kind", "pieces"), [("zset", (b"a",)), ("hash", (b"a",)), ("ReJSON-RL", ())])
 def test_values_of_the_wrong_number_of_pieces_are_damaged(tmp_path, kind, pieces):
-    entry = Entry("foo", b'{"a":1}', (".z",), (Value(".z", kind, pieces),))
+    entry = KeyContent("foo", b'{"a":1}', (".z",), (Value(".z", kind, pieces),))
     with Archive(made(tmp_path / "a.zip", [entry])) as archive, pytest.raises(BadData, match="pieces"):
         archive.read("foo")
 

@@ -28,7 +28,7 @@ from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import app, period
 from reem_async.tools.snapshots import files, portable, rdb
 from reem_async.tools.snapshots.archive import ArchiveWriter, header
-from reem_async.tools.snapshots.values import Entry
+from reem_async.tools.snapshots.plans import KeyContent
 
 MAIN = """
 from reem_async.tools.cli.commands import Entry
@@ -322,7 +322,7 @@ def test_a_listing_ends_with_its_reader(tmp_path):
     """A traceback was what `| head -1` had for it."""
     writer = ArchiveWriter(tmp_path / "a.zip", header("s", "", "*", "1"))
     for number in range(3000):
-        writer.add(Entry(f"a_key_of_some_length_{number}", b"1", (), ()))
+        writer.add(KeyContent(f"a_key_of_some_length_{number}", b"1", (), ()))
     writer.finish([])
     words = shlex.join([*REEM, "list", str(tmp_path / "a.zip")])
     run = subprocess.run(

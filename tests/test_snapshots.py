@@ -24,8 +24,7 @@ from reem_async.errors import BadData, BadKey, Conflict, MissingKey
 from reem_async.plan.keys import keys_of
 from reem_async.plan.shapes import ShapeCache
 from reem_async.tools.snapshots import describe, restore, save
-from reem_async.tools.snapshots.plans import put
-from reem_async.tools.snapshots.values import KINDS, Entry, Value, settable
+from reem_async.tools.snapshots.plans import REDIS_TYPES, KeyContent, Value, put, settable
 
 servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
 
@@ -99,7 +98,7 @@ class KindShip(reem_async.SpecialDatatypeShip):
         return "kind"
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "string" and not (PLAIN and "JSON" in kind)])
+@pytest.mark.parametrize("kind", [kind for kind in REDIS_TYPES if kind != "string" and not (PLAIN and "JSON" in kind)])
 async def test_ships_may_use_other_redis_types(servers, there, raws, tmp_path, kind):
     """The snapshot needs no ship to save and restore them."""
     async with reem_async.RedisInterface(servers[0], ships=[KindShip()]) as writer:
@@ -296,7 +295,7 @@ def test_putting_a_key_starts_over_when_somebody_writes_in_between():
         told.append(1)
         return [("PUBLISH", "c", b"x")]
 
-    entry = Entry("foo", b"{}", (".x",), (Value(".x", "string", (b"1",)),))
+    entry = KeyContent("foo", b"{}", (".x",), (Value(".x", "string", (b"1",)),))
     first = put(keys_of("foo"), entry, ShapeCache(), replace=True, notices=notices)
     assert first.held
     assert first.commands[0][0] == "WATCH"

@@ -21,7 +21,7 @@ from reem_async.errors import BadData
 from reem_async.tools.snapshots import describe, rdb, restore, save, save_rdb
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import new_name, prune
-from reem_async.tools.snapshots.values import Entry, Value, joined, split
+from reem_async.tools.snapshots.plans import KeyContent, Value, joined, split
 
 servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.here, snapshotkit.there
 
@@ -102,12 +102,12 @@ def test_what_a_newer_program_wrote_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "entry",
     [
-        Entry("foo", b"1", (), (Value(":ships", "string", (b"x",)),)),
-        Entry("foo", b"1", (":last",), ()),
-        Entry("foo", b"1", (".a[",), ()),
-        Entry("foo}", b"1", (), ()),
-        Entry("", b"1", (), ()),
-        Entry("foo", b"1", (), (Value(".x", "stream", (b"x",)),)),
+        KeyContent("foo", b"1", (), (Value(":ships", "string", (b"x",)),)),
+        KeyContent("foo", b"1", (":last",), ()),
+        KeyContent("foo", b"1", (".a[",), ()),
+        KeyContent("foo}", b"1", (), ()),
+        KeyContent("", b"1", (), ()),
+        KeyContent("foo", b"1", (), (Value(".x", "stream", (b"x",)),)),
     ],
 )
 def test_an_index_is_not_trusted(tmp_path, entry):
@@ -117,7 +117,7 @@ def test_an_index_is_not_trusted(tmp_path, entry):
 
 
 async def test_a_document_that_is_none_stops_before_anything_of_it_is_written(there, raws, tmp_path):
-    path = written(tmp_path / "a.zip", Entry("foo", b'{"x":', (".x",), (Value(".x", "string", (b"1",)),)))
+    path = written(tmp_path / "a.zip", KeyContent("foo", b'{"x":', (".x",), (Value(".x", "string", (b"1",)),)))
     with pytest.raises(BadData, match="JSON"):
         await restore(there, path)
     assert everything(raws[1]) == {}
@@ -246,7 +246,7 @@ async def test_killed_it_leaves_nothing_under_the_name(servers, here, raws, tmp_
 
 def test_names_say_when_and_pruning_deletes_only_its_own(tmp_path):
     """By the order of this run, not by the clock; never the newest, nor files of other names, kinds or content."""
-    entry = Entry("foo", b"1", (), ())
+    entry = KeyContent("foo", b"1", (), ())
     first = new_name(tmp_path, "portable", 0.0, auto=True)
     assert first.name == "reem-auto-19700101T000000Z.zip"
     others = [

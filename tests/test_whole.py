@@ -17,7 +17,7 @@ import reem_async
 from reem_async.errors import ClusterNode, NotConnected
 from reem_async.store.catalog import names
 from reem_async.tools.recording import Recorder
-from reem_async.tools.snapshots import RdbUnavailable, restore, save, save_rdb, survey
+from reem_async.tools.snapshots import RdbUnavailable, portable, restore, save, save_rdb
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ async def test_a_key_that_moves_behind_the_look_is_found_by_the_next(cluster, fl
     first, last = (next(node for node in cluster.nodes if node.port == port) for port in (ports[0], ports[-1]))
     moving = next(name for name in sorted(ALL) if owner(cluster, key(f"/{name}")) is last)
     moves = [Move(cluster, key(f"/{moving}"), first)]
-    looked = survey.scanned
+    looked = portable.scanned
 
     async def scanned(transport):
         async for page in looked(transport):
@@ -66,13 +66,13 @@ async def test_a_key_that_moves_behind_the_look_is_found_by_the_next(cluster, fl
             if moves:
                 await asyncio.to_thread(moves.pop().begin().finish)
 
-    monkeypatch.setattr(survey, "scanned", scanned)
+    monkeypatch.setattr(portable, "scanned", scanned)
     saved = await save(fleet, tmp_path / "all.zip")
     assert ({each.name for each in saved.keys}, saved.doubt) == (ALL, "")
 
 
 async def test_a_count_that_goes_on_growing_is_told(cluster, fleet, key, tmp_path, monkeypatch):
-    counted = survey.counted
+    counted = portable.counted
     number = iter(range(1000))
 
     async def growing(*where):
@@ -80,7 +80,7 @@ async def test_a_count_that_goes_on_growing_is_told(cluster, fleet, key, tmp_pat
         return await counted(*where)
 
     leave_nothing_to_expire(cluster)
-    monkeypatch.setattr(survey, "counted", growing)
+    monkeypatch.setattr(portable, "counted", growing)
     saved = await save(fleet, tmp_path / "all.zip")
     assert {each.name for each in saved.keys} >= ALL
     assert saved.doubt == "the server counts 1 Redis keys more than it named: new ones, or missed"
@@ -90,7 +90,7 @@ async def test_a_missed_key_is_told_though_others_were_deleted_since_the_first_l
     cluster, fleet, key, tmp_path, monkeypatch
 ):
     leave_nothing_to_expire(cluster)
-    missed, looked, looks = key("/key0").encode(), survey.scanned, []
+    missed, looked, looks = key("/key0").encode(), portable.scanned, []
 
     async def scanned(transport):
         looks.append(transport)
@@ -99,7 +99,7 @@ async def test_a_missed_key_is_told_though_others_were_deleted_since_the_first_l
         async for page in looked(transport):
             yield [each for each in page if bytes(each) != missed]
 
-    monkeypatch.setattr(survey, "scanned", scanned)
+    monkeypatch.setattr(portable, "scanned", scanned)
     saved = await save(fleet, tmp_path / "all.zip")
     assert saved.doubt == "the server counts 1 Redis keys more than it named: new ones, or missed"
 

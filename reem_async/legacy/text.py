@@ -15,7 +15,7 @@ from ..plan.sizes import STAGED
 from ..session import Session
 from ..store.document import Turn
 from ..store.publish import DocumentPublisher
-from ..tools.snapshots.values import settable
+from ..tools.snapshots.plans import settable
 from ..transport.scan import scanned
 
 __all__ = ["TextConverter", "texts"]

@@ -29,7 +29,7 @@ import orjson
 from ...errors import BadData
 from ...plan.paths import check_top_key, parse_suffix
 from .files import FIRST_MEMBER, NewFile, SavedKey, Snapshot
-from .values import KINDS, Entry, Value, joined, split
+from .plans import REDIS_TYPES, KeyContent, Value, joined, split
 
 __all__ = ["Archive", "ArchiveWriter", "header", "verify"]
 
@@ -95,21 +95,21 @@ class ArchiveWriter:
             self.abandon()
             raise
 
-    def add(self, entry: Entry) -> None:
+    def add(self, content: KeyContent) -> None:
         """Write one top-level key."""
         folder = f"keys/{len(self._keys) + 1}"
         # Text is compressed at the fastest level; arrays are not: they hardly shrink, and this is about as fast as
         # the disk.
-        self._put(f"{folder}/document.json", entry.text, zipfile.ZIP_DEFLATED)
+        self._put(f"{folder}/document.json", content.text, zipfile.ZIP_DEFLATED)
         values = []
-        for number, value in enumerate(entry.values, 1):
+        for number, value in enumerate(content.values, 1):
             blob = value.pieces[0] if value.kind == "string" else joined(value.pieces)
             member = f"{folder}/values/{number}.{_ending(value.kind, blob)}"
             self._put(member, blob)
             values.append({"suffix": value.suffix, "type": value.kind, "size": value.size, "file": member})
-        row = {"name": entry.name, "size": len(entry.text), "file": f"{folder}/document.json"}
-        row |= {} if entry.expires is None else {"expires": entry.expires}
-        self._keys.append({**row, "registry": entry.registry, "values": values})
+        row = {"name": content.name, "size": len(content.text), "file": f"{folder}/document.json"}
+        row |= {} if content.expires is None else {"expires": content.expires}
+        self._keys.append({**row, "registry": content.registry, "values": values})
 
     def finish(self, foreign: list[str], unsaved: Mapping[str, str] | None = None) -> None:
         """Write the index and the digest, see to it that all is on the disk, and give the file its name."""
@@ -194,13 +194,13 @@ class Archive:
             self._zip.close()
             raise
 
-    def read(self, name: str) -> Entry:
+    def read(self, name: str) -> KeyContent:
         """Return one top-level key; raises BadData."""
         with _believed(self._path):
             row = self._rows[name]
             values = tuple([self._value(each) for each in row["values"]])
             text = self._member(row["file"], row["size"])
-            return Entry(name, text, tuple(row["registry"]), values, row.get("expires"))
+            return KeyContent(name, text, tuple(row["registry"]), values, row.get("expires"))
 
     def __enter__(self) -> Self:
         return self
@@ -267,7 +267,7 @@ def _saved_key(row: dict[str, Any]) -> SavedKey:
         if suffix and suffix[0] not in ".[~":
             raise ValueError(f"{suffix!r} is not the place of a value")
         parse_suffix(suffix)
-    unknown = [value["type"] for value in row["values"] if value["type"] not in KINDS]
+    unknown = [value["type"] for value in row["values"] if value["type"] not in REDIS_TYPES]
     if unknown:
         raise ValueError(f"a value of {name} has the unknown type {unknown[0]!r}")
     expires = row.get("expires")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,17 +16,17 @@ import anyio.to_thread
 
 from ... import __version__
 from ...connection import RedisInterface
-from ...errors import BadData, Conflict, MissingKey, NotAllowed, PartialWrite, RedisError, ReemError, WrongKind
+from ...errors import BadData, BadKey, Conflict, MissingKey, NotAllowed, PartialWrite, RedisError, ReemError, WrongKind
 from ...plan import Command, Plan
 from ...plan.keys import DOCUMENT, Keys
 from ...plan.notices import announce, published
-from ...plan.paths import shorten
+from ...plan.paths import Pattern, check_top_key, shorten
+from ...plan.sizes import STAGED
 from ...session import Session
+from ...transport.scan import counted, scanned
 from .archive import Archive, ArchiveWriter, header, verify
 from .files import Snapshot, check_target, sniff
-from .plans import dump, lifetimes, put, types
-from .survey import Survey, matcher, survey
-from .values import Entry
+from .plans import NOT_ALLOWED, KeyContent, dump, lifetimes, put, shown, strangers, types
 
 __all__ = ["Progress", "Restored", "restore", "save"]
 
@@ -140,19 +142,19 @@ async def _fill(
             lifetimes_left = await _lifetimes(session, found, found.names[number : number + _PAGE])
         keys = session.keys(name)
         try:
-            entry: Entry | None = await session.run(dump(keys))
+            content: KeyContent | None = await session.run(dump(keys))
         except WrongKind:  # replaced by a program without REEM since it was found
             continue
         except (BadData, Conflict, NotAllowed) as error:
             failure = failure or error
             found.failed(name, str(error))
             continue
-        if entry is None:
+        if content is None:
             continue
-        entry = entry._replace(expires=lifetimes_left[number % _PAGE])
+        content = content._replace(expires=lifetimes_left[number % _PAGE])
         count += 1
-        found.owns(entry)
-        if batch.takes(entry):
+        found.owns(content)
+        if batch.takes(content):
             await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
     await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
     _tell(progress, "save", len(found.names), len(found.names))
@@ -166,29 +168,29 @@ async def _lifetimes(session: Session, found: Survey, names: Sequence[str]) -> l
     return left or [None] * len(names)
 
 
-def _write(writer: ArchiveWriter, entries: Sequence[Entry]) -> None:
-    for entry in entries:
-        writer.add(entry)
+def _write(writer: ArchiveWriter, contents: Sequence[KeyContent]) -> None:
+    for content in contents:
+        writer.add(content)
 
 
 class _Batch:
     """Entries on their way between the event loop and the thread that reads or writes the file."""
 
     def __init__(self) -> None:
-        self._entries: list[Entry] = []
+        self._entries: list[KeyContent] = []
         self._size = 0
 
-    def takes(self, entry: Entry) -> bool:
+    def takes(self, content: KeyContent) -> bool:
         """Add one; return whether it is time to hand them over."""
-        self._entries.append(entry)
-        # 100 bytes for what an entry costs besides its content, so that many empty ones make a batch too.
-        self._size += entry.size + 100
+        self._entries.append(content)
+        # 100 bytes for what an content costs besides its content, so that many empty ones make a batch too.
+        self._size += content.size + 100
         return self._size >= _BATCH
 
-    def handed_over(self) -> list[Entry]:
-        """Return the entries and forget them."""
-        entries, self._entries, self._size = self._entries, [], 0
-        return entries
+    def handed_over(self) -> list[KeyContent]:
+        """Return the contents and forget them."""
+        contents, self._entries, self._size = self._entries, [], 0
+        return contents
 
 
 async def restore(
@@ -243,11 +245,11 @@ async def restore(
             batch = await anyio.to_thread.run_sync(_next_batch, archive, left)
             left = left[len(batch) :]
             while batch:  # each is let go of before the next one comes
-                entry = batch.pop(0)
-                size += entry.size
+                content = batch.pop(0)
+                size += content.size
                 _tell(progress, "restore", len(done), len(names))
-                await _put(session, names[entry.name], entry, done, replace=replace)
-                del entry
+                await _put(session, names[content.name], content, done, replace=replace)
+                del content
         _tell(progress, "restore", len(done), len(names))
     return Restored(tuple(done), size)
 
@@ -286,7 +288,7 @@ async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) 
         )
 
 
-def _next_batch(archive: Archive, names: Iterable[str]) -> list[Entry]:
+def _next_batch(archive: Archive, names: Iterable[str]) -> list[KeyContent]:
     batch = _Batch()
     for name in names:
         if batch.takes(archive.read(name)):
@@ -294,14 +296,14 @@ def _next_batch(archive: Archive, names: Iterable[str]) -> list[Entry]:
     return batch.handed_over()
 
 
-async def _put(session: Session, keys: Keys, entry: Entry, done: list[str], *, replace: bool) -> None:
+async def _put(session: Session, keys: Keys, content: KeyContent, done: list[str], *, replace: bool) -> None:
     def notices() -> list[Command]:
         stamp = *session.stamp(keys), time.time(), ()
-        payload = announce(*stamp, size=entry.size)
+        payload = announce(*stamp, size=content.size)
         return published(keys, *stamp[:2], payload, everywhere=session.is_fresh(keys))
 
     plan: Plan = await anyio.to_thread.run_sync(
-        lambda: put(keys, entry, session.cache, replace=replace, notices=notices)
+        lambda: put(keys, content, session.cache, replace=replace, notices=notices)
     )
     # As every publish: notices of one key are sent in the order of their numbers.
     async with session.transport.ordered(keys.channel):
@@ -329,3 +331,140 @@ def _after(error: Exception, done: Sequence[str]) -> str:
 def _tell(progress: Told | None, doing: str, done: int, total: int) -> None:
     if progress is not None:
         progress(Progress(doing, done, total))
+
+
+# Which keys of a server are REEM's, found by SCAN.
+
+# Of each top-level key: the registry, and the note of its last update.
+_OF_KEY = {b":ships", b":last"}
+# Large arrays that are on their way to a key are not foreign; they are renamed in a moment.
+_COMING = STAGED.encode()
+_LOOKS = 3
+"""How often the servers are looked through before it is said that their count does not agree."""
+# The keys beside a document carry its name in braces: {foo}:ships, {foo}.bar.image.
+_TAGGED = re.compile(rb"\{([^{}]*)\}(.*)", re.DOTALL)
+
+Wanted = Callable[[str], bool]
+"""Whether a top-level key is meant."""
+
+
+class Survey:
+    """What was found in the namespace of one session.
+
+    Attributes:
+        names: The top-level keys, sorted.
+        seen: All keys that the servers named, whoever they belong to.
+        unsaved: The top-level keys, and arrays, that could not be saved, and why.
+        doubt: Why keys may be missing, for people; empty if the servers hold no more keys than they named.
+    """
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.seen: set[bytes] = set()
+        self.unsaved: dict[str, str] = {}
+        self.doubt = ""
+        self._tagged: dict[str, set[bytes]] = {}  # what carries a key's tag: suffixes by name, until it is known whose
+        self._foreign: list[str] = []
+
+    def owns(self, content: KeyContent) -> None:
+        """Take note of a key that was fetched: what belongs to it is not foreign."""
+        tagged = self._tagged.get(content.name, set())
+        tagged -= {suffix.encode() for suffix in content.registry}
+        tagged -= {value.suffix.encode() for value in content.values}
+        for suffix in content.missing:
+            self.unsaved[content.name + suffix.partition("~")[0]] = (
+                "it is gone from the server, only its name is left"
+            )
+
+    def failed(self, name: str, why: str) -> None:
+        """Take note of a key that could not be fetched; what belongs to it is not foreign."""
+        self.unsaved[name] = why
+        self._tagged.pop(name, None)
+
+    async def foreign(self, session: Session) -> list[str]:
+        """Return the keys that are not REEM's, each with its type. One round trip for each tag in question."""
+        found, documents = list(self._foreign), set(self.names)
+        for name, suffixes in sorted(self._tagged.items()):
+            suffixes = {suffix for suffix in suffixes if not suffix.startswith(_COMING)}
+            # Registry and note alone need no look where the document was found.
+            if suffixes and (name not in documents or suffixes - _OF_KEY):
+                found += await session.run(strangers(session.keys(name), sorted(suffixes)))
+        return found
+
+    def add_page(self, page: Sequence[bytes], kinds: Sequence[str], namespace: bytes, wanted: Wanted) -> None:
+        """Sort the keys of one page of a SCAN."""
+        for key, kind in zip(page, kinds, strict=True):
+            tagged = _TAGGED.fullmatch(key)
+            name = _name((tagged[1] if tagged else key)[len(namespace) :])
+            if name is None:
+                self._foreign.append(shown(key, kind))
+            elif not wanted(name):
+                continue
+            elif kind == NOT_ALLOWED:
+                # Of what belongs to a document, the document is named. Its rights may be other ones.
+                if tagged is None:
+                    self.failed(name, "this user may not read it")
+            elif tagged:
+                self._tagged.setdefault(name, set()).add(tagged[2])
+            elif kind == DOCUMENT:
+                self.names.append(name)
+            elif kind != "none":
+                self._foreign.append(shown(key, kind))
+
+
+def matcher(match: str) -> Wanted:
+    """Return what tells whether a top-level key matches; `*` and `?` stand for other characters.
+
+    Raises:
+        BadKey: Not a pattern of a top-level key.
+    """
+    pattern = Pattern(check_top_key(match))
+    return lambda name: pattern.concerns((name,))
+
+
+def _name(key: bytes) -> str | None:
+    """Return the top-level key of these bytes, None if it cannot be one."""
+    with suppress(UnicodeDecodeError, BadKey):
+        return check_top_key(key.decode())
+    return None
+
+
+async def survey(session: Session, match: str) -> Survey:
+    """Find the keys of a session's namespace; a plain name is taken as it is, without a look.
+
+    The servers are looked through again if they count more keys than they named: a key that moves from
+    node to node may be named by neither.
+    """
+    wanted, found = matcher(match), Survey()
+    if not set("*?") & set(match):
+        found.names.append(check_top_key(match))
+        return found
+    for _ in range(_LOOKS):
+        named = await _look(session, found, wanted)
+        held = await counted(session.transport, session.options.database)
+        if held is None:
+            found.doubt = "this user may not ask the server for its count (+info), so it was not compared"
+            break
+        # Keys that were written meanwhile are counted but not seen: another look finds them, or keys that moved
+        # between nodes. Of one look only: what was deleted since the first would hide as many that were missed.
+        more = held - named
+        found.doubt = f"the server counts {more} Redis keys more than it named: new ones, or missed" if more > 0 else ""
+        if not found.doubt:
+            break
+    found.names.sort()
+    return found
+
+
+async def _look(session: Session, found: Survey, wanted: Wanted) -> int:
+    """Add the keys that were not seen before; returns how many were named, seen before or not."""
+    space = session.namespace.encode()
+    named: set[bytes] = set()  # SCAN may name a key twice
+    async for page in scanned(session.transport):
+        named.update(map(bytes, page))
+        fresh = [key for key in dict.fromkeys(map(bytes, page)) if key not in found.seen]
+        found.seen.update(fresh)
+        # In the namespace itself, or with a tag of it.
+        ours = [key for key in fresh if key.startswith((space, b"{" + space))]
+        kinds: list[str] = await session.run(types(ours)) if ours else []
+        found.add_page(ours, kinds, space, wanted)
+    return len(named)
