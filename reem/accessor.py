@@ -10,7 +10,7 @@ from typing import Any, Self
 
 from reem_async.concurrency.queues import Policy
 from reem_async.errors import BadType, RedisError, ReemError
-from reem_async.plan.handles import Handle
+from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
 from reem_async.store import accessor as core
 from reem_async.store.catalog import Outline

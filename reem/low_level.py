@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from reem_async.store import low_level as core
+from reem_async.store import accessor as core
 from reem_async.store import publish as core_publish
 
 from ._twin import documented_by

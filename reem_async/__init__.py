@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .concurrency.timeouts import timeout
     from .connection import RedisInterface
     from .errors import *
-    from .plan.unreadable import Unreadable
+    from .plan.placeholders import Unreadable
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
     from .pubsub.updates import Origin, Update
     from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
@@ -57,7 +57,7 @@ _HOMES = {
     "SilentSubscriber": ".pubsub.subscribers",
     "SpecialDatatypeShip": ".ships",
     "StateChange": ".transport.state",
-    "Unreadable": ".plan.unreadable",
+    "Unreadable": ".plan.placeholders",
     "Update": ".pubsub.updates",
     "Writer": ".store",
     "timeout": ".concurrency.timeouts",

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["CURE", "original_reem"]
-
 CURE = "pip uninstall -y reem reem-async && pip install reem-async"
 
 

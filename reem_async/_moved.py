@@ -7,8 +7,6 @@ import sys
 from types import ModuleType
 from typing import Any
 
-__all__ = ["MOVED", "keep_old_names"]
-
 MOVED = {
     "accessor": "store.accessor",
     "browser": "tools.browser",

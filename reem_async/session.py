@@ -29,8 +29,6 @@ from .transport.endpoints import way_to
 from .transport.recorder import CommandRecorder
 from .transport.scan import scanned
 
-__all__ = ["QUIET", "Session", "Subscriptions"]
-
 _FRESH = 3.0
 """Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
 QUIET = 60.0

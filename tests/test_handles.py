@@ -116,9 +116,9 @@ def test_handles_of_one_place_are_equal_and_of_others_not(kvs, pspace, akvs_hand
 
 def test_printing_a_handle_says_what_it_is(kvs, pspace, akvs_handle, key):
     """And how to read it."""
-    assert str(kvs[key()]["n"]) == f"<Accessor {key()}.n: a place, whose value is read with .read()>"
-    assert f"{akvs_handle}" == f"<Accessor {key()}.n: a place, whose value is read with await handle.read()>"
-    assert repr(pspace[key()]) == f"<PublishAccessor {key()}: a place, whose value is read with a KeyValueStore>"
+    assert str(kvs[key()]["n"]) == f"<Accessor {key()}.n: read its value with .read()>"
+    assert f"{akvs_handle}" == f"<Accessor {key()}.n: read its value with await handle.read()>"
+    assert repr(pspace[key()]) == f"<PublishAccessor {key()}: read its value with a KeyValueStore>"
 
 
 def test_storing_a_handle_says_to_read_it(kvs, key):

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.legacy.convert import Migrated, Migration
 
-__all__ = ["migrate"]
-
 
 def migrate(
     yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only what would be done is shown.")] = False,

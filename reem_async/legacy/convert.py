@@ -26,8 +26,6 @@ from .olddata import METADATA, candidates, special_paths
 from .text import TextConverter, texts
 from .values import ARRAY_LABEL, Tree, array_of
 
-__all__ = ["Migrated", "Migration", "migrate"]
-
 # A key that is written each millisecond can be converted in between; one that never is has a program to be ended.
 _TRIES = 50
 

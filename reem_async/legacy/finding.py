@@ -15,8 +15,6 @@ from ..transport.scan import scanned
 from .olddata import METADATA, candidates, is_rooted, root_command, special_paths
 from .values import is_array
 
-__all__ = ["OldKey", "find"]
-
 _SECOND = METADATA.encode()
 
 

@@ -14,19 +14,6 @@ from ..plan.keys import Keys
 from ..plan.paths import Path, shorten
 from ..plan.shapes import ShapeCache
 
-__all__ = [
-    "CURE",
-    "METADATA",
-    "ROOT",
-    "candidates",
-    "first_read",
-    "is_new",
-    "is_rooted",
-    "look_first",
-    "root_command",
-    "special_paths",
-]
-
 METADATA = "&&&&metadata"
 """What follows a key's name in the name of its second document."""
 

@@ -18,8 +18,6 @@ from ..store.publish import DocumentPublisher
 from ..tools.snapshots.plans import settable
 from ..transport.scan import scanned
 
-__all__ = ["TextConverter", "texts"]
-
 # As `convert.py` has it.
 _TRIES = 50
 

@@ -13,8 +13,6 @@ from ..plan.paths import Path, shorten
 from ..ships.numpy import NumpyShip
 from .olddata import ROOT, candidates
 
-__all__ = ["ARRAY_FIELDS", "ARRAY_LABEL", "Tree", "array_of", "is_array"]
-
 ARRAY_LABEL = "default_numpy_handler"
 """The label of the ship for arrays."""
 

@@ -10,12 +10,6 @@ from ..plan.keys import DOCUMENT
 from .documents import READS, WRITES, Document, is_document
 from .paths import Refusal
 
-__all__ = [
-    "ASKING", "EXEC", "MULTI", "OTHER_TYPE", "UNWATCH", "Known", "MakeError", "Steps", "Watched", "asks", "body_of",
-    "concerns", "framed", "has_json", "is_json", "is_look", "is_whole", "key_of", "kind_told", "replaces", "run",
-    "text_told",
-]  # fmt: skip
-
 MakeError = Callable[[str], Exception]
 """Makes the error that an error reply of the server stands for."""
 

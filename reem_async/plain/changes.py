@@ -27,8 +27,6 @@ from .batches import (
 )
 from .documents import Document
 
-__all__ = ["after_look"]
-
 _FRAME = frozenset(["ASKING", "MULTI", "EXEC"])
 _STORING = frozenset(["SET", "UNLINK"])
 _SEEING = frozenset(["GET", "TYPE", "GETRANGE"])

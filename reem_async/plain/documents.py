@@ -16,8 +16,6 @@ import orjson
 from ..plan.documents import nested_over
 from .paths import Place, Refusal, places, steps_of
 
-__all__ = ["MARK", "READS", "WRITES", "Document", "is_document", "stored"]
-
 MARK = b" "
 """The first byte of the string that is a document, before its JSON text. To JSON it means nothing, and programs of
 others do not begin a string with it: so a document is told from their strings by its first byte alone."""

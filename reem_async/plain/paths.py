@@ -6,8 +6,6 @@ import re
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-__all__ = ["ALL", "Place", "Refusal", "places", "steps_of"]
-
 Step = str | int | slice
 Steps = tuple[Step, ...]
 

@@ -40,8 +40,6 @@ from .batches import (
 from .changes import after_look
 from .documents import MARK, READS, WRITES, Document, is_document, stored
 
-__all__ = ["directly", "finished", "looked_at", "shortcut", "translated"]
-
 
 def shortcut(commands: Sequence[Command], known: Known) -> list[Command] | None:
     """Return what to send for what programs do most, a small read or a whole small document; None for all else.

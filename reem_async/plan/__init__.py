@@ -1,8 +1,8 @@
 """The pure middle: what to send, and what the replies mean.
 
-Nothing in this package talks to anybody. A function here turns a call into a `Plan`: the commands
-of one round trip and a `decode` that turns their replies into the result or into the next `Plan`.
-Whoever owns a connection drives it, blocking or not, so both fronts run the very same plans.
+Nothing in this package does I/O. A function here turns a call into a `Plan`: the commands of one round trip and a
+`decode` that turns their replies into the result or into the next `Plan`. A transport drives it, blocking or not, so
+both fronts run the same plans.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Command = tuple[Any, ...]
 """One server command: its words as str, bytes, int, float or a flat buffer."""
 
 Reply = Any
-"""What the server said: bytes, int, None, a container of these, or an exception object."""
+"""A reply of the server: bytes, int, None, a container of these, or an exception object."""
 
 _MULTI: Command = ("MULTI",)
 _EXEC: Command = ("EXEC",)
 _READS = frozenset(["GET", "JSON.GET", "SMEMBERS", "TYPE"])
-"""What REEM's transactions read by. What ships of users' own read by is taken for a change."""
+"""Commands that REEM's transactions read with. Any other, such as one of a user's ship, may have changed something."""
 
 
 class Plan(NamedTuple):
@@ -31,14 +31,14 @@ class Plan(NamedTuple):
 
     Attributes:
         commands: What to send, in order.
-        decode: Takes one reply per command; returns the result, or the next plan. A plan whose
-            transaction was given up because a watched key changed gets None instead.
+        decode: Takes one reply per command; returns the result, or the next plan. If a watched key changed, so that
+            the transaction was not executed, it gets None instead.
         atomic: Send the commands as one MULTI/EXEC.
-        held: Keep the connection to this plan and its successors (WATCH lives on a connection).
-        bulk: Many bytes are expected back: use a connection where nobody waits behind them.
-        without_refused: The user may not do some of the commands, so nothing of the transaction was done: takes a reply
-            per command, and returns the plan for the rest; None if there is none.
-        unfinished: What came before was applied: makes the error to raise, from the one that says why the rest was not.
+        held: Keep the connection to this plan and its successors (WATCH belongs to a connection).
+        bulk: The replies are large: use a connection on which no other call waits.
+        without_refused: Called if the user lacks the right to some commands, so that nothing was executed: takes a
+            reply per command, and returns the plan for the rest; None if there is none.
+        unfinished: Earlier plans were applied and this one failed: makes the error to raise from that of this plan.
     """
 
     commands: Sequence[Command]
@@ -51,17 +51,16 @@ class Plan(NamedTuple):
 
 
 def wire_commands(plan: Plan) -> Sequence[Command]:
-    """Return what goes over the wire for `plan`, its transaction frame included."""
     return (_MULTI, *plan.commands, _EXEC) if plan.atomic else plan.commands
 
 
 def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
-    """Return one reply per command of `plan`, or None for a transaction given up by WATCH.
+    """Return one reply per command of `plan`, or None if a watched key had changed.
 
     Raises:
         redis.exceptions.RedisError: The server refused the whole transaction; nothing was applied.
-        PartialWrite: It refused only to make it one, and did what came then, command by command.
-        BadData: What came back is not the outcome of a transaction.
+        PartialWrite: It refused MULTI only, and executed the commands one by one.
+        BadData: The reply is not that of a transaction.
     """
     if not plan.atomic:
         return replies
@@ -71,7 +70,7 @@ def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
         pairs = list(zip(replies, wire_commands(plan), strict=True))
         reason = next((blamed(reply, command) for reply, command in pairs if isinstance(reply, Exception)), outcome)
         raise _apart(reason, pairs[1:-1]) if isinstance(replies[0], Exception) else reason
-    # EXEC answers nil only where a watched key was changed. Without a watch nobody could have said so.
+    # EXEC answers nil only where a watched key has changed.
     if outcome is None and plan.held:
         return None
     if type(outcome) is not list or len(outcome) != len(plan.commands):
@@ -80,8 +79,7 @@ def unwrap(plan: Plan, replies: list[Reply]) -> list[Reply] | None:
 
 
 def _apart(reason: Exception, pairs: Sequence[tuple[Reply, Command]]) -> Exception:
-    """Return the error to raise for commands that were to be a transaction, which MULTI was refused for."""
-    # Each command behind a MULTI that was refused was carried out by itself, as it came.
+    """Return the error to raise if MULTI was refused: each command behind it was then executed by itself."""
     done = [
         command[:2]
         for reply, command in pairs
@@ -90,11 +88,11 @@ def _apart(reason: Exception, pairs: Sequence[tuple[Reply, Command]]) -> Excepti
     if not done:
         return reason
     shown = ", ".join(" ".join(str(word) for word in command) for command in done)
-    return PartialWrite(f"{reason}; so what belongs together was not kept together, but these were done: {shown:.300}")
+    return PartialWrite(f"{reason}; MULTI was refused, so these commands were executed separately: {shown:.300}")
 
 
 def blamed(error: Exception, command: Command) -> Exception:
-    """Return `error` headed by the command that met it, if the server turned it down without naming a key."""
+    """Return `error` with the command in its message, if the server refused it without naming a key."""
     if not isinstance(error, Refused | ClusterReply):
         return error
     words = [word.decode(errors="replace") if isinstance(word, bytes) else str(word) for word in command[:2]]

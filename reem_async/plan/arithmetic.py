@@ -24,8 +24,6 @@ from .reads import get_command, present
 from .replies import checked, from_front, full, lengths, loads
 from .shapes import ShapeCache
 
-__all__ = ["calculate", "compute"]
-
 Operation = Callable[[Any, Any], Any]
 
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1

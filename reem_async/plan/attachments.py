@@ -19,19 +19,6 @@ from .replies import checked, diagnose, explained, full, loads, registered
 from .shapes import ShapeCache
 from .sizes import Staged
 
-__all__ = [
-    "Outcome",
-    "clean",
-    "left_behind",
-    "orphans",
-    "permitted",
-    "place_of",
-    "remove_orphans",
-    "survey",
-    "unreferred",
-    "watch",
-]
-
 # Ships' keys that the document does not refer to: finding them under WATCH, and removing them.
 
 

@@ -10,8 +10,6 @@ from . import Command, Reply
 from .keys import Keys
 from .paths import Path
 
-__all__ = ["REFUSED", "SILENT", "Announcement", "Change", "EncodedAttachment"]
-
 REFUSED = object()
 """Judging a reply: the server did nothing and did not say why."""
 

@@ -9,8 +9,6 @@ from .notices import ANNOUNCED, Notice
 from .paths import Path, below
 from .trees import MISSING, get, removed, replaced
 
-__all__ = ["AnnouncedChange", "Rest", "applied", "concerns", "is_own", "is_whole", "rest_of"]
-
 
 class AnnouncedChange(Protocol):
     """As much of an update as tells what it touches."""

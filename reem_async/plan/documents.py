@@ -25,19 +25,6 @@ from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
-__all__ = [
-    "DEEPEST",
-    "PLAIN_ARRAYS",
-    "Attachment",
-    "Encoded",
-    "Fits",
-    "encode",
-    "nested_over",
-    "number_text",
-    "plain",
-    "walk",
-]
-
 DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
 

@@ -14,8 +14,6 @@ import re
 
 import numpy as np
 
-__all__ = ["exact_list", "exact_text", "may_lose"]
-
 _POWERS = tuple(float(f"1e{k}") for k in range(309))
 _POWERS_ARRAY = np.array(_POWERS[:23])
 _EXACT_PLACES = 22

@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 from ..errors import ALL_NODES, ClusterNode, NotAllowed
 from . import Command, Plan, Reply
 
-__all__ = ["DOCUMENT", "Keys", "count", "first_page", "keys_of", "page"]
-
 
 class Keys(NamedTuple):
     """The server-side names of one top-level key.

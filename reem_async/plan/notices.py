@@ -21,26 +21,7 @@ from .changes import EncodedAttachment
 from .documents import nested_over
 from .keys import Keys
 from .paths import Path, check_element
-from .placeholders import find, marked
-from .unreadable import Unreadable
-
-__all__ = [
-    "LARGEST_INLINE",
-    "Notice",
-    "Slot",
-    "View",
-    "announce",
-    "decode",
-    "in_slot",
-    "named",
-    "note_of",
-    "parsed_note",
-    "published",
-    "sizes_of_parts",
-    "starts",
-    "told_at",
-    "with_value",
-]
+from .placeholders import Unreadable, find, marked
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14

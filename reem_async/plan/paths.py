@@ -19,36 +19,6 @@ import orjson
 from ..errors import BadKey, BadType, BadValue
 from .keys import keys_of
 
-__all__ = [
-    "LONGEST_TOP_KEY",
-    "Path",
-    "Pattern",
-    "below",
-    "channel_pattern",
-    "check_element",
-    "check_name",
-    "check_namespace",
-    "check_top_key",
-    "counts_from_end",
-    "escaped",
-    "fits",
-    "has_index",
-    "is_namespace",
-    "may_hold",
-    "name_of",
-    "names_key",
-    "parse",
-    "parse_pattern",
-    "parse_patterns",
-    "parse_shown",
-    "parse_suffix",
-    "shorten",
-    "show",
-    "spelled_out",
-    "suffix",
-    "to_jsonpath",
-]
-
 Path = tuple[str | int, ...]
 
 LONGEST_TOP_KEY = 512

@@ -1,4 +1,4 @@
-"""What stands in a document where a value is not JSON: a string that says what is there.
+"""Placeholders: strings that a document holds in the place of values that are not JSON.
 
     $ship numpy .image 7372800 float64[640,480,3]
     |     |     |      |       what it is, for people
@@ -7,9 +7,9 @@
     |     the label of the ship that wrote it
     the mark
 
-A string, since a path can lead into an object and a write could then change a placeholder's inside;
-nothing leads into a string. Two labels are REEM's own and hold their value in place: `text` for a
-user's string that begins with the mark, `float` for a float no decimal text of which survives.
+A string, since a path cannot lead into it: a write cannot change the inside of a placeholder. Two labels are REEM's
+own and hold their value in place: `text` for a user's string that begins with the mark, `float` for a float that
+RedisJSON reads back exactly from no decimal text.
 """
 
 from __future__ import annotations
@@ -18,26 +18,11 @@ import collections
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 from urllib.parse import quote, unquote
 
 from ..errors import BadData
 from .paths import Path, shorten, suffix
-from .unreadable import Unreadable
-
-__all__ = [
-    "INLINE_LABELS",
-    "MARK",
-    "Placeholder",
-    "PlaceholderSlot",
-    "Unfetched",
-    "find",
-    "inline_float",
-    "inline_text",
-    "marked",
-    "parse",
-    "place_of",
-]  # fmt: skip
 
 MARK = "$ship "
 _MARK_BYTES = MARK.encode()
@@ -45,7 +30,7 @@ INLINE_LABELS = frozenset({"text", "float"})
 
 
 class Placeholder(NamedTuple):
-    """What a document says of a value that a ship holds under a key of its own.
+    """The placeholder of an attachment, a value that a ship holds under a key of its own.
 
     Attributes:
         label: The ship's label.
@@ -65,9 +50,9 @@ class Placeholder(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Unfetched:
-    """An array, or another value that a ship carries, that was left at the server: what the document says of it.
+    """In the place of an array, or another value that a ship carries, that was not fetched from the server.
 
-    Two are equal only if they are the same object, which stands for one state of what is at the server.
+    Equal only to itself: the object changes when the value on the server changes.
 
     Attributes:
         label: The ship's label: "numpy", "bytes".
@@ -99,21 +84,15 @@ class PlaceholderSlot(NamedTuple):
 
 
 def inline_text(text: str) -> str:
-    """Return the placeholder of a user's string that looks like one."""
     return f"{MARK}text {text}"
 
 
 def inline_float(value: float) -> str:
-    """Return the placeholder of a float that no decimal text carries."""
     return f"{MARK}float {value.hex()}"
 
 
 def parse(text: str) -> Placeholder | str | float:
-    """Return what the string `text`, which begins with the mark, stands for.
-
-    Raises:
-        BadData: Not what REEM writes.
-    """
+    """Return the meaning of a string that begins with the mark; raises BadData if REEM does not write such."""
     return _parse_short(text) if len(text) <= _SHORT else _parse(text)
 
 
@@ -123,14 +102,14 @@ def _parse(text: str) -> Placeholder | str | float:
         return rest
     if label == "float":
         return _parse_float(rest)
-    # 18 digits are below 2**63: a stranger's number must not become a large int of Python.
+    # 18 digits are below 2**63: a foreign program's number must not become a large int of Python.
     words = rest.split(" ", 2)
     if not label or len(words) < 2 or not words[1].isascii() or not words[1].isdigit() or len(words[1]) > 18:
         raise BadData(f"the server holds {shorten(text)}, which looks like a placeholder of REEM but is none")
     return Placeholder(unquote(label), unquote(words[0]), int(words[1]), words[2] if len(words) > 2 else "")
 
 
-# Long texts, of which a stranger may put any number there, are not kept.
+# Long texts are not cached: a foreign program may store any number of them.
 _parse_short = lru_cache(maxsize=4096)(_parse)
 _SHORT = 256
 
@@ -146,28 +125,27 @@ def _parse_float(text: str) -> float:
 
 
 def marked(text: bytes) -> bool:
-    """Return whether JSON `text` may hold a placeholder; most has no `$`, and one byte is found at memory speed."""
+    # Most texts have no `$`, and one byte is found at memory speed.
     return b"$" in text and _MARK_BYTES in text
 
 
 def find(holder: list[Any], name: str, unreadable: list[Unreadable] | None = None) -> list[PlaceholderSlot]:
-    """Resolve what stands in place inside `holder` and return the placeholders that are left.
+    """Resolve the inline placeholders in `holder` and return those of attachments.
 
-    `holder` is a freshly decoded tree in a list of one; it is changed in place. Costs one visit to
-    every node, so callers look for the mark in the text first.
-
-    If there is a list of what is `unreadable`, nothing is raised: an `Unreadable` takes the place, and is added to it.
+    `holder` is a freshly decoded tree in a list of one; it is changed in place. Every node is visited, so callers check
+    `marked` first. With a list of what is `unreadable`, nothing is raised: an `Unreadable` is put into the tree and
+    added to the list.
 
     Raises:
-        BadData: A string has the mark but is no placeholder, or two stand for the same key: a document of a
-            few bytes could demand any number of copies. Says where, below the top-level key `name`.
+        BadData: A string has the mark but is no placeholder, or two placeholders name the same key: a document of a
+            few bytes could demand any number of copies.
     """
     slots: list[PlaceholderSlot] = []
     stack: list[Any] = [holder]
     while stack:
         container = stack.pop()
         for key, value in container.items() if type(container) is dict else enumerate(container):
-            # A stack and not recursion: what a stranger wrote may be nested deeper than Python calls may.
+            # A stack and not recursion: a foreign document may be nested deeper than Python's calls.
             kind = type(value)
             if kind is dict or kind is list:
                 stack.append(value)
@@ -185,9 +163,8 @@ def find(holder: list[Any], name: str, unreadable: list[Unreadable] | None = Non
                     slots.append(PlaceholderSlot(meaning, container, key))
                 else:
                     container[key] = meaning
-    # A set only where there are several: most documents with arrays have one or two.
     if len(slots) > 1 and len({slot.placeholder.suffix for slot in slots}) < len(slots):
-        reason = "several placeholders name the same key, which REEM does not write; write it anew"
+        reason = "several placeholders name the same key, which REEM does not write; write it again"
         if unreadable is None:
             raise BadData(f"{name}: {reason}")
         counts = collections.Counter(slot.placeholder.suffix for slot in slots)
@@ -199,12 +176,12 @@ def find(holder: list[Any], name: str, unreadable: list[Unreadable] | None = Non
 
 
 def place_of(name: str, suffix: str) -> str:
-    """Return where a value that a ship holds is, as people write it: its key ends in the path, and maybe a number."""
+    """Return the path of an attachment as text: its key ends in the path, and maybe a unique tail."""
     return f"{name}{suffix.partition('~')[0]}"
 
 
 def _place(tree: Any, text: str) -> str:
-    """Return where in `tree` the string `text` is, as people write paths; it may be nested deeper than calls may."""
+    """Return the path of the string `text` in `tree`, as text."""
     stack: list[tuple[Path, Any]] = [((), tree)]
     while stack:
         path, node = stack.pop()
@@ -213,3 +190,50 @@ def _place(tree: Any, text: str) -> str:
         pairs = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
         stack.extend(((*path, key), child) for key, child in pairs)
     return ""
+
+
+class _Used(BadData, AttributeError):
+    """For `hasattr` and `copy`, which expect an AttributeError."""
+
+
+class Unreadable:
+    """In the place of a value that cannot be read; any use of it raises BadData with the reason.
+
+    The bytes of an array may be gone, damaged, or not readable by this user, or the interface may lack the ship that
+    wrote it. Watches, subscribers, mirrors, recordings and the page of `reem browse` have it in their data.
+    Test for it with `isinstance(value, reem.Unreadable)`; two are equal if their reasons are.
+
+    Attributes:
+        place: Where the value is, as far as that is known: "arm.image".
+        reason: Why it cannot be read, and what to do.
+    """
+
+    __slots__ = ("place", "reason")
+
+    def __init__(self, place: str, reason: str) -> None:
+        self.place = place
+        self.reason = reason.removeprefix(f"{place}: ")
+
+    def __repr__(self) -> str:
+        return f"<unreadable {self.place}: {self.reason}>"
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is Unreadable and other.reason == self.reason
+
+    def __hash__(self) -> int:
+        return hash(self.reason)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Unreadable, (self.place, self.reason)
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise _Used(f"{self.place}: {self.reason}")
+
+    def _refuse(self, *_: object, **__: object) -> NoReturn:
+        raise BadData(f"{self.place}: {self.reason}")
+
+    __getitem__ = __setitem__ = __delitem__ = __iter__ = __len__ = __contains__ = __bool__ = __call__ = _refuse
+    __float__ = __int__ = __index__ = __complex__ = __bytes__ = __array__ = __lt__ = __le__ = __gt__ = __ge__ = _refuse
+    __add__ = __radd__ = __sub__ = __rsub__ = __mul__ = __rmul__ = __truediv__ = __rtruediv__ = __neg__ = _refuse
+    __floordiv__ = __rfloordiv__ = __mod__ = __rmod__ = __pow__ = __rpow__ = __matmul__ = __rmatmul__ = _refuse
+    __abs__ = __and__ = __rand__ = __or__ = __ror__ = __round__ = _refuse

@@ -13,35 +13,17 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from ..errors import BadData, Conflict, MissingDocument, MissingKey, NotAllowed, WrongKind, WrongType
-from ..legacy.olddata import first_read, look_first
+from ..legacy.olddata import first_read as first_read
+from ..legacy.olddata import look_first as look_first
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
-from .placeholders import Placeholder, PlaceholderSlot, Unfetched, find, marked, place_of
+from .placeholders import Placeholder, PlaceholderSlot, Unfetched, Unreadable, find, marked, place_of
 from .replies import checked, explained, full, loads, missing, type_name
 from .shapes import ShapeCache
 from .sizes import LARGE
 from .trees import MISSING
-from .unreadable import Unreadable
-
-__all__ = [
-    "HeldValues",
-    "RawRead",
-    "awaited",
-    "count_in",
-    "entries_command",
-    "exists",
-    "first_read",
-    "has_key",
-    "interpreted",
-    "keys_at",
-    "length",
-    "look_first",
-    "nothing",
-    "read",
-    "type_of",
-]
 
 # Reads of a document whose arrays come and go faster than it is read. Each takes a round trip of about 0.1 ms, so 50
 # are far more than any program needs, and no writer keeps a reader for ever.

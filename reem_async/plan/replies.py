@@ -32,23 +32,6 @@ from .documents import nested_over
 from .keys import Keys
 from .paths import Path, show, to_jsonpath
 
-__all__ = [
-    "checked",
-    "decoded",
-    "diagnose",
-    "explained",
-    "from_front",
-    "full",
-    "lengths",
-    "loads",
-    "missing",
-    "no_json",
-    "refusal",
-    "registered",
-    "settable",
-    "type_name",
-]
-
 _REFUSALS: dict[str, tuple[type[Refused], str]] = {
     "NOAUTH": (LoginRefused, "the server needs a password: RedisInterface(..., username=..., password=...)"),
     "WRONGPASS": (LoginRefused, "the server does not take this user name and password; nothing was tried again"),

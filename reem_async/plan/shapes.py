@@ -10,8 +10,6 @@ from typing import Any
 from .paths import Path
 from .placeholders import Placeholder
 
-__all__ = ["ShapeCache"]
-
 # Documents, or places in them, of each kind of guess.
 _MOST = 10_000
 _MOST_NUMBERS = 100

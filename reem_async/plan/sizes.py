@@ -11,24 +11,6 @@ from typing import Any, NamedTuple
 from ..errors import BadValue
 from . import Command, Plan, Reply
 
-__all__ = [
-    "KEPT",
-    "LARGE",
-    "STAGED",
-    "USUAL",
-    "Limits",
-    "Staged",
-    "are_missing",
-    "as_given",
-    "check_sizes",
-    "has_large",
-    "is_large",
-    "limits",
-    "looks_at",
-    "sizes_of",
-    "stage",
-]
-
 LARGE = 1 << 16
 """Bytes from which others should not have to wait behind a value, in either direction."""
 

@@ -14,9 +14,7 @@ import numpy as np
 
 from ..errors import BadKey
 from .paths import Path, check_element
-from .unreadable import Unreadable
-
-__all__ = ["MISSING", "CannotApply", "copied", "difference", "get", "is_addressable", "removed", "replaced", "same"]
+from .placeholders import Unreadable
 
 
 class _Missing:

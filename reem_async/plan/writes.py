@@ -24,21 +24,6 @@ from .replies import checked, from_front, full, lengths, missing, registered, se
 from .shapes import ShapeCache
 from .sizes import Staged, are_missing, looks_at, stage
 
-__all__ = [
-    "append_change",
-    "appendable",
-    "change",
-    "delete_change",
-    "exchange",
-    "expiry",
-    "into_new",
-    "is_watched",
-    "make_parents",
-    "set_change",
-    "takes",
-    "together",
-]
-
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 _STORED: list[Reply] = [b"OK", []]
 _TOLD: list[Reply] = [b"OK", [], b"OK"]

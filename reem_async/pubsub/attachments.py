@@ -6,8 +6,8 @@ from typing import Any
 
 from ..plan import Plan
 from ..plan.keys import Keys
+from ..plan.placeholders import Unreadable
 from ..plan.reads import RawRead
-from ..plan.unreadable import Unreadable
 
 __all__ = ["HeldAttachments"]
 

@@ -21,7 +21,7 @@ from ..concurrency.tasks import Tasks
 from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
 from ..local.path import LocalPath
 from ..plan import Reply
-from ..plan.unreadable import Unreadable
+from ..plan.placeholders import Unreadable
 from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport

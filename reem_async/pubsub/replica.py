@@ -57,11 +57,11 @@ from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, show
+from ..plan.placeholders import Unreadable
 from ..plan.reads import look_first, read
 from ..plan.replies import decoded
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, CannotApply, get
-from ..plan.unreadable import Unreadable
 from ..ships.registry import Ships
 from .attachments import HeldAttachments
 from .division import Division, Heard, Phase

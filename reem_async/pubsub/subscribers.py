@@ -12,8 +12,7 @@ from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, cho
 from ..concurrency.streams import Following, Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed, MissingKey, NotConnected, ReadOnly
-from ..plan.arguments import check_instance
-from ..plan.handles import Handle
+from ..plan.arguments import Handle, check_instance
 from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, parse, show
 from ..plan.trees import MISSING, copied

@@ -6,8 +6,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable
 from typing import Any
 
-__all__ = ["BlobShip", "SpecialDatatypeShip"]
-
 
 class SpecialDatatypeShip(ABC):
     """Base of the classes that store a custom type on the server.

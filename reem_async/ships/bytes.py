@@ -7,8 +7,6 @@ from typing import Any
 from ..errors import BadData
 from .base import BlobShip
 
-__all__ = ["BytesShip"]
-
 
 class BytesShip(BlobShip):
     """Carries bytes; a bytearray comes back as bytes."""

@@ -22,8 +22,6 @@ from ..errors import BadData, BadType
 from ..plan.documents import PLAIN_ARRAYS
 from .base import BlobShip
 
-__all__ = ["NumpyShip", "flat", "flat_buffer"]
-
 # The .npy format, as numpy.lib.format describes it: magic, version (two bytes), length of the header (two bytes in
 # version 1, four later, little-endian), the header as a Python literal, the data.
 _MAGIC = b"\x93NUMPY"

@@ -14,8 +14,6 @@ from .base import BlobShip, SpecialDatatypeShip
 from .bytes import BytesShip
 from .numpy import NumpyShip
 
-__all__ = ["Registered", "Ships", "default_ships"]
-
 # Stands for the key in the command that a ship records; no real key begins with a zero byte.
 _STAND_IN = "\0the key\0"
 _METHODS = ("check_fit", "write", "read", "interpret_read", "get_label")

@@ -1,6 +1,6 @@
 """One nested dictionary: its places, top-level keys, and what writes, reads and publishes them."""
 
-from .low_level import Reader, Writer
+from .accessor import Reader, Writer
 from .store import KeyValueStore
 
 __all__ = ["KeyValueStore", "Reader", "Writer"]

@@ -5,27 +5,26 @@ from __future__ import annotations
 import builtins
 import operator
 from collections.abc import Iterable, Mapping
+from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from ..concurrency.queues import Newest, Policy, chosen
-from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey
+from ..connection import RedisInterface
+from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey, WrongType
+from ..plan.arguments import Handle
 from ..plan.documents import number_text
-from ..plan.handles import Handle
-from ..plan.paths import Path, check_element, check_name, show
+from ..plan.paths import Path, check_element, check_name, parse, show
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
 from .catalog import Outline, outline_at
 from .document import DocumentWriter
-from .edit import Edit
-from .low_level import Reader, Writer
 from .reader import DocumentReader, opened
 
 if TYPE_CHECKING:
+    from ..plan.reads import RawRead
     from ..session import Session
-
-__all__ = ["Accessor", "Edit"]
 
 _NOTHING: Any = object()
 
@@ -444,3 +443,80 @@ class Accessor(Handle):
 def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> Any:
     """Make an accessor from the parts of a pickled one."""
     return kind(DocumentReader(session, path[0]), writer(session, path[0]), path[1:])
+
+
+class Edit:
+    """What `Accessor.edit` returns."""
+
+    def __init__(self, reader: DocumentReader, writer: DocumentWriter, path: Path) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._path = path
+        self._before: RawRead | None = None
+        self._value: Any = None
+
+    async def __aenter__(self) -> Any:
+        self._before = await self._reader.raw_read(self._path)
+        await opened(self._before)
+        for slot, _, _ in self._before.slots:
+            value = slot.container[slot.key]
+            # What was read shares its memory with the reply; the block may change arrays in place.
+            if isinstance(value, np.ndarray) and not value.flags.writeable:
+                slot.container[slot.key] = value.copy()
+        self._value = self._before.holder[0]
+        if not isinstance(self._value, dict | list | np.ndarray):
+            where = show((self._reader.name, *self._path))
+            raise WrongType(
+                f"{where} is of type {type(self._value).__name__}, which cannot be changed in place; "
+                "edit the dict or list that holds it, or use write()"
+            )
+        return self._value
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        # Compared with what was read, byte by byte, under WATCH: a change by another client since then is a Conflict.
+        if kind is None and self._before is not None:
+            await self._writer.exchange(self._path, self._value, self._before)
+
+
+class Reader:
+    """Reads one top-level key.
+
+    Args:
+        top_key_name: The key.
+        interface: The server.
+    """
+
+    def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
+        self.interface = interface
+        self.top_key_name = top_key_name
+        self._document = DocumentReader(interface.session, top_key_name)
+
+    async def read_from_redis(self, read_path: str) -> Any:
+        """Return the value at a path like ".a.b" (or "." for all); see `Accessor.read`."""
+        try:
+            return await self._document.read(parse(read_path))
+        # As the original did, and as GET does.
+        except MissingDocument:
+            return None
+
+
+class Writer:
+    """Writes one top-level key.
+
+    Args:
+        top_key_name: The key.
+        interface: The server.
+    """
+
+    _kind: type[DocumentWriter] = DocumentWriter
+
+    def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
+        self.interface = interface
+        self.top_key_name = top_key_name
+        self._document = self._kind(interface.session, top_key_name)
+
+    async def send_to_redis(self, set_path: str, set_value: Any) -> None:
+        """Store a value at a path like ".a.b" (or "." for all); see `Accessor.write`."""
+        await self._document.set(parse(set_path), set_value)

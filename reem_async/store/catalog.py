@@ -16,8 +16,6 @@ from ..plan.reads import get_command, present
 from ..plan.replies import from_front, lengths, loads
 from ..session import Session
 
-__all__ = ["Outline", "names", "outline", "outline_at"]
-
 _PLAIN = frozenset({"str", "int", "float", "bool", "NoneType"})
 # Lines of an outline that are printed: more would fill a terminal, or a cell of a notebook.
 _MOST_LINES = 200

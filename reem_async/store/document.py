@@ -31,9 +31,6 @@ from ..plan.writes import (
 from ..session import Session
 from .encoding import HUGE, Encoder, unique_tail
 
-__all__ = ["Assignment", "DocumentWriter", "Outages", "Turn"]
-
-
 Attachments = tuple[EncodedAttachment, ...]
 
 

@@ -16,8 +16,6 @@ from ..plan.paths import Path, has_index, show, suffix
 from ..plan.sizes import USUAL, check_sizes, limits, sizes_of
 from ..session import Session
 
-__all__ = ["HUGE", "Encoder", "unique_tail"]
-
 HUGE = 256 << 20
 """Bytes from which it is looked exactly whether the server takes a value; a ship may need more for it than it says."""
 

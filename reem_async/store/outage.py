@@ -39,8 +39,6 @@ from ..plan.sizes import sizes_of
 from ..session import Session
 from .document import Assignment, DocumentWriter, Turn
 
-__all__ = ["Outage"]
-
 logger = logging.getLogger("reem.publish")
 
 _POLICIES = ("raise", "drop", "newest")

@@ -17,14 +17,10 @@ from ..plan.keys import Keys
 from ..plan.notices import Slot, announce, in_slot, published, sizes_of_parts, told_at, with_value
 from ..plan.paths import Path, counts_from_end, show
 from ..session import Session
-from .accessor import _NOTHING, Accessor
+from .accessor import _NOTHING, Accessor, Writer
 from .document import Attachments, DocumentWriter, Turn
-from .low_level import Writer
 from .outage import Outage
 from .store import KeyValueStore
-
-__all__ = ["PublishAccessor", "PublishSpace", "Publisher"]
-
 
 _Stamp = tuple[str, int]
 """Who publishes, and the number of the update."""

@@ -13,8 +13,6 @@ from ..plan.paths import Path, check_name, show
 from ..plan.reads import RawRead, awaited, exists, first_read, has_key, interpreted, keys_at, length, read, type_of
 from ..session import Session
 
-__all__ = ["DocumentReader", "opened"]
-
 
 class DocumentReader:
     """Reads one top-level key.

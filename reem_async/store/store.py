@@ -20,8 +20,6 @@ from .reader import DocumentReader
 _MOST_TOPS = 1000
 """Accessors of top-level keys that are kept: only to be quick, any is made anew when it is asked for."""
 
-__all__ = ["KeyValueStore"]
-
 Interface = TypeVar("Interface")
 
 

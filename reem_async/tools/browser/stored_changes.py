@@ -17,9 +17,8 @@ from typing import Any
 
 from ...errors import BadData, RedisError, ReemError
 from ...plan.paths import Path, below
-from ...plan.placeholders import marked
+from ...plan.placeholders import Unreadable, marked
 from ...plan.trees import MISSING
-from ...plan.unreadable import Unreadable
 from ...pubsub.division import Division
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event

@@ -11,9 +11,8 @@ import orjson
 
 from ...errors import BadData
 from ...plan.paths import Path
-from ...plan.placeholders import find, marked
+from ...plan.placeholders import Unreadable, find, marked
 from ...plan.trees import MISSING, CannotApply, removed, replaced
-from ...plan.unreadable import Unreadable
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
 from .previews import preview_of

@@ -9,9 +9,9 @@ from functools import partial
 from ...plan import Plan, Reply, wire_commands
 from ...plan.keys import Keys
 from ...plan.paths import Path
+from ...plan.placeholders import Unreadable
 from ...plan.reads import HeldValues, RawRead, read
 from ...plan.replies import decoded
-from ...plan.unreadable import Unreadable
 from ...pubsub.attachments import HeldAttachments
 from ...pubsub.division import divided_read
 from ...pubsub.manager import manager_of

@@ -15,8 +15,8 @@ from typing import Any, Protocol
 from ...concurrency.tasks import started
 from ...errors import BadData, Conflict, NotAllowed, RedisError, WrongKind
 from ...plan.paths import Path, Pattern, show
+from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
-from ...plan.unreadable import Unreadable
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import RefreshTimer
 from ...session import Session

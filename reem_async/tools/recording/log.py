@@ -14,8 +14,8 @@ import numpy as np
 
 from ...errors import MissingKey
 from ...plan.paths import Path, parse, parse_pattern, show
+from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
-from ...plan.unreadable import Unreadable
 from ...ships.base import SpecialDatatypeShip
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships

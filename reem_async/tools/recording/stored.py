@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...plan.paths import Path, Pattern, show
+from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, CannotApply, difference, get, is_addressable, removed, replaced, same
-from ...plan.unreadable import Unreadable
 from .contents import Content
 from .roles import Kind, Role
 

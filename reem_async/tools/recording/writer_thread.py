@@ -18,8 +18,8 @@ import numpy as np
 
 from ...concurrency.scheduling import give_way
 from ...plan.paths import Path, Pattern, show
+from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, CannotApply, get, replaced, same
-from ...plan.unreadable import Unreadable
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent

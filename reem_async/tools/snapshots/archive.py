@@ -27,11 +27,10 @@ from typing import Any, BinaryIO, Self
 import orjson
 
 from ...errors import BadData
+from ...plan.keys import DOCUMENT
 from ...plan.paths import check_top_key, parse_suffix
 from .files import FIRST_MEMBER, NewFile, SavedKey, Snapshot
 from .plans import REDIS_TYPES, KeyContent, Value, joined, split
-
-__all__ = ["Archive", "ArchiveWriter", "header", "verify"]
 
 # Of the format: it grows when older programs would misread a file, not when something is added that they may ignore.
 VERSION = 1
@@ -62,7 +61,7 @@ class _Hashed:
         self._file.flush()
 
     def close(self) -> None:
-        """Leave closing to the owner."""
+        pass  # the owner closes the file
 
 
 # Bytes of an index after decompression; a small file may claim to unpack to any size.
@@ -74,13 +73,7 @@ _LONGEST_EXPIRY = 1 << 53
 
 
 class ArchiveWriter:
-    """Makes one portable snapshot, which has its name when `finish` has returned, or never.
-
-    Args:
-        path: The file.
-        header: What `header` returned.
-        overwrite: Whether a file that has its name by then may be replaced.
-    """
+    """Makes one portable snapshot, which has its name when `finish` has returned, or never."""
 
     def __init__(self, path: Path, header: dict[str, Any], *, overwrite: bool = False) -> None:
         self._new = NewFile(path, overwrite=overwrite)
@@ -96,15 +89,18 @@ class ArchiveWriter:
             raise
 
     def add(self, content: KeyContent) -> None:
-        """Write one top-level key."""
         folder = f"keys/{len(self._keys) + 1}"
         # Text is compressed at the fastest level; arrays are not: they hardly shrink, and this is about as fast as
         # the disk.
         self._put(f"{folder}/document.json", content.text, zipfile.ZIP_DEFLATED)
         values = []
         for number, value in enumerate(content.values, 1):
-            blob = value.pieces[0] if value.kind == "string" else joined(value.pieces)
-            member = f"{folder}/values/{number}.{_ending(value.kind, blob)}"
+            if value.kind == "string":
+                blob = value.pieces[0]
+                ending = "npy" if blob[:6] == _NUMPY else "bin"
+            else:
+                blob, ending = joined(value.pieces), "json" if value.kind == DOCUMENT else value.kind
+            member = f"{folder}/values/{number}.{ending}"
             self._put(member, blob)
             values.append({"suffix": value.suffix, "type": value.kind, "size": value.size, "file": member})
         row = {"name": content.name, "size": len(content.text), "file": f"{folder}/document.json"}
@@ -112,7 +108,7 @@ class ArchiveWriter:
         self._keys.append({**row, "registry": content.registry, "values": values})
 
     def finish(self, foreign: list[str], unsaved: Mapping[str, str] | None = None) -> None:
-        """Write the index and the digest, see to it that all is on the disk, and give the file its name."""
+        """Write the index and the digest, sync the file to the disk, and give it its name."""
         index = {
             "keys": self._keys,
             "foreign": len(foreign),
@@ -121,11 +117,10 @@ class ArchiveWriter:
         }
         self._put(_INDEX, orjson.dumps(index), zipfile.ZIP_DEFLATED)
         # The comment is the end of the file. It is written with zeros, which the digest covers, and then the digest
-        # takes
-        # their place: so a reader can compute the same digest from the file alone.
+        # takes their place, so a reader can compute the same digest from the file alone.
         self._zip.comment = _COMMENT + _ZEROS
         self._zip.close()
-        # Behind the back of `_hashed`: these bytes are not counted once more.
+        # Not through `_hashed`, which would count these bytes again.
         self._new.file.seek(-len(_ZEROS), 2)
         self._new.file.write(self._hashed.digest.hexdigest().encode())
         self._new.commit()
@@ -140,14 +135,8 @@ class ArchiveWriter:
         self._zip.writestr(zipfile.ZipInfo(name), data, method, 1)
 
 
-def _ending(kind: str, blob: Any) -> str:
-    if kind == "string":
-        return "npy" if blob[:6] == _NUMPY else "bin"
-    return {"ReJSON-RL": "json"}.get(kind, kind)
-
-
 def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Read the whole file and compare its digest; `progress` is told the bytes done and all of them.
+    """Read the whole file and compare its digest; `progress` is called with the bytes done and the total.
 
     Raises:
         BadData: The file was cut or changed, or is no portable snapshot.
@@ -173,14 +162,8 @@ def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> No
 class Archive:
     """A portable snapshot open for reading; use it in a `with` block.
 
-    Args:
-        path: The file.
-
-    Attributes:
-        summary: What is in it.
-
     Raises:
-        BadData: It is none, or damaged where it was looked at; `verify` looks everywhere.
+        BadData: It is none, or its index is damaged; `verify` checks the rest.
     """
 
     def __init__(self, path: Path) -> None:
@@ -195,7 +178,6 @@ class Archive:
             raise
 
     def read(self, name: str) -> KeyContent:
-        """Return one top-level key; raises BadData."""
         with _believed(self._path):
             row = self._rows[name]
             values = tuple([self._value(each) for each in row["values"]])
@@ -255,13 +237,13 @@ class Archive:
         blob = self._member(row["file"], row["size"] if row["type"] == "string" else None)
         # Hashes hold pairs, sorted sets members and scores, JSON is one text.
         pieces = (blob,) if row["type"] == "string" else tuple(split(blob))
-        if (row["type"] in ("hash", "zset") and len(pieces) % 2) or (row["type"] == "ReJSON-RL" and len(pieces) != 1):
+        if (row["type"] in ("hash", "zset") and len(pieces) % 2) or (row["type"] == DOCUMENT and len(pieces) != 1):
             raise ValueError(f"a {row['type']} of {len(pieces)} pieces")
         return Value(row["suffix"], row["type"], pieces)
 
 
 def _saved_key(row: dict[str, Any]) -> SavedKey:
-    """Return what the index says of a key, nothing of which is trusted: these become names on a server."""
+    # Nothing in the index is trusted: these become names on a server.
     name = check_top_key(row["name"])
     for suffix in [*row["registry"], *[value["suffix"] for value in row["values"]]]:
         if suffix and suffix[0] not in ".[~":
@@ -285,20 +267,18 @@ def _within(number: float, limit: float) -> float:
 
 @contextmanager
 def _believed(path: Path) -> Iterator[None]:
-    """Turn whatever a damaged file leads to into BadData."""
     try:
         yield
     except BadData:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise BadData(f"{path}: the snapshot is damaged or not complete: {error}") from None
-    # What code runs into that finds other types and names than it expects in a file which was made up.
+    # A file that was made up may hold any types and names.
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError, MemoryError) as error:
         raise BadData(f"{path}: the snapshot is damaged, its index does not fit its content: {error}") from None
 
 
 def header(server: str, namespace: str, match: str, version: str) -> dict[str, Any]:
-    """Return what the first member says of the rest."""
     now = time.time()
     utc = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(now))
     return {"time": now, "utc": utc, "server": server, "namespace": namespace, "match": match, "reem": version}

@@ -19,19 +19,6 @@ import orjson
 from ...errors import BadData
 from ..partfile import PartFile, there_already
 
-__all__ = [
-    "SUFFIXES",
-    "NewFile",
-    "Pruned",
-    "SavedKey",
-    "Snapshot",
-    "check_target",
-    "dated",
-    "new_name",
-    "prune",
-    "sniff",
-]
-
 SUFFIXES = {"portable": ".zip", "rdb": ".rdb"}
 """How the names of both kinds of files end. What a file is, its content says."""
 
@@ -60,7 +47,6 @@ class SavedKey(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of document and values."""
         return self.document + sum([size for _, _, size in self.values])
 
 
@@ -136,27 +122,16 @@ def dated(path: Path) -> float | None:
 
 
 class Pruned(NamedTuple):
-    """What became of snapshots that are too old.
-
-    Attributes:
-        deleted: Those that are gone.
-        failed: Why others are not.
-    """
-
     deleted: list[Path]
     failed: list[OSError]
 
 
 def prune(made: Sequence[Path], keep: int) -> Pruned:
-    """Delete the oldest snapshots that were saved by period until `keep` are left.
+    """Delete the oldest snapshots that were saved by period until `keep` (at least 1) are left.
 
-    Only files beside the last one made that have such a name and such content, and are of its kind, server,
-    namespace and pattern, are deleted, and never that one itself. Those of earlier runs go first, whatever the
-    clock said then and says now: a robot without a clock of its own begins each day in 1970.
-
-    Args:
-        made: What this run has saved, in this order.
-        keep: How many to leave, at least 1.
+    Deletes only files in the directory of the last one `made` by this run that have such a name and such content, and
+    are of its kind, server, namespace and pattern; never that one itself. Those of earlier runs go first, whatever
+    their times: a robot without a clock of its own begins each day in 1970.
     """
     done = Pruned([], [])
     try:
@@ -173,9 +148,7 @@ def prune(made: Sequence[Path], keep: int) -> Pruned:
 
 
 def _too_old(made: Sequence[Path], keep: int) -> list[Path]:
-    """Return the snapshots that `prune` deletes, the oldest first."""
-    # A clock may have been set back since: files of this run are in the order in which they were made, not of their
-    # times.
+    # The clock may have been set back: files of this run are in the order in which they were made.
     newest, order = made[-1], {path: number for number, path in enumerate(made)}
     origin = _origin(newest)
     own = [
@@ -185,7 +158,7 @@ def _too_old(made: Sequence[Path], keep: int) -> list[Path]:
     ]
     # -1 for files of earlier runs: they are older than all of this run.
     own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
-    # `own` is without the newest one, which counts among those that are kept.
+    # The newest one, which is not in `own`, counts among those that are kept.
     return own[: max(0, len(own) + 1 - keep)]
 
 
@@ -225,41 +198,29 @@ def check_target(path: Path, *, overwrite: bool) -> None:
 
 
 class NewFile:
-    """A file that gets the name `path` when all of it is on the disk, or never; until then it is hidden beside it.
-
-    Args:
-        path: The name.
-        overwrite: Whether a file that has it by then may be replaced.
-
-    Attributes:
-        file: What to write to.
-    """
+    """A file that gets the name `path` when all of it is on the disk, or never; until then it is hidden beside it."""
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self._part = PartFile(path, replace=overwrite)
         self.file: BinaryIO = self._part.path.open("r+b")
 
     def commit(self) -> None:
-        """Give the file its name; FileExistsError if another one has it by now, which may not be replaced."""
+        """Give the file its name; FileExistsError if another file has it by now and may not be replaced."""
         self.file.flush()
         # First the content, then the name: after a power failure there is never a name with half a file.
         os.fsync(self.file.fileno())
         self.file.close()
         self._part.finish()
-        _sync_directory(self._part.path.parent)
+        # Make the new name survive a power failure too, where directories can be opened.
+        with suppress(OSError):
+            descriptor = os.open(self._part.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
 
     def discard(self) -> None:
-        """Remove the file. A thread that still writes to it or commits it gets an error, and the name stays free."""
+        """Remove the file. A thread that still writes to it gets an error."""
         with suppress(OSError):
             self.file.close()
         self._part.close()
-
-
-def _sync_directory(directory: Path) -> None:
-    """Make the new name survive a power failure, where directories can be opened."""
-    with suppress(OSError):
-        descriptor = os.open(directory, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -18,23 +18,6 @@ from ...plan.reads import get_command
 from ...plan.replies import checked, loads
 from ...plan.shapes import ShapeCache
 
-__all__ = [
-    "NOT_ALLOWED",
-    "REDIS_TYPES",
-    "KeyContent",
-    "Value",
-    "dump",
-    "joined",
-    "lifetimes",
-    "put",
-    "redis_type",
-    "settable",
-    "shown",
-    "split",
-    "strangers",
-    "types",
-]
-
 _WORDS = 1000
 """Words of one command at most, so that no single one keeps the server busy for long."""
 

@@ -6,7 +6,7 @@ import dataclasses
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -27,11 +27,6 @@ from ...transport.scan import counted, scanned
 from .archive import Archive, ArchiveWriter, header, verify
 from .files import Snapshot, check_target, sniff
 from .plans import NOT_ALLOWED, KeyContent, dump, lifetimes, put, shown, strangers, types
-
-__all__ = ["Progress", "Restored", "restore", "save"]
-
-_BATCH = 1 << 20
-"""Bytes that are handed to the thread that writes, or by it, at once; one top-level key may be more."""
 
 # Keys whose types are asked for in one round trip.
 _PAGE = 500
@@ -63,7 +58,7 @@ class Restored(NamedTuple):
     size: int
 
 
-Told = Callable[[Progress], None]
+ProgressFunction = Callable[[Progress], None]
 
 
 async def save(
@@ -72,24 +67,24 @@ async def save(
     match: str = "*",
     *,
     overwrite: bool = False,
-    progress: Told | None = None,
+    progress: ProgressFunction | None = None,
 ) -> Snapshot:
     """Save the keys of REEM to one file: documents, arrays, whatever ships hold, byte for byte.
 
     Each top-level key is of one instant, with all that belongs to it; different keys are not. What is not
-    REEM's is left out and counted. One round trip for a key without arrays, two for others, after one for
-    about 1000 keys of the server to find them (none if `match` has no `*` or `?`); in a cluster all primaries
-    are asked. What was found is compared with the number of keys that the servers count; if they
-    count more, the result's `doubt` says so. What cannot be read is left out and named in the result's `unsaved`:
-    where a right is missing, an array is gone, or a ship's value has a Redis type that cannot be saved. A key that
-    expires is saved with the time it has left. In memory there are one top-level key, up to 1 MB of others and
-    the names of all Redis keys. Cancelling leaves no file behind.
+    REEM's is left out and counted. What cannot be read is left out and named in the result's `unsaved`: where a right
+    is missing, an array is gone, or a ship's value has a Redis type that cannot be saved. A key that expires is saved
+    with the time it has left. Cancelling leaves no file behind.
+
+    One round trip for a key without arrays, two for others, after one for about 1000 keys of the server to find them
+    (none if `match` has no `*` or `?`); in a cluster all primaries are asked. If the servers count more keys than
+    were found, the result's `doubt` says so. One top-level key and the names of all Redis keys are in memory.
 
     Args:
         interface: The server; its namespace is what is saved.
         path: The file to make; it appears under this name when it is complete and on the disk.
         match: Which top-level keys: a name in which `*` and `?` stand for other characters.
-        overwrite: Whether a file that is there may be replaced.
+        overwrite: Whether an existing file may be replaced.
         progress: Called now and then, on the event loop.
 
     Returns:
@@ -100,7 +95,7 @@ async def save(
         BadData, NotAllowed, Conflict: No key at all could be saved; this is why for the first. No file was made.
         ClusterNode: The server is one node of several. No file was made.
         NotConnected: A node does not answer, or slots of the cluster have none. No file was made.
-        FileExistsError: The file is there, or was made by somebody else meanwhile.
+        FileExistsError: The file exists, or another program made it in between.
         OSError: The file cannot be written.
     """
     session, target = interface.session, Path(path)
@@ -121,43 +116,33 @@ async def save(
     except BaseException:
         writer.abandon()
         raise
-    saved = await anyio.to_thread.run_sync(_describe, target)
-    return dataclasses.replace(saved, doubt=found.doubt)
-
-
-def _describe(path: Path) -> Snapshot:
-    with Archive(path) as archive:
-        return archive.summary
+    with await anyio.to_thread.run_sync(Archive, target) as archive:
+        return dataclasses.replace(archive.summary, doubt=found.doubt)
 
 
 async def _fill(
-    session: Session, writer: ArchiveWriter, found: Survey, progress: Told | None
+    session: Session, writer: ArchiveWriter, found: Survey, progress: ProgressFunction | None
 ) -> tuple[int, Exception | None]:
     """Fetch and write the keys found; return how many were still there, and why the first that failed did."""
-    count, batch, failure = 0, _Batch(), None
-    lifetimes_left: list[int | None] = []
+    count, failure = 0, None
+    left: list[int | None] = []
     for number, name in enumerate(found.names):
-        _tell(progress, "save", number, len(found.names))
+        _report(progress, "save", number, len(found.names))
         if number % _PAGE == 0:
-            lifetimes_left = await _lifetimes(session, found, found.names[number : number + _PAGE])
-        keys = session.keys(name)
+            left = await _lifetimes(session, found, found.names[number : number + _PAGE])
         try:
-            content: KeyContent | None = await session.run(dump(keys))
+            content: KeyContent | None = await session.run(dump(session.keys(name)))
         except WrongKind:  # replaced by a program without REEM since it was found
             continue
         except (BadData, Conflict, NotAllowed) as error:
             failure = failure or error
             found.failed(name, str(error))
             continue
-        if content is None:
-            continue
-        content = content._replace(expires=lifetimes_left[number % _PAGE])
-        count += 1
-        found.owns(content)
-        if batch.takes(content):
-            await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
-    await anyio.to_thread.run_sync(_write, writer, batch.handed_over())
-    _tell(progress, "save", len(found.names), len(found.names))
+        if content is not None:
+            count += 1
+            found.owns(content)
+            await anyio.to_thread.run_sync(writer.add, content._replace(expires=left[number % _PAGE]))
+    _report(progress, "save", len(found.names), len(found.names))
     return count, failure
 
 
@@ -168,31 +153,6 @@ async def _lifetimes(session: Session, found: Survey, names: Sequence[str]) -> l
     return left or [None] * len(names)
 
 
-def _write(writer: ArchiveWriter, contents: Sequence[KeyContent]) -> None:
-    for content in contents:
-        writer.add(content)
-
-
-class _Batch:
-    """Entries on their way between the event loop and the thread that reads or writes the file."""
-
-    def __init__(self) -> None:
-        self._entries: list[KeyContent] = []
-        self._size = 0
-
-    def takes(self, content: KeyContent) -> bool:
-        """Add one; return whether it is time to hand them over."""
-        self._entries.append(content)
-        # 100 bytes for what an content costs besides its content, so that many empty ones make a batch too.
-        self._size += content.size + 100
-        return self._size >= _BATCH
-
-    def handed_over(self) -> list[KeyContent]:
-        """Return the contents and forget them."""
-        contents, self._entries, self._size = self._entries, [], 0
-        return contents
-
-
 async def restore(
     interface: RedisInterface,
     path: str | os.PathLike[str],
@@ -200,28 +160,28 @@ async def restore(
     *,
     replace: bool = False,
     into: str = "",
-    progress: Told | None = None,
+    progress: ProgressFunction | None = None,
 ) -> Restored:
-    """Write the keys of a portable snapshot to a server, and tell their subscribers.
+    """Write the keys of a portable snapshot to a server, and notify their subscribers.
 
-    The whole file is checked first, and whether keys are in the way: a damaged file, or a key that is
-    there, changes nothing. Then each top-level key is one transaction of all that belongs to it and its
-    notice; the keys together are not. A key that was saved with an expiry has as long to live as it had left
-    then. Two round trips for each, after one for 500 of them. Cancelling, or an error on the way, leaves some keys
-    written and the others as they were, none half.
+    First the whole file is checked, and whether keys are in the way: a damaged file, or an existing key, changes
+    nothing. Then each top-level key is one transaction of all that belongs to it and its notice; the keys together
+    are not. A key that was saved with an expiry has as long to live as it had left then. Two round trips for each,
+    after one for 500 of them. Cancelling, or an error on the way, leaves some keys written and the others as they
+    were, none half.
 
     Args:
         interface: The server; the keys go to its namespace, whatever the one was they were saved of.
         path: The file.
         match: Which top-level keys of the file: a name in which `*` and `?` stand for other characters.
-        replace: Whether keys that are there may be replaced. Others on the server are left alone.
+        replace: Whether existing keys may be replaced. Others on the server are left alone.
         into: Goes before the name of each key.
         progress: Called now and then, on the event loop.
 
     Raises:
         BadData: The file is damaged, or none of REEM. Nothing was written.
         MissingKey: `match` names no key of the file. Nothing was written.
-        Conflict: A key is there and `replace` is False. Nothing was written, unless the message says so.
+        Conflict: A key exists and `replace` is False. Nothing was written, unless the message says so.
         WrongKind: A Redis key that is not REEM's has the name of one. Nothing was written.
         BadKey: A name with `into` before it is none.
         PartialWrite: The server, or the connection, failed behind some keys; the message says which were written.
@@ -239,22 +199,14 @@ async def restore(
         await _check_room(session, list(names.values()), replace=replace)
         done: list[str] = []
         size = 0
-        left = list(names)
-        while left:
-            # Reading and unpacking are the thread's work, so that the event loop goes on meanwhile.
-            batch = await anyio.to_thread.run_sync(_next_batch, archive, left)
-            left = left[len(batch) :]
-            while batch:  # each is let go of before the next one comes
-                content = batch.pop(0)
-                size += content.size
-                _tell(progress, "restore", len(done), len(names))
-                await _put(session, names[content.name], content, done, replace=replace)
-                del content
-        _tell(progress, "restore", len(done), len(names))
+        for name, keys in names.items():
+            _report(progress, "restore", len(done), len(names))
+            size += await _put(session, archive, name, keys, done, replace=replace)
+        _report(progress, "restore", len(done), len(names))
     return Restored(tuple(done), size)
 
 
-async def _check_file(source: Path, progress: Told | None) -> None:
+async def _check_file(source: Path, progress: ProgressFunction | None) -> None:
     if await anyio.to_thread.run_sync(sniff, source) == "rdb":
         raise BadData(
             f"{source} is an RDB file, which only a server can read: start one with `reem up --from {source}`, "
@@ -262,15 +214,14 @@ async def _check_file(source: Path, progress: Told | None) -> None:
         )
 
     # `verify` runs in a thread; the caller's function expects to be called on the event loop.
-    def told(done: int, total: int) -> None:
+    def report(done: int, total: int) -> None:
         if progress is not None:
             anyio.from_thread.run_sync(progress, Progress("verify", done, total))
 
-    await anyio.to_thread.run_sync(verify, source, told)
+    await anyio.to_thread.run_sync(verify, source, report)
 
 
 async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) -> None:
-    """Raise if anything is in the way, before anything is written."""
     there: list[str] = []
     for start in range(0, len(keys), _PAGE):
         page = keys[start : start + _PAGE]
@@ -288,23 +239,21 @@ async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) 
         )
 
 
-def _next_batch(archive: Archive, names: Iterable[str]) -> list[KeyContent]:
-    batch = _Batch()
-    for name in names:
-        if batch.takes(archive.read(name)):
-            break
-    return batch.handed_over()
+async def _put(session: Session, archive: Archive, name: str, keys: Keys, done: list[str], *, replace: bool) -> int:
+    """Write one key to the server; return its bytes."""
+    size = 0
 
-
-async def _put(session: Session, keys: Keys, content: KeyContent, done: list[str], *, replace: bool) -> None:
     def notices() -> list[Command]:
         stamp = *session.stamp(keys), time.time(), ()
-        payload = announce(*stamp, size=content.size)
+        payload = announce(*stamp, size=size)
         return published(keys, *stamp[:2], payload, everywhere=session.is_fresh(keys))
 
-    plan: Plan = await anyio.to_thread.run_sync(
-        lambda: put(keys, content, session.cache, replace=replace, notices=notices)
-    )
+    # Reading, unpacking and converting is work for a thread.
+    def prepared() -> tuple[int, Plan]:
+        content = archive.read(name)
+        return content.size, put(keys, content, session.cache, replace=replace, notices=notices)
+
+    size, plan = await anyio.to_thread.run_sync(prepared)
     # As every publish: notices of one key are sent in the order of their numbers.
     async with session.transport.ordered(keys.channel):
         await session.transport.settle(keys.document)
@@ -320,15 +269,15 @@ async def _put(session: Session, keys: Keys, content: KeyContent, done: list[str
                 raise
             raise PartialWrite(_after(error, done)) from error
     done.append(keys.name)
+    return size
 
 
 def _after(error: Exception, done: Sequence[str]) -> str:
-    """Return what went wrong, and what had been written by then."""
     why = str(error).replace(", nothing was written", "")
     return f"{why}. Written before that: {len(done)} keys, from {done[0]!r} to {done[-1]!r}"
 
 
-def _tell(progress: Told | None, doing: str, done: int, total: int) -> None:
+def _report(progress: ProgressFunction | None, doing: str, done: int, total: int) -> None:
     if progress is not None:
         progress(Progress(doing, done, total))
 
@@ -339,13 +288,12 @@ def _tell(progress: Told | None, doing: str, done: int, total: int) -> None:
 _OF_KEY = {b":ships", b":last"}
 # Large arrays that are on their way to a key are not foreign; they are renamed in a moment.
 _COMING = STAGED.encode()
-_LOOKS = 3
-"""How often the servers are looked through before it is said that their count does not agree."""
+_SEARCHES = 3
+"""How often the servers are searched before a count that does not agree is reported."""
 # The keys beside a document carry its name in braces: {foo}:ships, {foo}.bar.image.
 _TAGGED = re.compile(rb"\{([^{}]*)\}(.*)", re.DOTALL)
 
 Wanted = Callable[[str], bool]
-"""Whether a top-level key is meant."""
 
 
 class Survey:
@@ -367,17 +315,15 @@ class Survey:
         self._foreign: list[str] = []
 
     def owns(self, content: KeyContent) -> None:
-        """Take note of a key that was fetched: what belongs to it is not foreign."""
+        """Note that a key was fetched: what belongs to it is not foreign."""
         tagged = self._tagged.get(content.name, set())
         tagged -= {suffix.encode() for suffix in content.registry}
         tagged -= {value.suffix.encode() for value in content.values}
         for suffix in content.missing:
-            self.unsaved[content.name + suffix.partition("~")[0]] = (
-                "it is gone from the server, only its name is left"
-            )
+            self.unsaved[content.name + suffix.partition("~")[0]] = "it is gone from the server, only its name is left"
 
     def failed(self, name: str, why: str) -> None:
-        """Take note of a key that could not be fetched; what belongs to it is not foreign."""
+        """Note that a key could not be fetched; what belongs to it is not foreign."""
         self.unsaved[name] = why
         self._tagged.pop(name, None)
 
@@ -392,7 +338,6 @@ class Survey:
         return found
 
     def add_page(self, page: Sequence[bytes], kinds: Sequence[str], namespace: bytes, wanted: Wanted) -> None:
-        """Sort the keys of one page of a SCAN."""
         for key, kind in zip(page, kinds, strict=True):
             tagged = _TAGGED.fullmatch(key)
             name = _name((tagged[1] if tagged else key)[len(namespace) :])
@@ -430,23 +375,23 @@ def _name(key: bytes) -> str | None:
 
 
 async def survey(session: Session, match: str) -> Survey:
-    """Find the keys of a session's namespace; a plain name is taken as it is, without a look.
+    """Find the keys of a session's namespace; a plain name is taken as it is, without a search.
 
-    The servers are looked through again if they count more keys than they named: a key that moves from
-    node to node may be named by neither.
+    The servers are searched again if they count more keys than they named: a key that moves from node to node may be
+    named by neither.
     """
     wanted, found = matcher(match), Survey()
     if not set("*?") & set(match):
         found.names.append(check_top_key(match))
         return found
-    for _ in range(_LOOKS):
-        named = await _look(session, found, wanted)
+    for _ in range(_SEARCHES):
+        named = await _search(session, found, wanted)
         held = await counted(session.transport, session.options.database)
         if held is None:
             found.doubt = "this user may not ask the server for its count (+info), so it was not compared"
             break
-        # Keys that were written meanwhile are counted but not seen: another look finds them, or keys that moved
-        # between nodes. Of one look only: what was deleted since the first would hide as many that were missed.
+        # Keys that were written in between are counted but not seen: another search finds them, or keys that moved
+        # between nodes. Of one search only: what was deleted since the first would hide as many that were missed.
         more = held - named
         found.doubt = f"the server counts {more} Redis keys more than it named: new ones, or missed" if more > 0 else ""
         if not found.doubt:
@@ -455,7 +400,7 @@ async def survey(session: Session, match: str) -> Survey:
     return found
 
 
-async def _look(session: Session, found: Survey, wanted: Wanted) -> int:
+async def _search(session: Session, found: Survey, wanted: Wanted) -> int:
     """Add the keys that were not seen before; returns how many were named, seen before or not."""
     space = session.namespace.encode()
     named: set[bytes] = set()  # SCAN may name a key twice

@@ -20,8 +20,6 @@ from ...errors import ReemError
 from ...plan import Plan, Reply
 from .files import NewFile, Snapshot, check_target
 
-__all__ = ["RdbUnavailable", "describe_rdb", "save_rdb"]
-
 # Between two requests of INFO: a save of a small server takes some milliseconds, of a large one minutes.
 _POLL_SECONDS = 0.05
 # A save that the server has accepted must begin within this time.
