@@ -313,3 +313,10 @@ def test_a_decision_is_short():
             "Consequence",
         ], heading
         assert len(lines) <= 12, heading
+
+
+def test_files_that_contributing_names_are_there():
+    """A module that is merged or renamed is mended there too."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    for name in set(re.findall(r"[\w/]+\.py\b", text)):
+        assert any((ROOT / place / name).exists() for place in ("", "reem_async", "reem_async/pubsub", "reem")), name
