@@ -19,8 +19,8 @@ from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
-from reem_async.transport.addresses import NewTransport
 from reem_async.transport.blocking import BlockingTransport
+from reem_async.transport.composite import NewTransport
 from reem_async.transport.state import State, StateChange, StateChanges
 
 from ._portal import LastPortal, Portal, finish

@@ -10,8 +10,8 @@ from typing import Any, Literal, Self
 from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
-from .transport.addresses import NewTransport, ToOneServer
 from .transport.aio import AsyncTransport
+from .transport.composite import NewTransport, ToOneServer
 from .transport.options import Options
 from .transport.state import State, StateChange, StateChanges
 

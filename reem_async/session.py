@@ -23,11 +23,10 @@ from .plan.paths import LONGEST_TOP_KEY, Pattern, check_namespace, check_top_key
 from .plan.shapes import ShapeCache
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
-from .transport import Transport, drive
-from .transport.addresses import NewTransport
-from .transport.endpoints import way_to
-from .transport.recorder import CommandRecorder
-from .transport.scan import scanned
+from .transport import Transport, drive, scanned
+from .transport.composite import NewTransport
+from .transport.opening import make_transport
+from .transport.packing import CommandRecorder
 
 _FRESH = 3.0
 """Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
@@ -168,7 +167,7 @@ class Session:
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
-        self.options, self.transport = way_to(host, timeout, options, new_transport)
+        self.options, self.transport = make_transport(host, timeout, options, new_transport)
         self.local = local or LocalPath()
         self.interface: Any = None
         self._numbers = _Numbers()

@@ -16,8 +16,8 @@ from conftest import FRONTS, RawCluster
 import reem
 import reem_async
 from reem.server import EmbeddedServer
+from reem_async.transport import Contention
 from reem_async.transport.blocking import _Line
-from reem_async.transport.contention import Contention
 from reem_async.transport.wire import Wire
 
 LIMIT = 0.2

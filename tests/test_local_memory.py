@@ -28,7 +28,7 @@ from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import ANNOUNCED, LARGEST_INLINE, Slot, announce, decode, in_slot
 from reem_async.plan.placeholders import Placeholder
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.transport.recorder import CommandRecorder
+from reem_async.transport.packing import CommandRecorder
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
 

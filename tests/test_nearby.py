@@ -21,8 +21,8 @@ import reem
 from reem.errors import ConnectionLost, NotConnected
 from reem_async.server import EmbeddedServer
 from reem_async.tools.recording import open_log
-from reem_async.transport import nearby
-from reem_async.transport.nearby import Way, look_nearby
+from reem_async.transport import opening
+from reem_async.transport.opening import SocketOptions, look_nearby
 from reem_async.transport.options import NodeOptions, Options
 
 pytestmark = pytest.mark.skipif(
@@ -148,7 +148,7 @@ def test_another_server_at_the_same_path_is_not_taken(server, connect):
 
 def test_not_even_if_its_process_had_the_same_number(server, connect, monkeypatch):
     """As in two containers that share a folder, and both begin to count at 1."""
-    monkeypatch.setattr(Way, "_check_listener", lambda self, listening: None)
+    monkeypatch.setattr(SocketOptions, "_check_listener", lambda self, listening: None)
     with EmbeddedServer() as other:
         Path(server.socket_path).unlink()
         shutil.move(other.socket_path, server.socket_path)
@@ -170,7 +170,7 @@ def test_a_stranger_at_the_path_gets_no_password(connect):
 
 @pytest.mark.parametrize("said", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 100, b""])
 def test_nonsense_at_the_path_does_no_harm(server, connect, monkeypatch, said):
-    monkeypatch.setattr(Way, "_check_listener", lambda self, listening: None)
+    monkeypatch.setattr(SocketOptions, "_check_listener", lambda self, listening: None)
     with in_place_of(server, lambda connection: (connection.recv(1000), connection.sendall(said))):
         goes_on(connect(server.port))
         assert not any(ways(server))
@@ -234,7 +234,7 @@ def test_nor_for_one_of_several_servers():
 
 
 def test_nor_where_nobody_tells_who_listens(monkeypatch):
-    monkeypatch.delattr(nearby.socket, "SO_PEERCRED")
+    monkeypatch.delattr(opening.socket, "SO_PEERCRED")
     options = Options("localhost", 1.0, {})
     look_nearby(options)
     assert options.nearby is None

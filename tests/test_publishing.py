@@ -20,7 +20,7 @@ from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.writes import append_change, change, delete_change, set_change, takes, together
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.store.publish import PublishTurn
-from reem_async.transport.recorder import CommandRecorder
+from reem_async.transport.packing import CommandRecorder
 
 KEYS = keys_of("a", "", 0, False)
 IMAGE = (EncodedAttachment(".x.image", "numpy", (("SET", "{a}.x.image", b"1"),), (b"1",)),)

@@ -32,7 +32,7 @@ COMMANDS = (
 )
 if PLAIN:
     COMMANDS = "getrange " + re.sub(r"json\.\w+ ", "", COMMANDS)
-SHARDED = "spublish asking readonly"
+SHARDED = "spublish asking"
 PATTERNS = {"~robot1:*", "~{robot1:*", "&{robot1:*}:notices", "&{robot1:*}:notices@*"}
 OWN = "~elsewhere"
 """Something that every user may, so that no rule is empty."""

@@ -11,7 +11,7 @@ from ..plan import Plan, Reply
 from ..plan.keys import DOCUMENT
 from ..plan.paths import escaped
 from ..session import Session
-from ..transport.scan import scanned
+from ..transport import scanned
 from .olddata import METADATA, candidates, is_rooted, root_command, special_paths
 from .values import is_array
 

@@ -16,7 +16,7 @@ from ..session import Session
 from ..store.document import Turn
 from ..store.publish import DocumentPublisher
 from ..tools.snapshots.plans import settable
-from ..transport.scan import scanned
+from ..transport import scanned
 
 # As `convert.py` has it.
 _TRIES = 50

@@ -27,7 +27,7 @@ from ..plan.reads import awaited, interpreted
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
-from ..transport.redirects import is_unapplied
+from ..transport.route import is_unapplied
 from ..transport.wire import Wire
 from .listeners import Beginning, contained, give_error
 from .manager import SubscriptionManager, Topic

@@ -21,8 +21,7 @@ from ..errors import InterfaceClosed, RedisError
 from ..plan.keys import DOCUMENT, keys_of
 from ..plan.notices import Notice
 from ..session import QUIET
-from ..transport import Transport
-from ..transport.scan import scanned
+from ..transport import Transport, scanned
 from ..transport.wire import Wire
 from .listeners import Beginning, ForwardingListener, Listener, Topic
 from .reorder import ReorderBuffer

@@ -25,7 +25,7 @@ from ..plan.placeholders import Unreadable
 from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport
-from ..transport.redirects import is_moved, is_unapplied
+from ..transport.route import is_moved, is_unapplied
 from ..transport.wire import Wire, close_all
 from .key_watcher import KeyWatcher
 from .listeners import NOBODY, Beginning, Inbox, Listener, ListenerGroup, Topic

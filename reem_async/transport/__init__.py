@@ -6,21 +6,22 @@ event loop, `BlockingTransport` a plain thread; both are handed the same plans b
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..errors import SELF_EXPLANATORY, BadData, Contended, NotConnected, ReemError, Refused, WrongKind
 from ..plain.documents import is_document
 from ..plan import Command, Plan, Reply, wire_commands
+from ..plan.keys import count, first_page, page
 from ..plan.replies import decoded
-from .contention import Contention
 from .state import States
 
 if TYPE_CHECKING:
     from .options import Options
 
-__all__ = ["Held", "Transport", "drive"]
+__all__ = ["Contention", "Held", "Transport", "counted", "document_of", "drive", "scanned"]
 
 _UNWATCH: Command = ("UNWATCH",)
 _UNAPPLIED = (Contended, NotConnected, Refused)
@@ -110,6 +111,49 @@ class Transport(Held, Protocol):
         ...
 
 
+class Contention:
+    """The attempts of one call that were given up, since somebody else had written to the same top-level key.
+
+    Args:
+        limit: Seconds for which it is tried again.
+    """
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._deadline = 0.0
+
+    def given_up(self, commands: Sequence[Command]) -> None:
+        """Note that an attempt to apply `commands` was given up: so there are two at least, however long they take.
+
+        Raises:
+            Contended: The first one was given up longer ago than the limit.
+        """
+        now = time.monotonic()
+        if not self._deadline:
+            self._deadline = now + self._limit
+        elif now > self._deadline:
+            raise Contended(
+                f"{document_of(commands)}: others kept writing to this top-level key for {self._limit:g} s, each time "
+                "between a look at it and the change; nothing was applied: write to it less often, give what is "
+                "written often a top-level key of its own, or give it longer with timeout="
+            )
+
+    def waited(self, seconds: float) -> None:
+        """Leave out of the time for which it is tried again what it has waited for calls of its own interface."""
+        self._deadline += seconds if self._deadline else 0.0
+
+    def over(self) -> None:
+        """Note that it was applied: what follows from it has a time of its own."""
+        self._deadline = 0.0
+
+
+def document_of(commands: Sequence[Command]) -> str:
+    """Return the name on the server of the document that commands are about: all their keys carry it."""
+    key = next(command for command in commands if len(command) > 1)[1]
+    name: str = key.decode(errors="replace") if isinstance(key, bytes) else str(key)
+    return name[1 : name.index("}")] if name.startswith("{") else name
+
+
 async def drive(transport: Transport, plan: Plan) -> Any:
     """Run `plan` and what follows from it; return the result.
 
@@ -191,3 +235,40 @@ async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
             await held.roundtrip([_UNWATCH])
             return _Raised(_told(sent, error) if isinstance(error, _UNAPPLIED) else error)
     return outcome
+
+
+async def scanned(transport: Transport, glob: str = "", kind: str = "") -> AsyncIterator[list[bytes]]:
+    """Yield the names of all keys, about 1000 at a time; one round trip for each 1000, and a node at least one.
+
+    A key that is there from the beginning to the end is among them, unless it moves from node to node
+    meanwhile. Others may or may not be, and any may be twice.
+
+    Args:
+        transport: The way to the servers.
+        glob: A pattern of the names, in the server's syntax; all if it is empty.
+        kind: The Redis type; any if it is empty.
+
+    Raises:
+        ClusterNode: It is the way to one node of several.
+        NotConnected: A part of the keys cannot be reached.
+    """
+    for node in await transport.nodes():
+        plan = page(glob, kind) if transport.sharded else first_page(glob, kind)
+        while True:
+            cursor, names = await drive(node, plan)
+            yield names
+            # A cursor of 0 is the end; a page may be empty before that.
+            if cursor in (b"0", 0):
+                break
+            plan = page(glob, kind, cursor)
+
+
+async def counted(transport: Transport, database: int) -> int | None:
+    """Return how many keys the servers count in a database; None if this user may not ask. A round trip for each."""
+    total = 0
+    for node in await transport.nodes():
+        held: Any = await drive(node, count(database))
+        if held is None:
+            return None
+        total += held
+    return total

@@ -15,11 +15,9 @@ from ..concurrency.timeouts import patience
 from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
-from . import Held
-from .contention import document_of
-from .identity import WHO, who
-from .opening import first_answer, open_wire
-from .options import Options, ShorterWay
+from . import Held, document_of
+from .opening import WHO, ServerSocket, first_answer, open_wire, who
+from .options import Options
 from .state import States
 from .text import HeldText, Text
 from .wire import BUFFER, Wire, close_all
@@ -75,7 +73,6 @@ class AsyncTransport:
         self._farewell: AsyncGenerator[None, None] | None = None
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
-        """Send `commands` on the shared wire, or on the one for large values; awaited, it is the replies."""
         large = has_large(commands)
         wire = self._lanes.get(bulk or large)
         # The hot path is one look at what can be wrong; everything else is decided in `_lane`.
@@ -202,7 +199,7 @@ class AsyncTransport:
         with contextlib.suppress(ReemError, OSError):  # the next call says what is the matter
             await self._lane(False)
 
-    async def _nearest(self, nearby: ShorterWay, large: bool) -> Wire:
+    async def _nearest(self, nearby: ServerSocket, large: bool) -> Wire:
         """Return a new connection: through the server's socket, if it is found."""
         through = await self._through(nearby, large)
         if through is not None:
@@ -220,7 +217,7 @@ class AsyncTransport:
         await wire.close()
         return through
 
-    async def _through(self, nearby: ShorterWay, large: bool) -> Wire | None:
+    async def _through(self, nearby: ServerSocket, large: bool) -> Wire | None:
         way = nearby.way
         if way is None:
             return None
@@ -231,7 +228,6 @@ class AsyncTransport:
             return None
 
     def check(self) -> None:
-        """Bind to the running loop at first use; raise if this is another one, or if it is closed."""
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
         loop = asyncio.get_running_loop()
@@ -319,28 +315,22 @@ class AsyncTransport:
 
     @property
     def options(self) -> Options:
-        """How the server is reached."""
         return self._options
 
     @property
     def timeout(self) -> float:
-        """Seconds without a byte moving after which a call made now is given up."""
         return patience(self._options.timeout)
 
     async def owner(self, key: bytes, *, anew: bool = False) -> AsyncTransport:
-        """Return this: there is one server."""
         return self
 
     async def nodes(self) -> Sequence[AsyncTransport]:
-        """Return this alone."""
         return (self,)
 
     async def pause(self, seconds: float) -> None:
-        """Wait."""
         await asyncio.sleep(seconds)
 
     async def let_pass(self) -> bool:
-        """Wait until the calls under way on the shared wire, or about to begin, are answered; returns that it did."""
         self.check()
         for _ in range(_COURTESIES):
             # Calls that were made in this turn of the loop are sent in the next.
@@ -355,18 +345,15 @@ class AsyncTransport:
         return True
 
     def is_settled(self, document: str) -> bool:
-        """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
         if self._left:
             self.check()  # what was left in another event loop, or by the parent process, is none of ours
         return document not in self._left
 
     async def settle(self, document: str) -> None:
-        """Wait until it has arrived."""
         while left := self._left.get(document):
             await asyncio.wait(left)
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
-        """Return the lock of `key`."""
         if self._loop is not asyncio.get_running_loop() or self._pid != os.getpid():
             self.check()  # a lock of another event loop, or of the parent process, is no lock here
         return self._orders.of(key)
@@ -375,12 +362,10 @@ class AsyncTransport:
         """Do nothing: in an event loop calls end by being cancelled, which gives everything back."""
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
-        """Open a connection whose pushed messages go to `on_push`."""
         self.check()
         return await self._opened(on_push, on_lost)
 
     async def close(self) -> None:
-        """Close all connections, for good."""
         if self._closed:
             return
         self._closed = True
@@ -395,7 +380,6 @@ class AsyncTransport:
         self._forget()
 
     def retire(self) -> bool:
-        """Close the connections on which nothing is due; return whether none is left."""
         if self._loop is asyncio.get_running_loop():
             for wire in (*self._lanes.values(), *self._spare):
                 if not wire.busy:
@@ -403,7 +387,6 @@ class AsyncTransport:
         return not self._opening and not any(wire.alive for wire in self._open)
 
     async def release(self) -> None:
-        """Close the connections of this event loop; another one may go on with this transport."""
         wires = [*self._lanes.values(), *self._spare, *self._leaving]
         self._forget()
         await close_all(wires)
@@ -422,7 +405,6 @@ class _Lent:
         self.is_uploading = False
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
-        """Send `commands`; awaited, it is their replies."""
         return self._upload(commands) if has_large(commands) else self._wire.roundtrip(commands)
 
     async def _upload(self, commands: Sequence[Command]) -> list[Reply]:

@@ -24,8 +24,8 @@ from ..concurrency.timeouts import LOOKS, moved_last, patience, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from . import Held
-from .identity import WHO, unanswered, who
-from .options import Options, ShorterWay
+from .opening import WHO, ServerSocket, unanswered, who
+from .options import Options
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .state import States
@@ -94,7 +94,6 @@ class _Line:
         self._socket.settimeout(limit)
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` and read their replies, all on this thread."""
         return self.exchange(commands, bulk)
 
     def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
@@ -219,7 +218,6 @@ class _Line:
         return error
 
     def close(self) -> None:
-        """Close the connection."""
         self.broken, self.waiting = True, False
         self._connection.disconnect()
         self._out.close()
@@ -251,7 +249,6 @@ class BlockingTransport:
         self.at_end: Callable[[], Awaitable[None]] = self.release
 
     def check(self) -> None:
-        """Raise if this is closed."""
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
 
@@ -297,7 +294,7 @@ class BlockingTransport:
         line.close()
         return through
 
-    def _through(self, nearby: ShorterWay) -> _Line | None:
+    def _through(self, nearby: ServerSocket) -> _Line | None:
         way = nearby.way
         if way is None:
             return None
@@ -322,7 +319,6 @@ class BlockingTransport:
                 self._idle.pop().close()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` on a free connection and return their replies."""
         line = self._take()
         try:
             if not line.plain:
@@ -330,13 +326,12 @@ class BlockingTransport:
             sent = self._text.shortcut(commands)
             if sent is not None:
                 return self._text.finished(commands, line.exchange(sent, bulk))
-            return await self._text.roundtrip(line.roundtrip, _Mine(self, line), commands, bulk)
+            return await self._text.roundtrip(line.roundtrip, _BorrowedConnection(self, line), commands, bulk)
         finally:
             self._give(line)
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[Held]:
-        """Lend a connection; it is broken if the caller leaves with an error."""
         line = self._take()
         try:
             yield HeldText(line, self._text) if line.plain else line
@@ -348,24 +343,19 @@ class BlockingTransport:
 
     @property
     def options(self) -> Options:
-        """How the server is reached."""
         return self._options
 
     @property
     def timeout(self) -> float:
-        """Seconds without a byte moving after which a call made now is given up."""
         return patience(self._options.timeout)
 
     async def owner(self, key: bytes, *, anew: bool = False) -> BlockingTransport:
-        """Return this: there is one server."""
         return self
 
     async def nodes(self) -> Sequence[BlockingTransport]:
-        """Return this alone."""
         return (self,)
 
     async def pause(self, seconds: float) -> None:
-        """Wait, and the thread with it."""
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
 
     async def let_pass(self) -> bool:
@@ -380,32 +370,27 @@ class BlockingTransport:
         """Return: there is nothing to wait for."""
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
-        """Return the lock of `key`."""
         return self._orders.of(key)
 
     def broken_off(self) -> None:
-        """Give back what a call of this thread holds that ended in an exception of somebody else's: Ctrl-C, mostly."""
         for order in self._orders.all():
             order.let_go()
 
     async def close(self) -> None:
-        """Close all connections that are not in use; the others are closed when given back."""
         self._closed = True
         self.retire()
         self.states.closed()
 
     def retire(self) -> bool:
-        """Close all connections that are not in use, and the others when they are given back."""
         self._keeps = False
         self._close_idle()
         return True
 
     async def release(self) -> None:
-        """Close all connections that are not in use; new ones are made when needed."""
         self._close_idle()
 
 
-class _Mine:
+class _BorrowedConnection:
     """A connection that is taken already, lent once more; it is broken if the caller leaves with an error."""
 
     def __init__(self, transport: BlockingTransport, line: _Line) -> None:
@@ -413,8 +398,7 @@ class _Mine:
         self._text = transport._text
         self.ordered = transport.ordered
 
-    def hold(self) -> _Mine:
-        """Lend it."""
+    def hold(self) -> _BorrowedConnection:
         return self
 
     async def __aenter__(self) -> Held:

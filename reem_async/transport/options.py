@@ -14,8 +14,8 @@ import ssl
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
-from urllib.parse import parse_qsl, urlsplit
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
 import redis
 import redis.asyncio
@@ -29,7 +29,13 @@ from ..plan.replies import refusal
 from .packing import Packer
 from .parsing import LARGEST
 
-__all__ = ["Address", "NodeOptions", "Options", "connecting_by", "is_this_machine", "question", "question_here"]
+if TYPE_CHECKING:
+    from .opening import ServerSocket
+
+__all__ = [
+    "Address", "NodeOptions", "Options", "address_of", "connecting_by", "is_this_machine", "listed", "question",
+    "question_here",
+]  # fmt: skip
 
 Address = tuple[str, int]
 """Host and port."""
@@ -43,22 +49,6 @@ _SCHEMES = ("redis://", "rediss://", "unix://")
 _LEAST = 1 << 20
 """Bytes a string in a reply must be allowed: REEM itself asks for pages of names, and INFO."""
 _TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
-
-
-class ShorterWay(Protocol):
-    """What is known of a shorter way to a server than its address.
-
-    Attributes:
-        way: How to reach the server that way; None as long as none is known, or of use.
-    """
-
-    way: Options | None
-
-    def learn(self, replies: Any) -> None:
-        """Note what the server at the address says of itself."""
-
-    def give_up(self, way: Options, error: Exception) -> None:
-        """Note that `way` could not be gone; raises the error if the server does not answer at all."""
 
 
 class Options:
@@ -82,7 +72,7 @@ class Options:
     """
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
-        self.nearby: ShorterWay | None = None
+        self.nearby: ServerSocket | None = None
         self.settings = {**_address(host), **options}
         limit = self.settings.pop("socket_timeout", timeout)  # redis-py's name for it; None is no limit there
         self.timeout = timeout = LONGEST if limit is None else check_timeout(limit)
@@ -451,3 +441,33 @@ def _address(host: Any) -> dict[str, Any]:
     if settings.pop("connection_class", None) is redis.asyncio.connection.SSLConnection:
         settings["ssl"] = True
     return settings
+
+
+def address_of(url: str, port: int) -> tuple[str, int]:
+    """Return host and port of a plain URL; `port` if it names none."""
+    parts = urlsplit(url)
+    return parts.hostname or "localhost", parts.port or port
+
+
+def listed(url: str, example: str) -> list[str]:
+    """Return a URL that lists several hosts as one plain URL for each: redis+x://u@a:1,b:2/c as redis://u@a:1/c, ...
+
+    Raises:
+        BadValue: No host, or a port that is no number; never quotes the URL, which may hold a password.
+    """
+    parts = urlsplit(url)
+    if parts.fragment:
+        raise BadValue(f"the URL has a fragment (#...); write it like {example}")
+    # From the right: a password may contain an @.
+    login, at, hosts = parts.netloc.rpartition("@")
+    urls = []
+    for each in hosts.split(","):
+        one = urlsplit(f"//{each}")
+        try:
+            sound = bool(one.hostname) and (one.port is None or one.port > 0)
+        except ValueError:
+            sound = False
+        if not sound:
+            raise BadValue(f"{each!r} is not a host with a port; write it like {example}")
+        urls.append(urlunsplit((parts.scheme.partition("+")[0], login + at + each, parts.path, parts.query, "")))
+    return urls

@@ -1,4 +1,4 @@
-"""Commands -> the pieces that go over the wire.
+"""Commands: recorded from the calls of a ship, and packed into the pieces that go over the wire.
 
 hiredis packs small commands fastest but copies every argument several times; a large buffer (an
 array's memory) is sent as it is, between a header and a line end. A word that is a tuple is one
@@ -11,12 +11,23 @@ from collections.abc import Sequence
 from typing import Any
 
 import hiredis
+from redis.commands.core import (
+    BasicKeyCommands,
+    GeoCommands,
+    HashCommands,
+    HyperlogCommands,
+    ListCommands,
+    SetCommands,
+    SortedSetCommands,
+    StreamCommands,
+)
 from redis.connection import HiredisRespSerializer
 
 from ..plan import Command
 from ..plan.sizes import LARGE, has_large
+from ..ships.numpy import flat_buffer
 
-__all__ = ["SLOW", "Packer", "Piece", "as_text", "pack"]
+__all__ = ["SLOW", "CommandRecorder", "Packer", "Piece", "as_text", "pack"]
 
 Piece = bytes | memoryview
 
@@ -90,3 +101,25 @@ def _encoded(word: Any) -> Piece:
             raise TypeError("an outgoing buffer must be flat bytes")
         return word
     return str(word).encode()
+
+
+class CommandRecorder(
+    BasicKeyCommands,
+    HashCommands,
+    ListCommands,
+    SetCommands,
+    SortedSetCommands,
+    StreamCommands,
+    GeoCommands,
+    HyperlogCommands,
+):
+    """Offers redis-py's methods (`hset`, `set`, `rpush`, ...) and keeps their commands in `commands`."""
+
+    def __init__(self) -> None:
+        self.commands: list[Command] = []
+
+    def execute_command(self, *words: Any, **_: Any) -> CommandRecorder:
+        """Record one command; returns the recorder, as pipelines do."""
+        # Arrays stay views of their memory, not copies: they are sent from there.
+        self.commands.append(tuple([flat_buffer(as_text(word)) for word in words]))
+        return self

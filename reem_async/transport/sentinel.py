@@ -22,9 +22,8 @@ import redis.exceptions
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
-from .addresses import NewTransport, ToOneServer, address_of, listed
-from .options import Address, NodeOptions, Options, connecting_by, question, question_here
-from .rooted import Standing
+from .composite import CompositeTransport, NewTransport, ToOneServer
+from .options import Address, NodeOptions, Options, address_of, connecting_by, listed, question, question_here
 from .state import States
 
 if TYPE_CHECKING:
@@ -74,7 +73,7 @@ class SentinelOptions(Options):
             for parts, (_, mark, query) in zip(heads, urls, strict=True)
         ]
         self.found: Address | None = None
-        self.changed: Callable[[], None] = _nothing
+        self.changed: Callable[[], None] = lambda: None
         self._sentinels = [address_of(one, 26379) for one in plain]
         # When they were asked last, of those that have not answered since: they are asked behind all others.
         self._silent: dict[Address, float] = {}
@@ -107,7 +106,7 @@ class SentinelOptions(Options):
         return connecting_by(super().blocking_connection(), self._connect)
 
     async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
-        connection.host, connection.port = await self._asked()
+        connection.host, connection.port = await self.find_primary(_ask)
         self._note((connection.host, connection.port))
         await connect()
         await question(connection, [_ROLE], _check_role)
@@ -143,24 +142,17 @@ class SentinelOptions(Options):
             self._silent[address] = now  # until it has answered, however the asking ends
             yield sentinel, address, (deadline - now) / (parts - place + 1 if place else 2)
 
-    async def _asked(self) -> Address:
-        """Ask the sentinels where the primary is; raises what `primary` raises."""
-        problems: list[Exception] = []
-        for sentinel, address, limit in self._in_turn():
-            connection = sentinel.asynchronous_connection()
-            try:
-                async with asyncio.timeout(limit):
-                    await connection.connect()
-                    await connection.send_command(*_MASTERS)
-                    return self._named(await connection.read_response(), address)
-            except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
-                problems.append(sentinel.refused(error))
-            finally:
-                await connection.disconnect(nowait=True)
-        raise self._nowhere(problems)
-
     def primary(self) -> Address:
-        """Ask the sentinels where the primary is, on this thread.
+        """Ask the sentinels where the primary is, on this thread; raises what `find_primary` raises."""
+        try:
+            self.find_primary(_ask_blocking).send(None)
+        except StopIteration as end:
+            address: Address = end.value
+            return address
+        raise AssertionError("a blocking question cannot wait")
+
+    async def find_primary(self, ask: Callable[[Options, float], Awaitable[Any]]) -> Address:
+        """Ask the sentinels, one after the other by `ask`, where the primary is.
 
         Raises:
             TlsRefused, LoginRefused, NotAllowed: No sentinel names it, and one of them gave this reason.
@@ -168,16 +160,10 @@ class SentinelOptions(Options):
         """
         problems: list[Exception] = []
         for sentinel, address, limit in self._in_turn():
-            connection = sentinel.blocking_connection()
-            connection.socket_timeout = connection.socket_connect_timeout = limit
             try:
-                connection.connect()
-                connection.send_command(*_MASTERS)
-                return self._named(connection.read_response(), address)
-            except Exception as error:  # as above
+                return self._named(await ask(sentinel, limit), address)
+            except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
                 problems.append(sentinel.refused(error))
-            finally:
-                connection.disconnect()
         raise self._nowhere(problems)
 
     def _named(self, masters: Any, sentinel: Address) -> Address:
@@ -200,8 +186,26 @@ class SentinelOptions(Options):
         return NotConnected(f"no sentinel of {self.address} names a primary: {said}")
 
 
-def _nothing() -> None:
-    """Nobody wants to know."""
+async def _ask(sentinel: Options, limit: float) -> Any:
+    connection = sentinel.asynchronous_connection()
+    try:
+        async with asyncio.timeout(limit):
+            await connection.connect()
+            await connection.send_command(*_MASTERS)
+            return await connection.read_response()
+    finally:
+        await connection.disconnect(nowait=True)
+
+
+async def _ask_blocking(sentinel: Options, limit: float) -> Any:
+    connection = sentinel.blocking_connection()
+    connection.socket_timeout = connection.socket_connect_timeout = limit
+    try:
+        connection.connect()
+        connection.send_command(*_MASTERS)
+        return connection.read_response()
+    finally:
+        connection.disconnect()
 
 
 def _check_role(role: Any, connection: Any) -> None:
@@ -209,7 +213,7 @@ def _check_role(role: Any, connection: Any) -> None:
         raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
 
 
-class SentinelTransport(Standing):
+class SentinelTransport(CompositeTransport):
     """Connections to the primary of the moment.
 
     Attributes:
@@ -263,7 +267,6 @@ class SentinelTransport(Standing):
                 wire.abort_soon(reason)
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
-        """Open a connection to the primary whose pushed messages go to `on_push`."""
         self._root.check()
         wire = await cast("AsyncTransport", self._current()).listen(on_push, on_lost)
         self._listening.append(weakref.ref(wire, self._listening.remove))
@@ -299,7 +302,6 @@ class SentinelTransport(Standing):
 
     @property
     def states(self) -> States:
-        """What the interface's user gets to know of the connections to the primary of the moment."""
         return self._states
 
     @states.setter
@@ -307,19 +309,15 @@ class SentinelTransport(Standing):
         self._states = self._now.states = states
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
-        """Return a connection of the caller's own, given back on exit."""
         return _Checking(self, self._current())
 
     async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
-        """Return the way to the primary."""
         return self
 
     async def nodes(self) -> Sequence[Transport]:
-        """Return the way to the primary alone."""
         return (self,)
 
     async def close(self) -> None:
-        """Close all connections."""
         if self._lookout is not None:
             self._lookout.stop()
         self._states.closed()
@@ -380,6 +378,5 @@ class _Checking:
         return await self._lent.__aexit__(*error)
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` and return their replies."""
         assert self._held is not None
         return self._transport._checked(self._node, await self._held.roundtrip(commands, bulk=bulk))

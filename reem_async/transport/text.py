@@ -20,8 +20,7 @@ from ..plain.changes import after_look
 from ..plain.translation import directly, finished, looked_at, shortcut, translated
 from ..plan import Command, Reply
 from ..plan.sizes import KEPT, as_given, is_large, stage
-from . import Held
-from .contention import Contention
+from . import Contention, Held
 from .parsing import error_of
 
 __all__ = ["PROBE", "HeldText", "Text", "is_plain", "lists_json", "over_wire"]
@@ -51,12 +50,8 @@ def is_plain(reply: Reply) -> bool:
     return isinstance(reply, NoJsonSupport)
 
 
-class Send(Protocol):
-    """Sends commands that any server takes."""
-
-    def __call__(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
-        """Return their replies, once awaited."""
-        ...
+Send = Callable[..., Awaitable[list[Reply]]]
+"""Sends commands that any server takes: `send(commands, bulk=...)`."""
 
 
 class Lending(Protocol):
@@ -93,7 +88,6 @@ class Text:
         return finished(commands, replies, self.known, error_of)
 
     async def roundtrip(self, send: Send, lending: Lending, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        """Send commands for which there is no shortcut: in one round trip, or in two on a connection that is lent."""
         keys = looked_at(commands, self.known)
         if keys:
             return await self._after_look(lending, keys, commands, bulk)

@@ -31,6 +31,7 @@ REST, WHOLE, FOLLOW = 150, 1500, 40
 """After how many steps all is compared, a snapshot and a recording are made, and followers come and go."""
 MOST_FOLLOWERS = 6
 HISTORY = 15
+_LOST = (ConnectionLost, NotConnected, PartialWrite)
 
 
 class Difference(AssertionError):
@@ -276,8 +277,7 @@ class Hunter:
     def _cut(self) -> None:
         client = self.rng.choice(self.far)
         op, full = self._choose(client)
-        lost = (ConnectionLost, NotConnected, PartialWrite)
-        self._broken_off(client, op, full, lambda make: faults.cut(self.rng, self.proxy, make), lost)
+        self._broken_off(client, op, full, lambda make: faults.cut(self.rng, self.proxy, make), _LOST)
 
     def _broken_off(
         self,
@@ -325,8 +325,7 @@ class Hunter:
         self.broken.add(full)
         if not full:
             return
-        with contextlib.suppress(Exception):  # it waits for what is still on its way, and removes what was left
-            client.perform(Op("delete", (full[len(client.namespace) :], "never there"), None), False)
+        self._clean(client, full)
         if due.error is Overflow:  # docs/guarantees.md, 5: the server may have calculated, and nobody put it right
             document = {} if before is ABSENT else before
             self._take(self.ears[0], Op("write", (full,), copy.deepcopy(document)), full)
@@ -341,6 +340,16 @@ class Hunter:
                 f"broken off by {raised!r:.300}: {stored!r:.900}\n"
                 f"of {before!r:.900}\nand {due.after!r:.900}{self._told(full)}"
             )
+
+    def _clean(self, client: Client, full: str) -> None:
+        """Have a client wait for what is still on its way to a key, and remove arrays that a call left there."""
+        for _ in range(4):  # each of its connections may be dead
+            try:
+                client.perform(Op("delete", (full[len(client.namespace) :], "never there"), None), False)
+            except _LOST:
+                continue
+            except ReemError:
+                return
 
     def _stored(self, full: str) -> Any:
         kvs = self.ears[0].kvs

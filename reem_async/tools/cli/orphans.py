@@ -14,7 +14,7 @@ from reem_async.plan.attachments import orphans, remove_orphans
 from reem_async.plan.paths import check_top_key, parse_suffix
 from reem_async.plan.sizes import STAGED
 from reem_async.session import Session
-from reem_async.transport.scan import scanned
+from reem_async.transport import scanned
 
 __all__ = ["Orphans", "find_orphans"]
 

@@ -20,7 +20,7 @@ from ...ships.base import SpecialDatatypeShip
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
-from ...transport.recorder import CommandRecorder
+from ...transport.packing import CommandRecorder
 from .container import Container
 from .log_reader import RecordedPast, Stream
 from .roles import Role

@@ -23,7 +23,7 @@ from ...plan.notices import announce, published
 from ...plan.paths import Pattern, check_top_key, shorten
 from ...plan.sizes import STAGED
 from ...session import Session
-from ...transport.scan import counted, scanned
+from ...transport import counted, scanned
 from .archive import Archive, ArchiveWriter, header, verify
 from .files import Snapshot, check_target, sniff
 from .plans import NOT_ALLOWED, KeyContent, dump, lifetimes, put, shown, strangers, types
