@@ -89,7 +89,7 @@ class _Call(Generic[Result]):
             self.end(None)
 
     def give_up(self) -> None:
-        """Cancel the coroutine: nobody waits for it any more."""
+        """Cancel the coroutine: its caller has left."""
         if self._task is not None:
             self._task.cancel()
         elif not self.over:  # its caller was interrupted before it was handed over
@@ -138,7 +138,7 @@ class Portal:
         self._thread = threading.Thread(target=self._serve, name=name, daemon=True)
         try:
             self._thread.start()
-        except BaseException:  # Ctrl-C: the thread may run, and is nobody's
+        except BaseException:  # Ctrl-C: the thread may run, and has no owner
             self._hand_over(self._loop.stop)
             raise
 

@@ -65,8 +65,8 @@ class _OnThread(reem_async.RedisInterface):
 class _Background:
     """The event loop of an interface and the core's interface on it, made when first needed.
 
-    Threads do not survive a fork, so each process has its own loop. There is no lock: who comes second finds what the
-    first has made, and what is made while the interface is being closed is stopped by whoever sees it last.
+    Threads do not survive a fork, so each process has its own loop. There is no lock: the second thread finds what the
+    first has made, and what is made while the interface is being closed is stopped by the last one to see it.
 
     While the interpreter exits there is no loop thread: each call runs an event loop of its own on the caller's thread.
     """
@@ -91,7 +91,7 @@ class _Background:
         if made[0] is not portal:
             portal.stop()
         try:
-            # It may have been closed while this was made: then nobody else would stop it.
+            # It may have been closed while this was made: then nothing else would stop it.
             self._direct.session.transport.check()
         except InterfaceClosed:
             self.stop()

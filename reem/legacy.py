@@ -92,7 +92,7 @@ class TolerantKeyValueStore(KeyValueStore):
 
     Args:
         interface: As for `KeyValueStore`.
-        refreshRate: Seconds for which what `var` gives keeps a value that it read; 0 reads anew each time.
+        refreshRate: Seconds for which what `var` gives keeps a value that it read; 0 reads each time.
         options: As for `KeyValueStore`.
     """
 
@@ -129,7 +129,7 @@ class TolerantKeyValueStore(KeyValueStore):
 
     def contains(self, key: Keys) -> bool:
         """Return whether something is at a path; also `path in store`. Costs as `get`."""
-        # A default that nobody can have stored.
+        # A default that cannot have been stored.
         return self.get(key, self) is not self
 
     def pop(self, key: Keys, *default: Any) -> Any:
@@ -178,7 +178,7 @@ class TolerantKVSVar:
 
     def get(self) -> Any:
         """Return the value, as kept or as the server has it; raises as `Accessor.read`."""
-        # A copy: what is kept answers later calls as well, whatever its user does to what he was given.
+        # A copy: what is kept answers later calls as well, whatever the caller does to its copy.
         return copied(self._current())
 
     def _current(self) -> Any:

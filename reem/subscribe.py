@@ -80,7 +80,7 @@ class Watch(Following):
         return self
 
     def __next__(self) -> core.Update:
-        # On the caller's thread: the loop puts updates into the queue and knows nothing of who takes them.
+        # On the caller's thread: the loop puts updates into the queue and knows nothing of its readers.
         queue = self._core.queue
         try:
             if (update := queue.take()) is EMPTY:

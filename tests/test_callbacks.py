@@ -19,7 +19,7 @@ import reem
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
 from reem_async.concurrency.queues import BoundedQueue, Ended, Every, Last, Newest
-from reem_async.concurrency.timeouts import patience
+from reem_async.concurrency.timeouts import time_limit
 from reem_async.errors import WrongLoop
 
 
@@ -215,7 +215,7 @@ async def test_a_time_limit_for_listen_is_not_one_for_the_calls(ainterface, apsp
     """Nor is one that somebody else sets while the update arrives."""
     limits = []
 
-    subscriber = CallbackSubscriber(key(), ainterface, lambda *_: limits.append(patience(7.0)))
+    subscriber = CallbackSubscriber(key(), ainterface, lambda *_: limits.append(time_limit(7.0)))
     with reem_async.timeout(0.5):
         await subscriber.listen()
         await apspace[key()].write(1)

@@ -21,9 +21,8 @@ import reem
 from reem.errors import ConnectionLost, NotConnected
 from reem_async.server import EmbeddedServer
 from reem_async.tools.recording import open_log
-from reem_async.transport import opening
-from reem_async.transport.opening import SocketOptions, look_nearby
-from reem_async.transport.options import NodeOptions, Options
+from reem_async.transport import options as options_module
+from reem_async.transport.options import NodeOptions, Options, SocketOptions, look_nearby
 
 pytestmark = pytest.mark.skipif(
     not hasattr(socket, "SO_PEERCRED"), reason="this system does not tell who listens at a socket"
@@ -234,7 +233,7 @@ def test_nor_for_one_of_several_servers():
 
 
 def test_nor_where_nobody_tells_who_listens(monkeypatch):
-    monkeypatch.delattr(opening.socket, "SO_PEERCRED")
+    monkeypatch.delattr(options_module.socket, "SO_PEERCRED")
     options = Options("localhost", 1.0, {})
     look_nearby(options)
     assert options.nearby is None

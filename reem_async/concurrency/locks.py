@@ -13,12 +13,12 @@ __all__ = ["Locks", "ProcessLock", "ThreadLock"]
 
 Lock = TypeVar("Lock", bound=Any)
 
-# Keys whose locks are kept though nobody uses them; making one anew costs a microsecond.
+# Keys whose locks are kept though they are not in use; making one costs a microsecond.
 _MOST = 1000
 
 
 class Locks(Generic[Lock]):
-    """The locks of the last thousand keys, and of all for which somebody has one or waits for it.
+    """The locks of the last thousand keys, and of all that are held or waited for.
 
     Args:
         new: Makes a lock, which can be referred to weakly.
@@ -31,12 +31,12 @@ class Locks(Generic[Lock]):
         self._trimming = threading.Lock()
 
     def of(self, key: str) -> Lock:
-        """Return the lock of `key`; whoever uses it keeps it."""
+        """Return the lock of `key`; the caller keeps it while in use."""
         lock = self._recent.get(key)
         return lock if lock is not None else self._put(key)
 
     def _put(self, key: str) -> Lock:
-        # Nobody waits here for another thread: Ctrl-C may break that one off while it has a lock in its hands.
+        # No thread waits here for another one, which Ctrl-C may end while it holds the lock.
         if len(self._recent) >= _MOST and self._trimming.acquire(blocking=False):
             try:  # first in the one, then out of the other: always to be found
                 for old, lock in list(self._recent.items()):

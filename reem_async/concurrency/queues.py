@@ -13,7 +13,7 @@ from ..errors import QueueFull
 from ..plan.arguments import check_instance, whole
 from .wakeup import Wakeups, wakeups
 
-__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "Places", "Policy", "chosen", "unheard"]
+__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "PlaceQueue", "Policy", "chosen", "noop"]
 
 
 class Policy:
@@ -78,11 +78,10 @@ EMPTY: Any = object()
 class BoundedQueue:
     """The updates that wait for one loop; one thread puts them in at a time, any number of threads take them out.
 
-    Who takes may be interrupted by a handler of signals at any step, for good or to close the interface in it, which
-    the putting thread must be able to do. So there is no lock: each step that matters is one of C, which Python does
-    not divide. Updates are numbered, so that the one that makes room for another is named, and not whichever is
-    first at that moment; and what was lost before an update is noted before the update is there, so that whoever
-    takes the next one out tells it, however many were dropped in between.
+    Ctrl-C may interrupt a taking thread at any step, and must not block the putting thread. So there is no lock: each
+    step that matters is one of C, which Python does not divide. Updates are numbered, so that the one dropped for
+    another is named, and not the first at that moment. A loss is noted before the update after it is put in, so that
+    the next one taken out reports it, however many were dropped in between.
 
     Args:
         policy: How many to keep, and what happens to the next one.
@@ -101,7 +100,7 @@ class BoundedQueue:
         self._wakeups: dict[int, Wakeups] = {}  # by process: a forked child must not take its parent's
         self._end: BaseException | None = None
         self.dropped = 0
-        self.wake: Callable[[], None] = unheard
+        self.wake: Callable[[], None] = noop
 
     def put(self, update: Any) -> None:
         """Add an update, dropping or failing as the policy says."""
@@ -132,10 +131,10 @@ class BoundedQueue:
         self._tell()
 
     def overtaken(self, update: Any) -> None:
-        """Note that later updates changed what one wrote before it was read: what that was cannot be told.
+        """Note that later updates changed what one wrote before it was read, so its value is unknown.
 
         Args:
-            update: Its path, and all that is there now; None if a later one of this path is told of.
+            update: Its path, and all that is there now; None if a later one of this path is delivered.
         """
         self.skip()
 
@@ -149,7 +148,7 @@ class BoundedQueue:
             )
 
     def _tell(self) -> None:
-        """Wake all who wait; who then has nothing to take waits again."""
+        """Wake all waiting threads; one that finds nothing waits again."""
         while self._sleepers:
             with contextlib.suppress(IndexError):  # it has found something meanwhile
                 self._sleepers.pop()
@@ -181,9 +180,9 @@ class BoundedQueue:
         while (item := self.take()) is EMPTY:
             waiting = self._wakeup()
             self._sleepers.append(None)
-            if not self._items and self._end is None:  # else it was put in before anybody was seen to sleep
+            if not self._items and self._end is None:  # else it was put in before this thread was seen to sleep
                 waiting.get()
-            # Whoever leaves otherwise, also by Ctrl-C, leaves a wakeup that wakes somebody in vain.
+            # A thread that leaves otherwise, by Ctrl-C for example, leaves a wakeup that wakes another one in vain.
         return item
 
     def close(self, end: Exception | None = None) -> None:
@@ -193,19 +192,19 @@ class BoundedQueue:
         self._tell()
 
 
-class Places(BoundedQueue):
-    """A bounded queue for who wants to know which places were updated and what is there now, not what was written."""
+class PlaceQueue(BoundedQueue):
+    """A bounded queue that delivers which places were updated and their present value, not what was written."""
 
     def overtaken(self, update: Any) -> None:
-        """Tell of the place."""
+        """Deliver the place."""
         if update is None:
             self.skip()
         else:
             self.put(update)
 
 
-def unheard() -> None:
-    """Wake nobody."""
+def noop() -> None:
+    """Do nothing."""
 
 
 def _sum(missed: list[int | None]) -> int | None:

@@ -1,4 +1,4 @@
-"""Giving way to whoever waits for the processor.
+"""Giving way to other threads and programs that wait for the processor.
 
 A kernel without full preemption takes the processor from a busy thread only at its next tick, up to 4 ms later,
 however nice the thread is. A control loop on the same core would wait that long. So a thread that computes or copies
@@ -29,7 +29,7 @@ _SHORTEST_TURN = 100_000
 
 
 def give_way() -> None:
-    """Let whoever waits for the processor run."""
+    """Let a waiting thread or program run."""
     if hasattr(os, "sched_yield"):
         os.sched_yield()
     else:
@@ -39,7 +39,7 @@ def give_way() -> None:
 def come_second() -> None:
     """Come a little after others for the processor from now on, with all threads begun later, where that can be.
 
-    A batch thread that wakes does not take the processor from whoever has it.
+    A batch thread that wakes does not take the processor from the running one.
     """
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_NICER)
@@ -47,7 +47,7 @@ def come_second() -> None:
 
 
 def stand_back() -> None:
-    """Take only processor time that nobody else wants from now on, with all threads begun later: perhaps none.
+    """Run only when the processor is idle from now on, with all threads begun later: perhaps never.
 
     There is no way back without rights. Where there is no SCHED_IDLE (not Linux), it is niceness 19.
 
@@ -78,7 +78,7 @@ def take_short_turns() -> None:
 def keep_memory() -> None:
     """Have this process keep the memory it frees for what comes next, up to 64 MiB a thread, where that can be.
 
-    Large blocks are given back to the system otherwise, and each page that is taken anew costs a fault: for a
+    Large blocks are given back to the system otherwise, and each page that is taken again costs a fault: for a
     camera of 28 MB/s twelve thousand a second.
     """
     if sys.platform == "linux":

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Generic, Self, TypeVar
 
 from ..errors import BadType
-from .queues import EMPTY, BoundedQueue, Ended, Policy, unheard
+from .queues import EMPTY, BoundedQueue, Ended, Policy, noop
 
 __all__ = ["Following", "Stream", "arrived"]
 
@@ -93,7 +93,7 @@ class Stream(Following, Generic[Item]):
         finally:
             if self._waiter is waiter:  # else it was left behind by an event loop that was closed
                 self._waiter = None
-                self.queue.wake = unheard  # a reference back would keep a stream that was dropped
+                self.queue.wake = noop  # a reference back would keep a stream that was dropped
 
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done() and not self._waiter.get_loop().is_closed():

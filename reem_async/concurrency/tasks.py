@@ -1,4 +1,4 @@
-"""Tasks that run beside the caller, and who owns them."""
+"""Tasks that run beside the caller, and their owners."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LONGEST_END = 1.0
 
 
 def started(coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-    """Run a coroutine as a named task. Whoever starts it keeps it: asyncio alone would let it be collected."""
+    """Run a coroutine as a named task. The caller keeps it: asyncio alone would let it be collected."""
     context = copy_context()
     context.run(forget)  # a time limit given for one call is not meant for what goes on after it
     return asyncio.get_running_loop().create_task(coroutine, name=name, context=context)
@@ -29,7 +29,7 @@ def is_being_cancelled() -> bool:
 
 
 class Tasks:
-    """The background tasks of one owner, who ends them when it is closed."""
+    """The background tasks of one owner, which ends them when it is closed."""
 
     def __init__(self) -> None:
         self._running: set[asyncio.Task[Any]] = set()

@@ -20,7 +20,15 @@ except ImportError:  # Windows: what the kernel still holds cannot be asked ther
     fcntl = termios = None  # type: ignore[assignment]
 
 __all__ = [
-    "LONGEST", "LOOKS", "check_timeout", "confirmed", "forget", "moved_last", "patience", "server_timeout", "timeout",
+    "LONGEST",
+    "LOOKS",
+    "check_timeout",
+    "confirmed",
+    "forget",
+    "moved_last",
+    "server_timeout",
+    "time_limit",
+    "timeout",
     "unsent",
 ]  # fmt: skip
 
@@ -104,7 +112,7 @@ def check_timeout(seconds: float) -> float:
     return float(seconds)
 
 
-def patience(default: float) -> float:
+def time_limit(default: float) -> float:
     """Return the time limit of a call made now."""
     given = _given.get()
     return default if given is None else given

@@ -1,11 +1,11 @@
 """Large values from a publisher to subscribers of the same host and user, through shared memory.
 
-The server gets every update as ever; its notice also says where the bytes are in the publisher's memory, and a
+The server still gets every update; its notice also says where the bytes are in the publisher's memory, and a
 subscriber that can reach them there need not fetch them. `path.py` is what an interface has of it, `segment.py` the
 memory of a publisher, `reader.py` the views of a subscriber, `locks.py` the locks that keep them apart.
 
     publisher                                          subscriber
-    segment.put(): lock a slot that nobody reads
+    segment.put(): lock a slot that no reader has
                    stamp 0, copy, new stamp, unlock
     notice (process, descriptor, slot, stamp)  ---->   reader.view(): open, lock, compare the stamp
                                                        the last view is gone: unlock

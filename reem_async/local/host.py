@@ -18,7 +18,7 @@ __all__ = ["host", "reason_against"]
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _PROCESSES = "/proc/self/ns/pid"
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC)
-"""Errors of what may be there again later: a later call tries anew."""
+"""Errors of what may be there again later: a later call tries again."""
 
 
 def host() -> str:

@@ -1,7 +1,7 @@
 """Locks on bytes of a file that belong to an open file description, not to a process.
 
 The kernel gives them back when the description is closed for the last time, so also when its process is killed. Each
-byte stands for one slot; nobody ever waits for one.
+byte stands for one slot; no process ever waits for one.
 """
 
 from __future__ import annotations

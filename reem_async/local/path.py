@@ -1,4 +1,4 @@
-"""What an interface has of the local path: the segments of its publishers, and who near them listens.
+"""What an interface has of the local path: the segments of its publishers, and the listeners near them.
 
 What shares memory is imported only where the system has it.
 """
@@ -26,7 +26,7 @@ LEAST = 1 << 16
 """Bytes from which a value goes through shared memory: below, a fetch from the server takes no longer."""
 
 MEMORY = 256 << 20
-"""Bytes of shared memory of one interface, unless it is told otherwise."""
+"""Bytes of shared memory of one interface, unless another number is given."""
 
 _MODES = ("auto", "off", "early")
 _SEGMENTS = 64
@@ -40,21 +40,21 @@ _IDLE = 10.0
 _GROWTH = 2
 """Times the room of the segment before, where a value has outgrown that."""
 _KEYS = 1000
-"""Top-level keys of which is known who listens."""
+"""Keys whose local audience is cached."""
 
 
 class LocalPath:
     """The shared memory of one interface.
 
     Args:
-        mode: "auto", "off", or "early": subscribers near by are told before the server has the update.
+        mode: "auto", "off", or "early": subscribers on this host are notified before the server has the update.
         memory: Bytes that it may take in all.
 
     Raises:
         BadValue: Another mode, or no number of bytes.
 
     Attributes:
-        early: Subscribers near by are told before the server has an update.
+        early: Subscribers on this host are notified before the server has an update.
     """
 
     def __init__(self, mode: Any = "auto", memory: Any = MEMORY) -> None:
@@ -106,7 +106,7 @@ class LocalPath:
             self._audiences.popitem(last=False)
 
     def has_audience(self, keys: Keys) -> bool:
-        """Return whether somebody near by listened to a key when that was asked last."""
+        """Return whether a program on this host listened to a key when last asked."""
         return self._audiences.get(keys.channel, (0, 0.0))[0] > 0
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:
@@ -142,7 +142,7 @@ class LocalPath:
             left = self._memory - sum(each.shape.size for each in others) - HEAD
             if SLOTS * room > left or len(others) >= _SEGMENTS:
                 return None  # smaller values still have the one that is there
-            if segment is not None:  # those who read keep the old ones for a while: of a map that grows, only a few
+            if segment is not None:  # readers keep the old ones for a while: of a map that grows, only a few
                 room = max(room, min(_GROWTH * segment.shape.room, left // SLOTS))
             self._segments.pop(channel, None)
             segment = None  # its memory goes before the next one's comes

@@ -31,7 +31,7 @@ _MAPPINGS = 64
 
 _PINS = 3
 """Slots of a segment that may be looked into at a time: what a slow callback works on, the newest, and the one that
-takes its place. Who keeps more gets copies, so that one who collects frames does not take the slots from everybody."""
+takes its place. A program that keeps more gets copies, so that collecting frames does not use up the slots."""
 
 _IDLE = 10.0
 """Seconds after which a segment is unmapped that nothing was looked for in."""
@@ -160,7 +160,7 @@ class LocalReader:
     def view(self, slot: Slot, size: int) -> memoryview | None:
         """Return the first `size` bytes of a slot, read-only; None if they are not to be had (any more).
 
-        The slot is not written while anything refers to the view. It may be a copy: who keeps many.
+        The slot is not written while anything refers to the view. It may be a copy, for a program that keeps many.
         """
         place = slot.process, slot.descriptor, slot.inode
         try:

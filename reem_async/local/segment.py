@@ -1,10 +1,10 @@
 """The memory of a publisher: one file without a name for each top-level key, in slots that each hold one update.
 
-The file is sealed: nobody but the process that made it can change or shorten it, so a reader that has checked the seals
+The file is sealed: only the process that made it can change or shorten it, so a reader that has checked the seals
 can neither be surprised by other bytes than the publisher's nor be killed by a page that is gone. It lives as long as
-somebody has it open.
+a process has it open.
 
-    0        identity        who reads compares it
+    0        identity        readers compare it
     64       a stamp for each slot: 0 while it is written
     4096     slot 0, slot 1, ... each of the same size
 """
@@ -33,7 +33,7 @@ SLOTS = 6
 """One that is written, three for a subscriber (see `reader.py`), two for others that are not as far."""
 
 NAME = "reem"
-"""Of the file, for who looks at the descriptors of a process."""
+"""Of the file, for a look at the descriptors of a process."""
 
 HEAD = 4096
 """Bytes before the first slot: a page."""
@@ -46,7 +46,7 @@ STAMP = struct.Struct("<Q")
 _STAMPS = 64
 
 _STEP = 1 << 20
-"""Bytes that are allocated at a time: older kernels begin anew when a signal comes, and timers may send many."""
+"""Bytes that are allocated at a time: older kernels restart when a signal comes, and timers may send many."""
 
 _FUTURE_WRITE = 0x10
 """F_SEAL_FUTURE_WRITE of <linux/fcntl.h>, which Python does not name: no mapping to write can be made any more."""
@@ -96,7 +96,7 @@ class Segment:
     Raises:
         OSError: There is no memory, or no descriptor, to be had.
 
-    Who drops it gives its memory back; who reads a slot keeps that.
+    Dropping it frees the memory; mapped slots stay valid.
 
     Attributes:
         shape: How it is divided.
@@ -129,7 +129,7 @@ class Segment:
         self._bytes = np.frombuffer(self._map, np.uint8)
 
     def put(self, pieces: Sequence[Any], sizes: Sequence[int]) -> tuple[int, int] | None:
-        """Copy parts into the oldest slot that nobody reads; returns its number and stamp, None if all are read.
+        """Copy parts into the oldest slot that no reader has; returns its number and stamp, None if all are read.
 
         Args:
             pieces: Flat buffers of bytes. Several make up one part where a size spans them.
@@ -161,7 +161,7 @@ class Segment:
         return writing
 
     def _write(self, number: int, pieces: Sequence[Any], sizes: Sequence[int]) -> int:
-        STAMP.pack_into(self._map, stamp_at(number), 0)  # broken off in the middle, it is nobody's
+        STAMP.pack_into(self._map, stamp_at(number), 0)  # broken off in the middle, it belongs to no update
         base, waiting = self.shape.start(number), iter(pieces)
         for start, size in zip(starts(sizes), sizes, strict=False):
             at = base + start

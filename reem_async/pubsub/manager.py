@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from ..concurrency.queues import unheard
+from ..concurrency.queues import noop
 from ..concurrency.tasks import Tasks
 from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
 from ..local.path import LocalPath
@@ -199,7 +199,7 @@ class SubscriptionManager:
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
                     with self._beginning([listener]):
-                        node = await self.transport.owner(listener.topic.name, anew=anew)
+                        node = await self.transport.owner(listener.topic.name, refresh=anew)
                         wire = await self._subscribe_at(node, [listener.topic])
                 if listener.stored:
                     await self.invalidations.turn_on(wire)
@@ -402,7 +402,7 @@ class SubscriptionManager:
         """Subscribe what is missing, node by node; raise the last failure when all that could be done is done."""
         missing: dict[Transport, list[Topic]] = {}
         for place, topic in enumerate(self._missing()):
-            missing.setdefault(await self.transport.owner(topic.name, anew=place == 0), []).append(topic)
+            missing.setdefault(await self.transport.owner(topic.name, refresh=place == 0), []).append(topic)
         failure: Exception | None = None
         for node, topics in missing.items():
             try:
@@ -437,7 +437,7 @@ class SubscriptionManager:
         """End the loops of threads over what is followed, though the event loop may be busy. Any thread may."""
         for listener in self._everybody():
             for queue in listener.queues:
-                if queue.wake is unheard:  # else it wakes something in the event loop, which no other thread may
+                if queue.wake is noop:  # else it wakes something in the event loop, which no other thread may
                     queue.close()
 
     def _everybody(self) -> list[Listener]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..concurrency.queues import Every, Policy, chosen, unheard
+from ..concurrency.queues import Every, Policy, chosen, noop
 from ..concurrency.streams import Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed
@@ -129,8 +129,8 @@ class Monitor(Stream[Event]):
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
         self._owed: dict[str, int] = {}  # keys with a gap to be told, and how many updates are known to be lost there
         self.doubted: Callable[[str], None] = lambda name: None
-        self.broken: Callable[[], None] = unheard
-        self.begun_anew: Callable[[], None] = unheard
+        self.broken: Callable[[], None] = noop
+        self.begun_anew: Callable[[], None] = noop
         self.changed: Callable[[str | None], None] = lambda key: None
         self._telling = False  # that it begins anew, in this turn of the event loop
 
@@ -180,9 +180,9 @@ class Monitor(Stream[Event]):
         return all(listener.wire is not None for listener in self._listeners)
 
     @property
-    def leisurely(self) -> bool:
+    def batches_messages(self) -> bool:
         """Whether nobody waits for the notices."""
-        return any(listener.wire is not None and listener.wire.leisurely for listener in self._listeners)
+        return any(listener.wire is not None and listener.wire.batches_messages for listener in self._listeners)
 
     def _topic(self, pattern: Pattern) -> bytes:
         """Return the pattern of the channels of the keys that `pattern` names."""

@@ -8,7 +8,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from typing import Any, NoReturn
 
-from ..concurrency.queues import BoundedQueue, Last, Newest, Places, Policy, chosen
+from ..concurrency.queues import BoundedQueue, Last, Newest, PlaceQueue, Policy, chosen
 from ..concurrency.streams import Following, Stream
 from ..connection import RedisInterface
 from ..errors import BadType, InterfaceClosed, MissingKey, NotConnected, ReadOnly
@@ -341,7 +341,7 @@ class CallbackSubscriber(SilentSubscriber):
 
     def _begin(self) -> None:
         session = self.interface.session
-        queue = Places(self.policy)
+        queue = PlaceQueue(self.policy)
         self._updates = Watch(session, self._keys, self._path, self.policy, queue, stored=self.stored)
         self._watches[id(self._updates)] = self._updates
         self._link = self._updates._link  # one follower serves the calls and value()

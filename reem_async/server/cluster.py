@@ -16,14 +16,14 @@ from .process import HOST, PortTaken, ServerProcess, ServerProgram
 from .programs import find_program
 from .startable import Startable
 
-__all__ = ["ClusterNode", "EmbeddedCluster"]
+__all__ = ["EmbeddedCluster", "NodeProcess"]
 
 SLOTS = 16384
-ATTEMPTS = 10  # to find ports that nobody takes in the moment before the server does
+ATTEMPTS = 10  # to find ports that no other program takes just before the server does
 JOIN_SECONDS = 30.0  # for all nodes to know of each other
 
 
-class ClusterNode(ServerProcess):
+class NodeProcess(ServerProcess):
     """One server of a cluster, up and not yet a member.
 
     Attributes:
@@ -115,7 +115,7 @@ class EmbeddedCluster(Startable):
         self._lock = threading.RLock()
         self._owner: int | None = None
         self._finalizer: weakref.finalize[[], EmbeddedCluster] | None = None
-        self.nodes: list[ClusterNode] = []
+        self.nodes: list[NodeProcess] = []
 
     def start(self) -> None:
         """Start all nodes and wait until the cluster takes writes; nothing if it runs already.
@@ -133,7 +133,7 @@ class EmbeddedCluster(Startable):
                 return
             program = find_program(json=self._json)
             count = self._primaries * (1 + self._replicas)
-            nodes: list[ClusterNode] = []
+            nodes: list[NodeProcess] = []
             try:
                 with ThreadPoolExecutor(count, "reem-cluster") as threads:
                     begun = [threads.submit(self._node, program) for _ in range(count)]
@@ -172,17 +172,17 @@ class EmbeddedCluster(Startable):
         """Whether the nodes have JSON; without, REEM keeps documents as text there."""
         return all(node.json for node in self.nodes)
 
-    def _node(self, program: ServerProgram) -> ClusterNode:
+    def _node(self, program: ServerProgram) -> NodeProcess:
         for attempt in range(ATTEMPTS):
             port, bus = _free_ports(2)
             try:
-                return ClusterNode(program, port, bus, self._node_timeout)
+                return NodeProcess(program, port, bus, self._node_timeout)
             except PortTaken:
                 if attempt == ATTEMPTS - 1:
                     raise
         raise AssertionError("unreachable")
 
-    def _join(self, nodes: list[ClusterNode]) -> None:
+    def _join(self, nodes: list[NodeProcess]) -> None:
         """Give out the slots, have the nodes meet, give the primaries their replicas, wait until all know."""
         primaries = nodes[: self._primaries]
         for place, node in enumerate(primaries):
@@ -197,7 +197,7 @@ class EmbeddedCluster(Startable):
             _until(deadline, lambda node=node, primary=primary: _replicates(node, primary))
         _until(deadline, lambda: all(self._knows_all(node, nodes) for node in nodes))
 
-    def _knows_all(self, node: ClusterNode, nodes: list[ClusterNode]) -> bool:
+    def _knows_all(self, node: NodeProcess, nodes: list[NodeProcess]) -> bool:
         """Return whether a node takes commands, knows all others, and sees the replicas in their places."""
         if "cluster_state:ok" not in node.say("CLUSTER", "INFO"):
             return False
@@ -213,7 +213,7 @@ class EmbeddedCluster(Startable):
         return f"<EmbeddedCluster {state}>"
 
 
-def stop_all(nodes: list[ClusterNode]) -> None:
+def stop_all(nodes: list[NodeProcess]) -> None:
     """Stop the nodes, all at the same time; without threads, which cannot be had any more as the interpreter ends."""
     for node in nodes:
         node.order_to_end()
@@ -226,7 +226,7 @@ def packed(*words: str) -> bytes:
     return b"".join([b"*%d\r\n" % len(words), *(b"$%d\r\n%b\r\n" % (len(w.encode()), w.encode()) for w in words)])
 
 
-def _replicates(node: ClusterNode, primary: ClusterNode) -> bool:
+def _replicates(node: NodeProcess, primary: NodeProcess) -> bool:
     with suppress(ServerFailed):  # it has not heard of the primary yet
         node.say("CLUSTER", "REPLICATE", primary.id)
         return True

@@ -19,7 +19,7 @@ from reem_async.server.startable import Startable
 
 __all__ = ["EmbeddedServer"]
 
-ATTEMPTS = 10  # to find a port that nobody takes in the moment before the server does
+ATTEMPTS = 10  # to find a port that no other program takes just before the server does
 FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored
 PASSWORD_BYTES = 512  # the server's own limit
 
@@ -40,7 +40,7 @@ class EmbeddedServer(Startable):
     offered to others as a managed service. Elsewhere, and with `json=False`, the server has no JSON module, and REEM
     keeps its documents as text: the same promises, at the cost that docs/decisions.md tells.
 
-    Everybody who can log in to this machine can connect to the port: set a password if that is not you alone.
+    All users of this machine can connect to the port: set a password unless you are the only one.
 
     Up to 64 MiB of memory that it frees stay with it, for the next large value, if its malloc is glibc's and the
     environment has no GLIBC_TUNABLES.
@@ -225,7 +225,7 @@ class EmbeddedServer(Startable):
                 return ServerProcess(
                     program, port=port, directory=self._wanted_directory, password=self._password, rdb=rdb
                 )
-            except PortTaken:  # by somebody who came between the look and the start
+            except PortTaken:  # by a program that came between the look and the start
                 if not attempts:
                     raise
 

@@ -139,5 +139,5 @@ def _executable(file: Path) -> str:
         try:
             file.chmod(file.stat().st_mode | 0o111)
         except OSError as error:
-            raise ServerFailed(f"{file} cannot be executed: chmod +x it as the user who owns it") from error
+            raise ServerFailed(f"{file} cannot be executed: chmod +x it as its owner") from error
     return str(file)

@@ -38,7 +38,7 @@ class Startable(ABC):
     def _start_or_stop(self) -> None:
         try:
             self._start()
-        except BaseException:  # whoever is interrupted leaves nothing running that would be nobody's
+        except BaseException:  # an interrupted start leaves nothing running without an owner
             self.stop()
             raise
 
@@ -54,7 +54,7 @@ class Startable(ABC):
     async def __aenter__(self) -> Self:
         try:
             await anyio.to_thread.run_sync(self.start)
-        except BaseException:  # cancelled: the thread goes on, and what it starts would be nobody's
+        except BaseException:  # cancelled: the thread goes on, and what it starts would have no owner
             await self._stop_shielded()
             raise
         return self

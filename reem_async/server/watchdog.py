@@ -7,10 +7,10 @@ kernel closes that pipe however the owner ends, kill -9 included. This works on 
 thread: Linux's parent-death signal alone would fire when the *thread* that started the server ends.
 
 Whom it signals: its own process group, which is the server and whatever a wrapper script around it has
-started, and whose number cannot become somebody else's while the watchdog lives. How it knows that all of
+started, and whose number cannot become another group's while the watchdog lives. How it knows that all of
 them are gone: they inherit the writing end of a second pipe, and the reading end comes to its end.
 
-What it is told, one line of JSON: program, config, scratch, lock. What it tells, one line each: `pid N`,
+Its input is one line of JSON: program, config, scratch, lock. Its output, one line each: `pid N`,
 `busy` (another server holds the directory), `failed WHY`, `exited CODE`.
 """
 
@@ -139,7 +139,7 @@ def _remove(folder: str) -> None:
 
 
 def _say(text: str) -> None:
-    with suppress(OSError):  # nobody is left to hear it
+    with suppress(OSError):  # the owner has ended
         os.write(1, f"{text}\n".encode())
 
 

@@ -63,8 +63,8 @@ class Transport(Held, Protocol):
         """Seconds without a byte moving after which a call made now is given up."""
         ...
 
-    async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
-        """Return the way to the server that has `key`; `anew` if it was not where it was thought to be."""
+    async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
+        """Return the way to the server that has `key`; `refresh` if it was not where it was thought to be."""
         ...
 
     async def nodes(self) -> Sequence[Transport]:
@@ -83,7 +83,7 @@ class Transport(Held, Protocol):
         ...
 
     def is_settled(self, document: str) -> bool:
-        """Return whether nothing large, sent by callers who were cancelled since, is on its way to `document`."""
+        """Return whether nothing large, sent by callers that were cancelled since, is on its way to `document`."""
         ...
 
     async def settle(self, document: str) -> None:
@@ -112,7 +112,7 @@ class Transport(Held, Protocol):
 
 
 class Contention:
-    """The attempts of one call that were given up, since somebody else had written to the same top-level key.
+    """The attempts of one call that were given up, since another client had written to the same top-level key.
 
     Args:
         limit: Seconds for which it is tried again.
@@ -231,7 +231,7 @@ async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
         except BadData:
             raise
         except ReemError as error:
-            # The next borrower must not have his transaction fail over keys that he does not know of.
+            # The next borrower's transaction must not fail over keys that this one has watched.
             await held.roundtrip([_UNWATCH])
             return _Raised(_told(sent, error) if isinstance(error, _UNAPPLIED) else error)
     return outcome

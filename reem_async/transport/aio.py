@@ -11,20 +11,20 @@ from typing import Any
 
 from ..concurrency.locks import Locks
 from ..concurrency.tasks import Tasks
-from ..concurrency.timeouts import patience
+from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Held, document_of
-from .opening import WHO, ServerSocket, first_answer, open_wire, who
-from .options import Options
+from .opening import first_answer, open_wire
+from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .state import States
 from .text import HeldText, Text
 from .wire import BUFFER, Wire, close_all
 
 __all__ = ["AsyncTransport"]
 
-# Connections for WATCH that are kept for the next one who needs one; more at the same time are made and closed again.
+# Connections for WATCH that are kept for the next caller; more at the same time are made and closed again.
 _SPARE = 4
 _LENT = 32
 """Connections for WATCH that are lent at a time. More callers wait for one: a server has 10,000 for all its clients."""
@@ -53,7 +53,7 @@ class AsyncTransport:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = 0
         self._closed = False
-        # Two shared connections: False for small calls, True for large values, which nobody waits behind.
+        # Two shared connections: False for small calls, True for large values, which no small call waits behind.
         self._lanes: dict[bool, Wire] = {}
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
@@ -106,7 +106,7 @@ class AsyncTransport:
         return await (self.upload(wire, commands) if large else wire.roundtrip(commands))
 
     async def upload(self, wire: Wire, commands: Sequence[Command]) -> list[Reply]:
-        """Send what is large. A caller who is cancelled leaves it on its way, with a note of that."""
+        """Send large values. A cancelled caller leaves them on their way, and notes that in `_left`."""
         shared = self._lanes.get(False)
         wire.limit_buffer(_PORTION if shared is not None and shared.idle < _COMPANY else BUFFER)
         # What was begun must be sent to its end: half a command would be read together with the next one.
@@ -130,13 +130,13 @@ class AsyncTransport:
             self._left.pop(document, None)
 
     async def _lane(self, bulk: bool) -> Wire:
-        """Return the shared wire, connecting if need be: once for all who ask meanwhile, who share its failure too."""
+        """Return the shared wire, connecting if need be. Concurrent callers share one attempt, and its failure."""
         self.check()
         opening = self._opening.get(bulk)
         if opening is None:
             opening = self._opening[bulk] = self._tasks.start(self._open_lane(bulk), "reem connect")
             opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # all may have gone away
-        # One caller who is cancelled does not take the connection from the others who wait for it.
+        # A cancelled caller does not take the connection from the others who wait for it.
         return await asyncio.shield(opening)
 
     async def _open_lane(self, bulk: bool) -> Wire:
@@ -163,7 +163,7 @@ class AsyncTransport:
             nonlocal has_answered
             if isinstance(replies, list):
                 has_answered = True
-                self.states.opened(self._options.address, who(replies))
+                self.states.opened(self._options.address, server_run_id(replies))
 
         def gone(wire: Wire, reason: Exception) -> None:
             self._open.discard(wire)
@@ -171,28 +171,28 @@ class AsyncTransport:
                 self.states.lost(reason)
                 on_lost(wire, reason)
             elif not isinstance(reason, InterfaceClosed):
-                self._missed(reason, anew=has_answered)
+                self._missed(reason, reconnect=has_answered)
 
         nearby = self._options.nearby
         wire = await (open_wire(self._options, large=large) if nearby is None else self._nearest(nearby, large))
-        # Closed while this was made: nobody else knows of the connection.
+        # Closed while this was made: the connection has no other owner.
         if self._closed:
             await wire.close()
             self.check()
         self._open.add(wire)
         wire.on_push, wire.on_lost = on_push, gone
-        wire.send([WHO], answered)
+        wire.send([INFO_SERVER], answered)
         return wire
 
-    def _missed(self, reason: Exception, *, anew: bool) -> None:
-        """Find out whether the server is gone with a connection for calls: nobody may call for a long time.
+    def _missed(self, reason: Exception, *, reconnect: bool) -> None:
+        """Find out whether the server is gone when a connection for calls breaks: the next call may be long after.
 
-        `anew`: then try to connect, once. What hangs up on whom it has greeted would be connected to without end.
+        `reconnect`: then try to connect, once. Not for a server that hung up after the greeting.
         """
         for other in list(self._open):  # one that does not answer in time breaks as well; the last one tells
-            if not other.busy:  # else what it owes already tells, and sooner: whoever asks last would be waited for
+            if not other.busy:  # else what it owes already tells, and sooner: the last question would be waited for
                 other.send([_PING], lambda _: None)
-        if not self._open and self.states.lost(reason) and anew:
+        if not self._open and self.states.lost(reason) and reconnect:
             self._tasks.start(self._made_anew(), "reem connect")
 
     async def _made_anew(self) -> None:
@@ -206,7 +206,7 @@ class AsyncTransport:
             return through
         wire = await open_wire(self._options, large=large)
         # Only the server itself says where its socket is, so the first connection always goes to the address.
-        nearby.learn(await first_answer(wire, WHO, self._options.address))
+        nearby.learn(await first_answer(wire, INFO_SERVER, self._options.address))
         try:
             through = await self._through(nearby, large)
         except BaseException:
@@ -319,9 +319,9 @@ class AsyncTransport:
 
     @property
     def timeout(self) -> float:
-        return patience(self._options.timeout)
+        return time_limit(self._options.timeout)
 
-    async def owner(self, key: bytes, *, anew: bool = False) -> AsyncTransport:
+    async def owner(self, key: bytes, *, refresh: bool = False) -> AsyncTransport:
         return self
 
     async def nodes(self) -> Sequence[AsyncTransport]:

@@ -20,12 +20,12 @@ import redis.exceptions
 
 from ..concurrency.locks import Locks, ThreadLock
 from ..concurrency.scheduling import give_way
-from ..concurrency.timeouts import LOOKS, moved_last, patience, unsent
+from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from . import Held
-from .opening import WHO, ServerSocket, unanswered, who
-from .options import Options
+from .opening import unanswered
+from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
 from .state import States
@@ -81,15 +81,15 @@ class _Line:
         self.broken = self.waiting = False
         known = lists_json(self._connection.handshake_metadata)
         try:
-            self.introduction, *probed = self.exchange([WHO] if known else [WHO, PROBE])
+            self.introduction, *probed = self.exchange([INFO_SERVER] if known else [INFO_SERVER, PROBE])
         except ConnectionLost as error:
             raise unanswered(options.address, error) from error
         self.plain = bool(probed) and is_plain(probed[0])
-        self._states.opened(options.address, who([self.introduction]))
+        self._states.opened(options.address, server_run_id([self.introduction]))
         lines.append(weakref.ref(self, lines.remove))
 
     def _set_limit(self, limit: float) -> None:
-        """Have Python watch the time: the kernel's own limits begin anew after each signal."""
+        """Have Python watch the time: the kernel's own limits restart after each signal."""
         self._limit = limit
         self._socket.settimeout(limit)
 
@@ -100,7 +100,7 @@ class _Line:
         """Send `commands` and read their replies."""
         pieces = pack(commands)
         self.broken = True  # until all is read: a Ctrl-C anywhere must not leave a reply for the next caller
-        limit = patience(self._timeout)
+        limit = time_limit(self._timeout)
         try:
             receive = self._socket.recv_into
             if len(pieces) == 1 and len(piece := pieces[0]) < SLOW:
@@ -158,7 +158,7 @@ class _Line:
                 return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
-        """Send large values, letting small calls of other threads pass; bytes that move begin the limit anew."""
+        """Send large values, letting small calls of other threads pass; bytes that move restart the limit."""
         if limit / LOOKS != self._limit:
             self._set_limit(limit / LOOKS)
         self._moved, self._left = time.monotonic(), 0
@@ -347,9 +347,9 @@ class BlockingTransport:
 
     @property
     def timeout(self) -> float:
-        return patience(self._options.timeout)
+        return time_limit(self._options.timeout)
 
-    async def owner(self, key: bytes, *, anew: bool = False) -> BlockingTransport:
+    async def owner(self, key: bytes, *, refresh: bool = False) -> BlockingTransport:
         return self
 
     async def nodes(self) -> Sequence[BlockingTransport]:

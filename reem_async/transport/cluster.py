@@ -25,8 +25,9 @@ from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotC
 from ..plan import Command, Reply
 from ..plan.sizes import are_missing, as_given, is_large, looks_at, stage
 from . import Contention, Held, Transport
+from .addresses import address_of, listed
 from .composite import CompositeTransport, NewTransport
-from .options import Address, NodeOptions, Options, address_of, listed
+from .options import Address, NodeOptions, Options
 from .route import (
     Ask,
     HeldAcross,
@@ -110,7 +111,7 @@ class ClusterTransport(CompositeTransport):
         self._primaries: tuple[Address, ...] = ()
         # When a node did not answer last: it is asked for the layout behind all others.
         self._failed: dict[Address, float] = {}
-        # Nodes that a connection was lost to, and that nobody has reached since.
+        # Nodes that a connection was lost to, and that no connection has reached since.
         self._gone: set[Address] = set()
         self._looked = 0.0
         # When a look was in vain last, and why.
@@ -185,17 +186,17 @@ class ClusterTransport(CompositeTransport):
             )
         return [self._node(address) for address in self._primaries]
 
-    async def owner(self, key: str | bytes, *, anew: bool = False) -> Transport:
-        """Return the node that has `key`; `anew` if what is known of the cluster is in doubt.
+    async def owner(self, key: str | bytes, *, refresh: bool = False) -> Transport:
+        """Return the node that has `key`; `refresh` if what is known of the cluster is in doubt.
 
         Raises:
             NotConnected: No node answers, or none has it.
         """
-        return await self.owner_of(key_slot(key if isinstance(key, bytes) else key.encode()), anew=anew)
+        return await self.owner_of(key_slot(key if isinstance(key, bytes) else key.encode()), refresh=refresh)
 
-    async def owner_of(self, slot: int, *, anew: bool = False) -> Transport:
-        """Return the node that has `slot`; `anew` if what is known of the cluster is in doubt."""
-        if anew or self._owners[slot] is None:
+    async def owner_of(self, slot: int, *, refresh: bool = False) -> Transport:
+        """Return the node that has `slot`; `refresh` if what is known of the cluster is in doubt."""
+        if refresh or self._owners[slot] is None:
             await self.look()
         found = self._owners[slot]
         if found is None:
@@ -225,7 +226,7 @@ class ClusterTransport(CompositeTransport):
                     return
                 self._vain = time.monotonic(), reason
             reason = self._vain[1]
-        # A certificate that is not trusted needs somebody to act, and no waiting mends it.
+        # A certificate that is not trusted needs a person to act; waiting does not mend it.
         kind = TlsRefused if isinstance(reason, TlsRefused) else NotConnected
         raise kind(f"no node of the cluster answers; the last one tried: {reason}") from reason
 

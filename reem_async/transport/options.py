@@ -10,42 +10,48 @@ import codecs
 import ipaddress
 import os
 import re
+import socket
 import ssl
+import struct
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qsl, urlsplit, urlunsplit
+from typing import Any
 
 import redis
 import redis.asyncio
 import redis.exceptions
-from redis.asyncio.connection import parse_url
 
 from ..concurrency.timeouts import LONGEST, check_timeout
 from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
 from ..plan import Command
 from ..plan.replies import refusal
+from .addresses import settings_of
 from .packing import Packer
 from .parsing import LARGEST
 
-if TYPE_CHECKING:
-    from .opening import ServerSocket
-
 __all__ = [
-    "Address", "NodeOptions", "Options", "address_of", "connecting_by", "is_this_machine", "listed", "question",
-    "question_here",
+    "INFO_SERVER", "Address", "NodeOptions", "Options", "ServerSocket", "SocketOptions", "connecting_by",
+    "is_this_machine", "look_nearby", "question", "question_here", "server_run_id",
 ]  # fmt: skip
 
 Address = tuple[str, int]
 """Host and port."""
+
+INFO_SERVER: Command = ("INFO", "server")
+"""Asked once per connection. Restarts are not noticed without the right to it."""
+
+_RUN = re.compile(rb"run_id:([0-9a-f]{8,64})")
+_PORT = re.compile(rb"^tcp_port:(\d+)\r?$", re.MULTILINE)
+_PID = re.compile(rb"^process_id:(\d+)\r?$", re.MULTILINE)
+_SOCKET = re.compile(rb"^listener\d+:name=unix,bind=(/[^,\r\n]+)", re.MULTILINE)
+_CREDENTIALS = struct.Struct("3i")  # process, user and group of the listener
 
 for _codec in ("ascii", "idna", "latin-1"):
     # For host names, digests and redis-py: imported by a first connection it may be too late, while Python is shutting
     # down, or in the middle of a fork.
     codecs.lookup(_codec)
 
-_SCHEMES = ("redis://", "rediss://", "unix://")
 _LEAST = 1 << 20
 """Bytes a string in a reply must be allowed: REEM itself asks for pages of names, and INFO."""
 _TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
@@ -73,7 +79,7 @@ class Options:
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
         self.nearby: ServerSocket | None = None
-        self.settings = {**_address(host), **options}
+        self.settings = {**settings_of(host), **options}
         limit = self.settings.pop("socket_timeout", timeout)  # redis-py's name for it; None is no limit there
         self.timeout = timeout = LONGEST if limit is None else check_timeout(limit)
         if self.settings.setdefault("protocol", 3) not in (3, "3"):
@@ -118,7 +124,7 @@ class Options:
             return
         if not self.tls:
             danger, remedy = (
-                "is not encrypted: whoever is on its way can read and change data and password",
+                "is not encrypted: others on the network can read and change data and password",
                 "rediss://",
             )
         elif self.settings.get("ssl_cert_reqs", "required") in ("none", ssl.CERT_NONE):
@@ -368,106 +374,132 @@ def _shown(reason: BaseException, text: str) -> str:
     return f"{text:.200}" or type(reason).__name__
 
 
-def _host_and_port(host: str) -> dict[str, Any]:
-    """Return the connection settings of `host`, `host:port`, `[IPv6]:port`, or an IPv6 address alone."""
-    if ":" not in host or (host.count(":") > 1 and not host.startswith("[")):
-        return {"host": host}
-    try:
-        parts = urlsplit(f"//{host}")
-        if parts.netloc == host and parts.hostname and parts.port:
-            return {"host": parts.hostname, "port": parts.port}
-    except ValueError:
-        pass
-    raise BadValue(f"{host!r} is not a host with a port; write it like localhost:6379 or [::1]:6379")
+def server_run_id(replies: Any) -> str | None:
+    """Return what the server's process calls itself, None if it did not say (or if an error is given)."""
+    # An error, or a user without the right: restarts are then not noticed, and all else goes on.
+    text = replies[0] if isinstance(replies, list) and replies else None
+    found = _RUN.search(text) if isinstance(text, bytes | bytearray) else None
+    return None if found is None else found[1].decode()
 
 
-def check_url(url: str) -> None:
-    """Refuse the parts of a server's URL that redis-py drops in silence: another server would be meant.
+def look_nearby(options: Options) -> None:
+    """Have connections look for the server's Unix socket first.
 
-    Raises:
-        BadValue: There is one. The message never quotes user and password.
+    Only where the address is that of one server on this machine, without TLS, and only on systems
+    that tell which process listens at a socket. Nothing is connected yet.
     """
-    parts = urlsplit(url)
-    login, _, place = parts.netloc.rpartition("@")
-    problem, form = "", f"{parts.scheme}://{'user:password@' if login else ''}host:6379/0"
-    if parts.scheme == "unix":
-        form = "unix:///run/redis.sock?db=0"
-        if place:
-            problem = f"{place!r} stands in the place of a host; a path begins with three slashes"
-        elif parts.path in ("", "/"):
-            problem = "it has no path of a socket"
-    elif not re.fullmatch(r"/?|/[0-9]+/?", parts.path):
-        problem = f"{parts.path!r} is not the number of a database"
-    elif "," in place:
-        problem, form = (
-            "it lists several hosts",
-            "redis+cluster://host:7000,host:7001 or redis+sentinel://host:26379/name",
+    host = str(options.settings.get("host", "localhost"))
+    plain = type(options) is Options and not options.tls and options.socket_path is None
+    if plain and is_this_machine(host) and hasattr(socket, "SO_PEERCRED"):
+        options.nearby = ServerSocket(options)
+
+
+class ServerSocket:
+    """The Unix socket of the server at an address, as far as it is known.
+
+    Args:
+        options: How to reach the server by its address.
+
+    Attributes:
+        way: How to reach it through the socket; None as long as none is known, or of use.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+        self._vain: str | None = None
+        self.way: Options | None = None
+
+    def learn(self, replies: Any) -> None:
+        """Note what the server at the address says of itself, asked who it is.
+
+        Where its port is another one, something stands in between, on purpose: a tunnel, or a proxy.
+        """
+        process = server_run_id(replies)
+        # The socket of this process was tried and does not work (another container, no right to it): not again.
+        if process is None or process == self._vain:
+            return
+        port, pid, path = (pattern.search(replies[0]) for pattern in (_PORT, _PID, _SOCKET))
+        if port and pid and path and int(port[1]) == int(self._options.settings.get("port", 6379)):
+            self.way = SocketOptions(self._options, os.fsdecode(path[1]), process, int(pid[1]))
+
+    def give_up(self, way: Options, error: Exception) -> None:
+        """Note that `way` could not be gone. As long as the same process is at the address, it is not tried again.
+
+        Raises:
+            The error, if it says that the server does not answer in time: it will not at its address either.
+        """
+        if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
+            raise error
+        self._vain, self.way = (way.process if isinstance(way, SocketOptions) else None), None
+
+
+class SocketOptions(Options):
+    """How to reach a server through its Unix socket, and no other one: the login is for this process alone.
+
+    Args:
+        by_address: How to reach it by its address.
+        path: The socket.
+        process: What the server's process calls itself.
+        pid: Its number in this system.
+    """
+
+    def __init__(self, by_address: Options, path: str, process: str, pid: int) -> None:
+        self._by_address = by_address.address
+        self.process = process
+        self._pid = pid
+        settings = {name: value for name, value in by_address.settings.items() if not name.startswith("socket_keepa")}
+        settings.pop("socket_type", None)
+        super().__init__(
+            "localhost", by_address.timeout, settings | {"unix_socket_path": path, "largest_value": by_address.largest}
         )
-    elif place.endswith((":", ":0")) or re.search(r"\s", place):
-        problem = f"{place!r} is not a host with a port"
-    if "#" in url.rpartition("@")[2]:
-        problem = "it has a fragment (#...)"
-    databases = [value for name, value in parse_qsl(parts.query) if name == "db"]
-    if any(not re.fullmatch("[0-9]+", value) for value in databases):
-        problem = f"db={databases[0]!r} is not the number of a database"
-    elif parts.scheme != "unix" and databases and parts.path.strip("/") not in ("", databases[0]):
-        problem = "it names two databases"
-    if problem:
-        raise BadValue(f"the URL of the server is wrong: {problem}; write it like {form}")
 
+    @property
+    def address(self) -> str:
+        """Where the user said that the server is, for messages."""
+        return self._by_address
 
-def _address(host: Any) -> dict[str, Any]:
-    """Return the connection settings that `host` stands for."""
-    socket_path = getattr(host, "socket_path", None)
-    if socket_path is not None:
-        password = getattr(host, "password", None)
-        return {"unix_socket_path": str(socket_path)} | ({"password": password} if password else {})
-    if not isinstance(host, str):
-        raise BadType(f"host is a name, a URL or an EmbeddedServer, not {type(host).__name__}")
-    if "://" not in host:
-        if "@" in host:
-            raise BadValue("host is a name alone; user and password go in username=, password= or in a URL, redis://")
-        return _host_and_port(host)
-    if not host.startswith(_SCHEMES):
-        raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")
-    check_url(host)
-    try:
-        settings: dict[str, Any] = {**parse_url(host)}
-    except ValueError:  # its text may hold a part of the password
-        raise BadValue(
-            "the URL of the server is wrong; write it like redis://user:password@host:6379/0, special characters "
-            "of the password percent-encoded"
-        ) from None
-    if settings.pop("connection_class", None) is redis.asyncio.connection.SSLConnection:
-        settings["ssl"] = True
-    return settings
+    def asynchronous_connection(self) -> Any:
+        """Return a connection that makes sure, before it logs in, which process listens."""
+        connection = connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
+        log_in = connection.on_connect_check_health
 
+        async def check_first(**options: Any) -> None:
+            # Before AUTH is sent: another process that listens at the path must not get the password.
+            self._check_listener(connection._writer.get_extra_info("socket"))
+            await log_in(**options)
 
-def address_of(url: str, port: int) -> tuple[str, int]:
-    """Return host and port of a plain URL; `port` if it names none."""
-    parts = urlsplit(url)
-    return parts.hostname or "localhost", parts.port or port
+        connection.on_connect_check_health = check_first
+        return connection
 
+    def blocking_connection(self) -> Any:
+        """Return a connection that makes sure, before it logs in, which process listens."""
+        connection = connecting_by(super().blocking_connection(), self._connect)
+        log_in = connection.on_connect_check_health
 
-def listed(url: str, example: str) -> list[str]:
-    """Return a URL that lists several hosts as one plain URL for each: redis+x://u@a:1,b:2/c as redis://u@a:1/c, ...
+        def check_first(**options: Any) -> None:
+            self._check_listener(connection._sock)
+            log_in(**options)
 
-    Raises:
-        BadValue: No host, or a port that is no number; never quotes the URL, which may hold a password.
-    """
-    parts = urlsplit(url)
-    if parts.fragment:
-        raise BadValue(f"the URL has a fragment (#...); write it like {example}")
-    # From the right: a password may contain an @.
-    login, at, hosts = parts.netloc.rpartition("@")
-    urls = []
-    for each in hosts.split(","):
-        one = urlsplit(f"//{each}")
-        try:
-            sound = bool(one.hostname) and (one.port is None or one.port > 0)
-        except ValueError:
-            sound = False
-        if not sound:
-            raise BadValue(f"{each!r} is not a host with a port; write it like {example}")
-        urls.append(urlunsplit((parts.scheme.partition("+")[0], login + at + each, parts.path, parts.query, "")))
-    return urls
+        connection.on_connect_check_health = check_first
+        return connection
+
+    async def _connect_asynchronously(self, connection: Any, connect: Any) -> None:
+        await connect()
+        await question(connection, [INFO_SERVER], self._check_process)
+
+    def _connect(self, connection: Any, connect: Any) -> None:
+        connect()
+        question_here(connection, [INFO_SERVER], self._check_process)
+
+    def _check_listener(self, listening: Any) -> None:
+        """Raise redis.exceptions.ConnectionError if another process listens there: it gets no password."""
+        with socket.socket(fileno=os.dup(listening.fileno())) as connected:
+            # A copy of the descriptor: closing this socket object must not close the connection.
+            told = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        if _CREDENTIALS.unpack(told)[0] != self._pid:
+            raise redis.exceptions.ConnectionError("another process listens at the server's socket")
+
+    def _check_process(self, reply: Any, _: Any) -> None:
+        """Raise redis.exceptions.ConnectionError if it is another server: its number may be another system's."""
+        if server_run_id([reply]) != self.process:
+            raise redis.exceptions.ConnectionError("another server answers at the server's socket")

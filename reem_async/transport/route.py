@@ -20,7 +20,7 @@ leaves their keys out), nor in commands of one key, by which keys are watched. T
 Whatever is not at the source in step 2 has been at the target since step 1, or is nowhere. At the source one WATCH of
 all keys tells as much, for it is refused unless all are there. In between a key may leave, which makes the transaction
 fail; and what is nowhere when a slot begins to move is made at the source only if the document, which every
-transaction watches, is there: then nobody makes it at the target, since the same look finds the document here.
+transaction watches, is there: then no client makes it at the target, since the same look finds the document here.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import redis.crc
 import redis.exceptions
@@ -38,9 +38,6 @@ import redis.exceptions
 from ..errors import ConnectionLost, NotConnected, TlsRefused
 from ..plan import Command, Reply, blamed
 from . import Held, Transport
-
-if TYPE_CHECKING:
-    from .cluster import ClusterTransport
 
 __all__ = [
     "Ask", "HeldAcross", "Moved", "Route", "Unapplied", "asked_of", "is_moved", "is_unapplied", "key_of",
@@ -145,10 +142,21 @@ def is_unapplied(reply: object) -> bool:
     return isinstance(reply, Unapplied)
 
 
+class Layout(Protocol):
+    """What a route needs of `cluster.ClusterTransport`."""
+
+    @property
+    def timeout(self) -> float: ...
+    async def owner_of(self, slot: int, *, refresh: bool = False) -> Transport: ...
+    async def nodes(self) -> Sequence[Transport]: ...
+    def moved(self, problem: Any, asked: Transport) -> Transport: ...
+    async def pause(self, seconds: float) -> None: ...
+
+
 class Route:
     """The way of one call: which node is next, until the call's time is over."""
 
-    def __init__(self, cluster: ClusterTransport, slot: int | None, asked: Transport | None = None) -> None:
+    def __init__(self, cluster: Layout, slot: int | None, asked: Transport | None = None) -> None:
         self._cluster = cluster
         self._slot = slot
         self._node = asked
@@ -165,9 +173,9 @@ class Route:
     async def node(self) -> Transport:
         """Return where to send next."""
         if self._node is None:
-            # The first try believes what is known. Each later one looks anew, since what was known has failed.
+            # The first try believes what is known. Each later one looks again, since what was known has failed.
             if self._slot is not None:
-                self._node = await self._cluster.owner_of(self._slot, anew=self._tries > 0)
+                self._node = await self._cluster.owner_of(self._slot, refresh=self._tries > 0)
             else:
                 self._node = random.choice(await self._cluster.nodes())  # noqa: S311
         return self._node
@@ -233,7 +241,7 @@ def _reason(problem: Exception) -> str:
 class HeldAcross:
     """A connection to the node that has what is watched; each WATCH may find it elsewhere."""
 
-    def __init__(self, cluster: ClusterTransport) -> None:
+    def __init__(self, cluster: Layout) -> None:
         self._cluster = cluster
         self._node: Transport | None = None
         self._lent: AbstractAsyncContextManager[Held] | None = None

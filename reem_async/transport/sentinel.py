@@ -22,8 +22,9 @@ import redis.exceptions
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
+from .addresses import address_of, listed
 from .composite import CompositeTransport, NewTransport, ToOneServer
-from .options import Address, NodeOptions, Options, address_of, connecting_by, listed, question, question_here
+from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .state import States
 
 if TYPE_CHECKING:
@@ -178,7 +179,7 @@ class SentinelOptions(Options):
         raise NotConnected(f"a sentinel knows no {self.service!r}; the URL ends with the name that it was given there")
 
     def _nowhere(self, problems: Sequence[Exception]) -> Exception:
-        """Return the error to raise: the reason that most needs somebody to act, or all of them."""
+        """Return the error to raise: the reason that a person has to act on, or all of them."""
         for kind in (TlsRefused, Refused):
             if found := [problem for problem in problems if isinstance(problem, kind)]:
                 return found[-1]
@@ -285,7 +286,7 @@ class SentinelTransport(CompositeTransport):
         return replies
 
     def _leave(self, demoted: Transport) -> None:
-        """Use new connections from now on. The old ones are left to whoever waits for a reply on them."""
+        """Use new connections from now on. The old ones serve calls that wait for a reply on them."""
         if demoted is self._now:
             self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
             self._renew()
@@ -311,7 +312,7 @@ class SentinelTransport(CompositeTransport):
     def hold(self) -> AbstractAsyncContextManager[Held]:
         return _Checking(self, self._current())
 
-    async def owner(self, key: bytes, *, anew: bool = False) -> Transport:
+    async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         return self
 
     async def nodes(self) -> Sequence[Transport]:

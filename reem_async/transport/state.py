@@ -22,8 +22,8 @@ logger = logging.getLogger("reem.connection")
 
 State = Literal["idle", "connected", "lost", "reconnecting", "closed"]
 """idle: nothing was connected yet. lost: a connection broke and none is left that answers; the next call makes a
-new one, and an event loop tries once at once. reconnecting: the same, and it is tried until it works, since somebody
-follows updates."""
+new one, and an event loop tries once at once. reconnecting: the same, and it is retried until it works, since a
+subscriber follows updates."""
 
 # Changes that wait for a slow reader of `states()`: of a server that comes and goes, the last ones tell.
 _KEPT = 100
@@ -62,20 +62,20 @@ class _Turn:
     """To call back: it ends with the call that has it, also where that is interrupted.
 
     Attributes:
-        over: It has ended; somebody may keep it with what was raised.
+        over: It has ended; a traceback may keep it.
     """
 
     over = False
 
 
 def _nobody() -> None:
-    """Nobody has the turn."""
+    """Stand for a weak reference to no turn."""
 
 
 class States:
     """The state of one interface. Any thread may call; what is called back runs on the thread that noticed.
 
-    Or on one that is calling back already, so that changes are told in order. No lock is held meanwhile: what is
+    Or on one that is calling back already, so that changes are reported in order. No lock is held meanwhile: what is
     called back may call REEM, and wait for what another thread has.
 
     Attributes:
@@ -134,7 +134,7 @@ class States:
         turn = _Turn()
         try:
             while (change := self._next(turn)) is not None:
-                self._untold.popleft()  # not before: whoever is interrupted on the way to here leaves it to the next
+                self._untold.popleft()  # not before: an interrupted call leaves it to the next one
                 for callback in tuple(self._callbacks):
                     try:
                         callback(change)
@@ -188,7 +188,7 @@ class States:
                 queue.close()
 
     def _next(self, turn: _Turn) -> StateChange | None:
-        """Return the next change to tell for who has the turn, or takes it; None if there is none, or another has."""
+        """Return the next change to report if `turn` has or gets the turn, else None."""
         with self._lock:
             holder = self._turn()
             if holder not in (None, turn) and not holder.over:

@@ -13,7 +13,7 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol
 from zlib import crc32
 
-from ..concurrency.timeouts import patience
+from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, NoJsonSupport, NotConnected
 from ..plain.batches import Known, Steps, Watched, concerns, has_json
 from ..plain.changes import after_look
@@ -31,7 +31,7 @@ PROBE: Command = ("JSON.GET",)
 _AT_A_TIME = 8
 """Changes below the top that one interface has under way at the same time, each over a connection of its own."""
 _AS_LONG = 0.9
-"""Of a time limit: who has tried for so long has found out for others; uploads are given up a little early."""
+"""Fraction of the time limit after which a failure counts as "server down" for queued calls: uploads fail early."""
 
 _MODULES = (b"ReJSON", "ReJSON", b"json", "json")
 """What HELLO calls the modules of Redis and of Valkey."""
@@ -100,7 +100,7 @@ class Text:
     async def _after_look(
         self, lending: Lending, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
     ) -> list[Reply]:
-        """Look, then change, again if somebody else was first. Two round trips.
+        """Look, then change; retry if another client wrote in between. Two round trips.
 
         Callers of one transport go one after the other for each key, since they would only be in each other's way, and
         no more than a few at a time, since each has a connection. Cancelled, or broken off, it was applied once or not
@@ -110,18 +110,18 @@ class Text:
             Contended: Others were first each time; nothing was applied.
         """
         # Locks by a few numbers rather than by key, which bounds the connections as well. Sorted, so that two callers
-        # who need the same two locks never wait for each other.
+        # that need the same two locks never wait for each other.
         turns = sorted({f"documents {crc32(key) % _AT_A_TIME}" for key in keys})
-        contention, attempt = Contention(patience(self.timeout)), _Attempt(keys, commands)
+        contention, attempt = Contention(time_limit(self.timeout)), _Attempt(keys, commands)
         while True:
-            # Each attempt waits for its turn: who is never first must not keep those who write to other keys.
+            # Each attempt waits for its turn: a caller that keeps losing must not block writers of other keys.
             came = attempt.begun = time.monotonic()
             replies = await self._in_turn(turns, lending, attempt, bulk)
             contention.waited(attempt.begun - came)
             if replies is not None:
                 return replies
             contention.given_up(commands)
-            # Somebody was first, and will be again while the array is on its way: from now on it is sent ahead.
+            # Another client was first, and will be again while the array is on its way: from now on it is sent ahead.
             if type(attempt) is _Attempt and commands[-1][0] == "EXEC" and any(map(is_large, commands)):
                 attempt = _Ahead(keys, commands)
 
@@ -147,13 +147,13 @@ class Text:
     def _check_reached(self, turn: str, came: float) -> None:
         """Raise NotConnected if the server was lost while a call waited for its turn, after as much time as it has.
 
-        Else each of those who wait would have a time limit of its own, one after the other.
+        Else each waiting call would have a time limit of its own, one after the other.
         """
         lost = self._lost.get(turn)
         # A connection that breaks at once says nothing of the server: the next one may be made.
-        if lost is not None and lost.time > came and lost.took >= _AS_LONG * patience(self.timeout):
+        if lost is not None and lost.time > came and lost.took >= _AS_LONG * time_limit(self.timeout):
             raise NotConnected(
-                "the call before this one lost the server, so nothing of this one was sent and nothing was applied: "
+                "the call ahead of this one lost the server, so this one was not sent and nothing was applied: "
                 f"call again (of that one it was said: {lost.error})"
             )
 
@@ -184,11 +184,11 @@ class HeldText:
             replies = await _carried_out(self._held.roundtrip, steps, bulk)
             if replies is not None:
                 return replies
-            contention = contention or Contention(patience(self._timeout))
+            contention = contention or Contention(time_limit(self._timeout))
             contention.given_up(commands)
 
     async def attempt(self, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool) -> list[Reply] | None:
-        """Look at `keys` and change them where nothing is watched before; return None if somebody else was first."""
+        """Look at `keys` and change them where nothing is watched before; return None if another client was first."""
         return await _carried_out(self._held.roundtrip, after_look(commands, keys, self._known, error_of, None), bulk)
 
 
@@ -207,7 +207,7 @@ class _Lost(NamedTuple):
 
 
 class _Attempt:
-    """A batch that is tried until nobody else is first.
+    """A batch that is retried until no other client writes in between.
 
     Args:
         keys: Of the documents.
@@ -224,7 +224,7 @@ class _Attempt:
         self.begun = 0.0
 
     async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
-        """Try once; return None if somebody else was first."""
+        """Try once; return None if another client was first."""
         return await held.attempt(self._keys, self.given, bulk)
 
 
@@ -243,7 +243,7 @@ class _Ahead(_Attempt):
         self._sent = -float(KEPT)
 
     async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
-        """Try once; return None if somebody else was first."""
+        """Try once; return None if another client was first."""
         # Sent again well before the server forgets it.
         if time.monotonic() - self._sent > KEPT / 2:
             self._sent = time.monotonic()

@@ -20,7 +20,7 @@ from typing import Any
 import hiredis
 
 from ..concurrency.scheduling import give_way
-from ..concurrency.timeouts import LOOKS, confirmed, moved_last, patience, unsent
+from ..concurrency.timeouts import LOOKS, confirmed, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
@@ -34,7 +34,7 @@ __all__ = ["BUFFER", "Wire", "close_all"]
 _BUSY = 2.5
 """The connection is busy if three reads come within so many times `pace`."""
 
-_LEISURELY = 0.005
+_BATCHING = 0.005
 """Seconds of `pace` from which on updates may be read together: no listener needs them at once."""
 
 BUFFER = 1 << 22
@@ -58,7 +58,7 @@ class _Due:
     Attributes:
         count: How many they are.
         done: Takes them, or an error.
-        limit: Seconds without a byte moving after which the caller is told, and
+        limit: Seconds without a byte moving after which the call fails, and
         since: the time from which this counts at the earliest: when they were asked for.
         replies: Those that have come.
         late: The limit has passed; it is given up if the next look at the socket brings nothing.
@@ -166,9 +166,9 @@ class Wire(asyncio.BufferedProtocol):
         return self._loop.time() - self._last_byte
 
     @property
-    def leisurely(self) -> bool:
-        """Whether nobody waits for what comes, so that others are given way after each message."""
-        return self.pace >= _LEISURELY
+    def batches_messages(self) -> bool:
+        """Whether messages are batched, so that other threads are given way after each one."""
+        return self.pace >= _BATCHING
 
     def send(self, commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]) -> None:
         """Send `commands`; `done` is called with their replies, in order with pushed messages, or with an error."""
@@ -180,7 +180,7 @@ class Wire(asyncio.BufferedProtocol):
         if self._transport is None or self._reason is not None:
             done(self._reason or ConnectionLost("the connection is closed"))
             return
-        pieces, limit, now = pack(commands), patience(self._timeout), self._loop.time()
+        pieces, limit, now = pack(commands), time_limit(self._timeout), self._loop.time()
         idle = not self._due
         self._due.append(_Due(len(commands), done, limit, now))
         self._watch_until(now + limit)
@@ -204,7 +204,7 @@ class Wire(asyncio.BufferedProtocol):
         """
         if not self.alive:
             return
-        limit, now = patience(self._timeout), self._loop.time()
+        limit, now = time_limit(self._timeout), self._loop.time()
         due = _Due(1, lambda _: None, limit, now)
         due.lenient = True
         self._due.append(due)
@@ -260,7 +260,7 @@ class Wire(asyncio.BufferedProtocol):
         return arrived
 
     def abort(self, reason: Exception) -> None:
-        """Break the connection; whoever waits gets `reason`."""
+        """Break the connection; waiting calls get `reason`."""
         self._fail(reason)
         if self._transport is not None:
             self._transport.abort()
@@ -301,10 +301,10 @@ class Wire(asyncio.BufferedProtocol):
         before, self._read_before, self._last_byte = self._read_before, self._last_byte, self._loop.time()
         try:
             self._reader.received(nbytes)
-            leisurely = self.leisurely
+            batches_messages = self.batches_messages
             while (reply := self._reader.gets()) is not MORE:
                 self._take(reply)
-                if leisurely:
+                if batches_messages:
                     give_way()
         except NOT_THE_PROTOCOL as error:
             self.abort(ConnectionLost(f"the server sent something that is not its protocol: {error!s:.200}"))
@@ -322,7 +322,7 @@ class Wire(asyncio.BufferedProtocol):
         """Close: the server will not answer any more."""
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Tell everybody who waits."""
+        """Fail the waiting calls."""
         self._fail(
             ConnectionLost(
                 f"the connection broke before the reply came ({exc or 'closed by the server'}); "
@@ -341,7 +341,7 @@ class Wire(asyncio.BufferedProtocol):
                 self.on_push(reply)
             return
         if not self._due:
-            self.abort(ConnectionLost("the server sent a reply that nobody asked for"))
+            self.abort(ConnectionLost("unexpected reply from the server"))
             return
         due = self._due[0]
         if due.lenient and isinstance(reply, Exception):
@@ -431,7 +431,7 @@ class Wire(asyncio.BufferedProtocol):
 
 
 async def close_all(wires: Collection[Wire]) -> None:
-    """Close connections, and wait until they are; who is cancelled meanwhile leaves none behind."""
+    """Close connections and wait until they are closed; a cancelled caller leaves none behind."""
     going = [wire.hang_up() for wire in wires]
     try:
         if going:
@@ -446,7 +446,7 @@ def _is_loopback(sock: Any) -> bool:
         return False
     try:
         return is_this_machine(sock.getpeername()[0])
-    except OSError:  # gone meanwhile: whoever sends will be told
+    except OSError:  # gone meanwhile: the next send fails
         return False
 
 

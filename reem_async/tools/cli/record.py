@@ -88,7 +88,7 @@ def record(
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.transport.opening import look_nearby
+        from reem_async.transport.options import look_nearby
 
         # Before the recorder is made: threads that it starts inherit the scheduling.
         if background:

@@ -300,7 +300,7 @@ class Recorder:
         assert self._monitor is not None
         async for event in self._monitor:
             self._key_recorder(event.name).on_event(event)
-            if self._monitor.leisurely:
+            if self._monitor.batches_messages:
                 give_way()
 
     def _pump(self) -> None:
