@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import queue
 import sys
-from typing import NoReturn, Protocol
+from typing import NoReturn
 
 __all__ = ["Descriptor", "Wakeups", "wakeups"]
 
@@ -43,25 +43,7 @@ class Descriptor:
             os.close(self.number)
 
 
-class Wakeups(Protocol):
-    """Each wakeup that is put wakes one thread that gets one."""
-
-    def put(self, wakeup: None) -> None:
-        """Add a wakeup."""
-
-    def get(self) -> None:
-        """Take a wakeup; block this thread until there is one."""
-
-
-def wakeups() -> Wakeups:
-    """Return the wakeups that wake fastest here."""
-    try:
-        return _Descriptor()
-    except (AttributeError, OSError):  # not Linux; or no descriptor is left
-        return queue.SimpleQueue()
-
-
-class _Descriptor:
+class EventDescriptor:
     """Wakeups that the kernel counts, in one file descriptor.
 
     The thread that is woken may get the processor at once, while the other one is still waking it. That one lets go
@@ -78,3 +60,15 @@ class _Descriptor:
 
     def get(self) -> None:
         os.read(self._descriptor.number, 8)
+
+
+Wakeups = EventDescriptor | queue.SimpleQueue[None]
+"""Each wakeup that is put wakes one thread that gets one."""
+
+
+def wakeups() -> Wakeups:
+    """Return the wakeups that wake fastest here."""
+    try:
+        return EventDescriptor()
+    except (AttributeError, OSError):  # not Linux; or no descriptor is left
+        return queue.SimpleQueue()

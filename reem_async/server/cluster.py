@@ -7,12 +7,13 @@ import socket
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 
 from ..errors import BadValue, ServerFailed
-from .process import HOST, PortTaken, ServerProcess, ServerProgram
+from .process import HOST, PortTaken, ServerProcess, ServerProgram, packed
 from .programs import find_program
 from .startable import Startable
 
@@ -28,23 +29,19 @@ class NodeProcess(ServerProcess):
 
     Attributes:
         id: What the cluster calls it.
+        bus: The port on which the nodes talk to each other.
     """
 
     def __init__(self, program: ServerProgram, port: int, bus: int, node_timeout: float) -> None:
-        self._bus = bus
+        self.bus = bus
         self._node_timeout = node_timeout
         super().__init__(program, port=port, directory=None, password=None)
         self.id = self.say("CLUSTER", "MYID")
 
-    @property
-    def bus(self) -> int:
-        """The port on which the nodes talk to each other."""
-        return self._bus
-
     def _config(self, program: ServerProgram, keep: bool, password: str | None) -> str:
         lines = [
             "cluster-enabled yes",
-            f"cluster-port {self._bus}",
+            f"cluster-port {self.bus}",
             f"cluster-node-timeout {round(self._node_timeout * 1000)}",
             # One dead primary must not stop the others.
             "cluster-require-full-coverage no",
@@ -194,7 +191,7 @@ class EmbeddedCluster(Startable):
         deadline = time.monotonic() + JOIN_SECONDS
         for place, node in enumerate(nodes[self._primaries :]):
             primary = primaries[place % len(primaries)]
-            _until(deadline, lambda node=node, primary=primary: _replicates(node, primary))
+            _until(deadline, partial(_replicates, node, primary))
         _until(deadline, lambda: all(self._knows_all(node, nodes) for node in nodes))
 
     def _knows_all(self, node: NodeProcess, nodes: list[NodeProcess]) -> bool:
@@ -221,11 +218,6 @@ def stop_all(nodes: list[NodeProcess]) -> None:
         node.stop()
 
 
-def packed(*words: str) -> bytes:
-    """Return a command as it travels."""
-    return b"".join([b"*%d\r\n" % len(words), *(b"$%d\r\n%b\r\n" % (len(w.encode()), w.encode()) for w in words)])
-
-
 def _replicates(node: NodeProcess, primary: NodeProcess) -> bool:
     with suppress(ServerFailed):  # it has not heard of the primary yet
         node.say("CLUSTER", "REPLICATE", primary.id)
@@ -233,8 +225,7 @@ def _replicates(node: NodeProcess, primary: NodeProcess) -> bool:
     return False
 
 
-def _until(deadline: float, condition: object) -> None:
-    assert callable(condition)
+def _until(deadline: float, condition: Callable[[], bool]) -> None:
     while not condition():
         if time.monotonic() > deadline:
             raise ServerFailed(f"the nodes of the cluster did not find each other within {JOIN_SECONDS:g} s")

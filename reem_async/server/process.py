@@ -102,11 +102,11 @@ class ServerProcess:
 
     def ask(self, *command: str, password: str | None = None) -> bytes:
         """Send one command by the unix socket; the first line of the reply, empty if none comes."""
-        login = _packed("AUTH", password) if password is not None else b""
+        login = packed("AUTH", password) if password is not None else b""
         with socket.socket(socket.AF_UNIX) as connection, suppress(OSError):
             connection.settimeout(ANSWER_SECONDS)
             connection.connect(self.socket_path)
-            connection.sendall(login + _packed(*command))
+            connection.sendall(login + packed(*command))
             with connection.makefile("rb") as replies:
                 return replies.readline() if not login else replies.readline() and replies.readline()
         return b""
@@ -295,7 +295,7 @@ def _private_directory() -> Path:
     return Path(tempfile.mkdtemp(prefix="reem-", dir=None if roomy else "/tmp"))  # noqa: S108
 
 
-def _packed(*words: str) -> bytes:
+def packed(*words: str) -> bytes:
     """A command as it travels."""
     encoded = [word.encode() for word in words]
     return b"*%d\r\n" % len(encoded) + b"".join(b"$%d\r\n%b\r\n" % (len(word), word) for word in encoded)

@@ -27,7 +27,7 @@ from . import Held
 from .opening import unanswered
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, Reader, SmallReader
+from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 
@@ -135,7 +135,7 @@ class _Line:
             self.close()
             raise
 
-    def _replies(self, reader: Reader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
+    def _replies(self, reader: ReplyReader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
         """Read `count` replies. Nothing is left over: nothing else was asked.
 
         Raises:

@@ -16,7 +16,7 @@ import random
 import secrets
 import time
 from collections.abc import AsyncIterator, Collection, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from contextlib import asynccontextmanager
 from typing import Any
 
 import redis.exceptions
@@ -152,11 +152,9 @@ class ClusterTransport(CompositeTransport):
         problem = refusal(replies)
         return replies if problem is None else await self._apply(commands, bulk, problem, replies, owner)
 
-    def hold(self, key: str | bytes | None = None) -> AbstractAsyncContextManager[Held]:
-        return self._hold()
-
     @asynccontextmanager
-    async def _hold(self) -> AsyncIterator[Held]:
+    async def hold(self) -> AsyncIterator[Held]:
+        """Lend a connection to the node that has what is watched, wherever that moves."""
         held = HeldAcross(self)
         try:
             yield held

@@ -7,7 +7,7 @@ that becomes the reply; for small replies it is several times slower than hiredi
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import hiredis
 import redis.exceptions
@@ -17,7 +17,7 @@ from ..errors import ClusterNode
 from ..plan import Reply
 from ..plan.replies import refusal
 
-__all__ = ["LARGEST", "MORE", "NOT_THE_PROTOCOL", "LargeReader", "Reader", "SmallReader", "error_of"]
+__all__ = ["LARGEST", "MORE", "NOT_THE_PROTOCOL", "LargeReader", "ReplyReader", "SmallReader", "error_of"]
 
 NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError, TypeError, ValueError)
 """What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
@@ -55,41 +55,15 @@ def error_of(text: str) -> Exception:
 _parse_error: Any = BaseParser.parse_error
 
 
-class Reader(Protocol):
-    """A parser that says where it wants the next bytes, and refuses replies that are too large.
-
-    Attributes:
-        fed: Bytes received of the reply that is under way; whoever takes a reply sets it to 0.
-    """
-
-    fed: int
-
-    def target(self) -> memoryview:
-        """Return where to put received bytes."""
-        ...
-
-    def received(self, count: int) -> None:
-        """Take note of `count` bytes put there.
-
-        Raises:
-            redis.exceptions.InvalidResponse: The reply is too large.
-        """
-        ...
-
-    def gets(self) -> Reply:
-        """Return the next reply, or MORE.
-
-        Raises:
-            redis.exceptions.InvalidResponse: The bytes are not the Redis protocol.
-        """
-        ...
-
-
 class SmallReader:
     """hiredis, handing out error replies as redis-py's exceptions.
 
     Args:
         largest: Bytes a string in a reply may have.
+
+    Attributes:
+        fed: Bytes received of the reply that is under way; to be set to 0 when a reply is taken.
+        gets: Returns the next reply, or MORE; raises redis.exceptions.InvalidResponse for what is not the protocol.
     """
 
     def __init__(self, largest: int = LARGEST) -> None:
@@ -109,7 +83,7 @@ class SmallReader:
         return self._view
 
     def received(self, count: int) -> None:
-        """Parse `count` bytes."""
+        """Parse `count` bytes put there; raises redis.exceptions.InvalidResponse if the reply is too large."""
         self.fed += count
         if self.fed == count and self._buffer[_LONG] in _DIGITS:  # a reply begins here, perhaps with a long number
             self._look_at = _MUCH
@@ -193,7 +167,6 @@ class LargeReader:
         return self._view[self._end :]
 
     def received(self, count: int) -> None:
-        """Take note of `count` bytes put where `target` said."""
         self.fed += count
         if self.fed > self._in_all:
             _check_size(self.fed - _BUFFER, self._in_all)
@@ -203,7 +176,6 @@ class LargeReader:
             self._end += count
 
     def gets(self) -> Reply:
-        """Return the next reply, or MORE."""
         while True:
             value = self._element()
             if value is MORE or type(value) is _Open:
@@ -271,6 +243,9 @@ class LargeReader:
         self._start += 2
         value, self._large = self._large, None
         return value
+
+
+ReplyReader = SmallReader | LargeReader
 
 
 def _count(text: bytes) -> int:

@@ -13,8 +13,8 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import AbstractAsyncContextManager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any, cast
 
 import redis.exceptions
@@ -309,8 +309,11 @@ class SentinelTransport(CompositeTransport):
     def states(self, states: States) -> None:
         self._states = self._now.states = states
 
-    def hold(self) -> AbstractAsyncContextManager[Held]:
-        return _Checking(self, self._current())
+    @asynccontextmanager
+    async def hold(self) -> AsyncIterator[Held]:
+        node = self._current()
+        async with node.hold() as held:
+            yield _CheckedConnection(self, node, held)
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         return self
@@ -362,22 +365,13 @@ class _Lookout:
         self._stopped.set()
 
 
-class _Checking:
-    """A held connection whose replies are looked at, too."""
+class _CheckedConnection:
+    """A lent connection whose replies are checked, too."""
 
-    def __init__(self, transport: SentinelTransport, node: Transport) -> None:
+    def __init__(self, transport: SentinelTransport, node: Transport, held: Held) -> None:
         self._transport = transport
         self._node = node
-        self._lent = node.hold()
-        self._held: Held | None = None
-
-    async def __aenter__(self) -> Held:
-        self._held = await self._lent.__aenter__()
-        return self
-
-    async def __aexit__(self, *error: Any) -> bool | None:
-        return await self._lent.__aexit__(*error)
+        self._held = held
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        assert self._held is not None
         return self._transport._checked(self._node, await self._held.roundtrip(commands, bulk=bulk))

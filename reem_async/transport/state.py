@@ -95,36 +95,62 @@ class States:
 
     def changes(self) -> StateChanges:
         """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
-        return self._changes()
+        changes = StateChanges(Last(_KEPT))
+        with self._lock:
+            changes.queue.put(self.last)
+            if self.last.state == "closed":
+                changes.queue.close()
+            self._queues.append(weakref.ref(changes.queue, self._queues.remove))
+        return changes
 
     def call(self, callback: Callable[[StateChange], object]) -> None:
         """Call `callback` with each change from now on; it must not block. What it raises is logged."""
         self._callbacks.append(callback)
 
+    # Callbacks are called without the lock.
+
     def opened(self, address: str, server: str | None) -> None:
         """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so)."""
-        self._opened(address, server)
+        with self._lock:
+            # Per address: another node of a cluster is another process without anything having been restarted.
+            before = self._servers.get(address, server)
+            restarted = before != server and server is not None
+            if server is not None:
+                self._servers[address] = server
+            if restarted or self.last.state not in ("connected", "closed"):
+                self._change("connected", f"the server at {address} was restarted" if restarted else "", restarted)
         self.tell()
 
     def lost(self, reason: Exception) -> bool:
         """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""
-        is_lost = self._lost(reason)
+        with self._lock:
+            if self.last.state in ("connected", "idle") and not isinstance(reason, InterfaceClosed):
+                self._change("lost", str(reason))
+            is_lost = self.last.state == "lost"
         self.tell()
         return is_lost
 
     def answered(self) -> None:
         """Note that the server answers over another connection than the one that was lost."""
-        self._answered()
+        with self._lock:
+            if self.last.state == "lost":
+                self._change("connected", "")
         self.tell()
 
     def retrying(self) -> None:
         """Note that a connection is made again."""
-        self._retrying()
+        with self._lock:
+            if self.last.state in ("connected", "lost"):
+                self._change("reconnecting", self.last.reason)
         self.tell()
 
     def closed(self) -> None:
         """Note the end, which ends all iterators."""
-        self._closed()
+        with self._lock:
+            if self.last.state != "closed":
+                self._change("closed", "")
+            for queue in self._listening():
+                queue.close()
         self.tell()
 
     def tell(self) -> None:
@@ -142,50 +168,6 @@ class States:
                         logger.exception("a callback for changes of the connection raised")
         finally:
             turn.over = True
-
-    # With the lock.
-
-    def _changes(self) -> StateChanges:
-        changes = StateChanges(Last(_KEPT))
-        with self._lock:
-            changes.queue.put(self.last)
-            if self.last.state == "closed":
-                changes.queue.close()
-            self._queues.append(weakref.ref(changes.queue, self._queues.remove))
-        return changes
-
-    def _opened(self, address: str, server: str | None) -> None:
-        with self._lock:
-            # Per address: another node of a cluster is another process without anything having been restarted.
-            before = self._servers.get(address, server)
-            restarted = before != server and server is not None
-            if server is not None:
-                self._servers[address] = server
-            if restarted or self.last.state not in ("connected", "closed"):
-                self._change("connected", f"the server at {address} was restarted" if restarted else "", restarted)
-
-    def _lost(self, reason: Exception) -> bool:
-        with self._lock:
-            if self.last.state in ("connected", "idle") and not isinstance(reason, InterfaceClosed):
-                self._change("lost", str(reason))
-            return self.last.state == "lost"
-
-    def _answered(self) -> None:
-        with self._lock:
-            if self.last.state == "lost":
-                self._change("connected", "")
-
-    def _retrying(self) -> None:
-        with self._lock:
-            if self.last.state in ("connected", "lost"):
-                self._change("reconnecting", self.last.reason)
-
-    def _closed(self) -> None:
-        with self._lock:
-            if self.last.state != "closed":
-                self._change("closed", "")
-            for queue in self._listening():
-                queue.close()
 
     def _next(self, turn: _Turn) -> StateChange | None:
         """Return the next change to report if `turn` has or gets the turn, else None."""

@@ -26,7 +26,7 @@ from ..plan import Command, Reply
 from ..plan.sizes import LARGE
 from .options import is_this_machine
 from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, Reader
+from .parsing import MORE, NOT_THE_PROTOCOL, ReplyReader
 from .text import over_wire
 
 __all__ = ["BUFFER", "Wire", "close_all"]
@@ -94,7 +94,7 @@ class Wire(asyncio.BufferedProtocol):
         plain: The server has no JSON module; what reads documents is sent as what reads their text.
     """
 
-    def __init__(self, timeout: float, reader: Reader) -> None:
+    def __init__(self, timeout: float, reader: ReplyReader) -> None:
         self.on_push: Callable[[list[Any]], None] | None = None
         self.on_lost: Callable[[Wire, Exception], None] | None = None
         self.pace = 0.0
