@@ -8,7 +8,18 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from ..errors import SELF_EXPLANATORY, BadKey, BadType, BadValue, ConnectionLost, MissingKey, MissingTop, ReemError
+from ..errors import (
+    SELF_EXPLANATORY,
+    BadKey,
+    BadType,
+    BadValue,
+    ConnectionLost,
+    MissingKey,
+    MissingTop,
+    NotConnected,
+    PartialWrite,
+    ReemError,
+)
 from ..plan import Plan
 from ..plan.arithmetic import Operation, calculate, compute
 from ..plan.changes import SILENT, Announcement, Change, EncodedAttachment
@@ -108,6 +119,13 @@ def _milliseconds(seconds: float, name: str) -> int:
     if not 0 < seconds <= _LONGEST_EXPIRY:
         raise BadValue(f"{name}: seconds must be positive and at most {_LONGEST_EXPIRY:g}, got {seconds!r}")
     return max(round(seconds * 1000), 1)
+
+
+def _may_have_left(error: BaseException) -> bool:
+    """Return whether a change that raised `error` may have left arrays that the document does not refer to."""
+    if isinstance(error, PartialWrite):  # the server could not be reached to remove them
+        return isinstance(error.__cause__, NotConnected)
+    return not isinstance(error, ReemError) or isinstance(error, ConnectionLost)
 
 
 class DocumentWriter:
@@ -271,7 +289,7 @@ class DocumentWriter:
             except BaseException as error:
                 # Cancelled, interrupted, or without an answer: nobody knows what was applied, and a later change cleans
                 # up.
-                if not isinstance(error, ReemError) or isinstance(error, ConnectionLost):
+                if _may_have_left(error):
                     session.cache.broke_off(document)
                 else:
                     session.cache.forget_numbers(document)
