@@ -25,7 +25,7 @@ from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive, scanned
 from .transport.composite import NewTransport
-from .transport.opening import make_transport
+from .transport.endpoints import make_transport
 from .transport.packing import CommandRecorder
 
 _FRESH = 3.0

@@ -16,11 +16,10 @@ from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Held, document_of
-from .opening import first_answer, open_wire
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .state import States
 from .text import HeldText, Text
-from .wire import BUFFER, Wire, close_all
+from .wire import BUFFER, Wire, close_all, first_answer, open_wire
 
 __all__ = ["AsyncTransport"]
 
@@ -206,7 +205,7 @@ class AsyncTransport:
             return through
         wire = await open_wire(self._options, large=large)
         # Only the server itself says where its socket is, so the first connection always goes to the address.
-        nearby.learn(await first_answer(wire, INFO_SERVER, self._options.address))
+        nearby.learn(await first_answer(wire, INFO_SERVER, self._options))
         try:
             through = await self._through(nearby, large)
         except BaseException:

@@ -24,7 +24,6 @@ from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from . import Held
-from .opening import unanswered
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
@@ -83,7 +82,7 @@ class _Line:
         try:
             self.introduction, *probed = self.exchange([INFO_SERVER] if known else [INFO_SERVER, PROBE])
         except ConnectionLost as error:
-            raise unanswered(options.address, error) from error
+            raise options.unanswered(error) from error
         self.plain = bool(probed) and is_plain(probed[0])
         self._states.opened(options.address, server_run_id([self.introduction]))
         lines.append(weakref.ref(self, lines.remove))

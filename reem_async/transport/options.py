@@ -23,7 +23,16 @@ import redis.asyncio
 import redis.exceptions
 
 from ..concurrency.timeouts import LONGEST, check_timeout
-from ..errors import BadType, BadValue, InsecureConnection, LoginRefused, NotConnected, ReemError, TlsRefused
+from ..errors import (
+    BadType,
+    BadValue,
+    ConnectionLost,
+    InsecureConnection,
+    LoginRefused,
+    NotConnected,
+    ReemError,
+    TlsRefused,
+)
 from ..plan import Command
 from ..plan.replies import refusal
 from .addresses import settings_of
@@ -211,6 +220,14 @@ class Options:
         return NotConnected(
             f"no server answers at {self.address} ({_shown(reason, text)}); start one with `reem up` or with "
             f"compose.yaml, or pass the right address: RedisInterface('redis://host:port'){self._hint(reason)}"
+        )
+
+    def unanswered(self, error: ConnectionLost) -> NotConnected:
+        """Return the error to raise where a new connection broke at its first question: no call had been sent."""
+        reason = str(error).partition("; the call")[0]
+        return NotConnected(
+            f"the server at {self.address} accepted the connection, but the first request failed: {reason}; "
+            "nothing was applied"
         )
 
     def _hint(self, reason: BaseException) -> str:

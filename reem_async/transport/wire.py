@@ -20,16 +20,16 @@ from typing import Any
 import hiredis
 
 from ..concurrency.scheduling import give_way
-from ..concurrency.timeouts import LOOKS, confirmed, moved_last, time_limit, unsent
+from ..concurrency.timeouts import LOOKS, confirmed, moved_last, server_timeout, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
-from .options import is_this_machine
+from .options import Options, is_this_machine
 from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, ReplyReader
-from .text import over_wire
+from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
+from .text import PROBE, is_plain, lists_json, over_wire
 
-__all__ = ["BUFFER", "Wire", "close_all"]
+__all__ = ["BUFFER", "Wire", "close_all", "first_answer", "open_wire"]
 
 _BUSY = 2.5
 """The connection is busy if three reads come within so many times `pace`."""
@@ -428,6 +428,43 @@ class Wire(asyncio.BufferedProtocol):
                 due.done(reason)
         if self.on_lost is not None:
             self.on_lost(self, reason)
+
+
+async def open_wire(options: Options, *, large: bool = False) -> Wire:
+    """Connect, log in, and return the wire; `large` replies are received in place.
+
+    Raises:
+        NotConnected: No server listens there.
+        Refused: The server refused the login.
+    """
+    connection = options.asynchronous_connection()
+    try:
+        async with server_timeout(options.handshake_timeout):
+            await connection.connect()
+    except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
+        await connection.disconnect(nowait=True)
+        raise options.refused(error) from error
+    wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
+    wire.take_over(connection)
+    if not lists_json(connection.handshake_metadata):
+        (reply,) = await first_answer(wire, PROBE, options)
+        wire.plain = is_plain(reply)
+    return wire
+
+
+async def first_answer(wire: Wire, question: Command, options: Options) -> list[Reply]:
+    """Ask something over a new connection; if that does not go well, close it.
+
+    Raises:
+        NotConnected: It broke.
+    """
+    try:
+        return await wire.roundtrip([question])
+    except BaseException as error:
+        await wire.close()
+        if isinstance(error, ConnectionLost):
+            raise options.unanswered(error) from error
+        raise
 
 
 async def close_all(wires: Collection[Wire]) -> None:
