@@ -26,27 +26,12 @@ from .publish import Publisher
 from .store import KeyValueStore
 
 __all__ = [
-    "ROOT_PATH",
-    "ActiveSubscriberKeyAccessor",
-    "KeyAccessor",
-    "NumpyMarshaller",
-    "PublishWriter",
-    "SpecialDatatypeMarshaller",
-    "TolerantKVSVar",
-    "TolerantKVSVarSubkey",
-    "TolerantKeyValueStore",
-    "WriteOnlyKeyAccessor",
-    "append_to_path",
-    "check_valid_key_name",
-    "check_valid_key_name_ext",
-    "copy_dictionary_without_paths",
-    "extract_object",
-    "filter_paths_by_prefix",
-    "insert_into_dictionary",
-    "key_sequence_to_path",
-    "key_sequence_to_path_ext",
-    "path_to_key_sequence",
-]
+    "ROOT_PATH", "ActiveSubscriberKeyAccessor", "KeyAccessor", "NumpyMarshaller", "PublishWriter",
+    "SpecialDatatypeMarshaller", "TolerantKVSVar", "TolerantKVSVarSubkey", "TolerantKeyValueStore",
+    "WriteOnlyKeyAccessor", "append_to_path", "check_valid_key_name", "check_valid_key_name_ext",
+    "copy_dictionary_without_paths", "extract_object", "filter_paths_by_prefix", "insert_into_dictionary",
+    "key_sequence_to_path", "key_sequence_to_path_ext", "path_to_key_sequence",
+]  # fmt: skip
 
 # --- other names of what there still is
 

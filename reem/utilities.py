@@ -14,20 +14,10 @@ from .legacy import (
     key_sequence_to_path,
     key_sequence_to_path_ext,
     path_to_key_sequence,
-)
+)  # fmt: skip
 
 __all__ = [
-    "ROOT_PATH",
-    "ROOT_VALUE_SEQUENCE",
-    "SEPARATOR_CHARACTER",
-    "append_to_path",
-    "check_valid_key_name",
-    "check_valid_key_name_ext",
-    "copy_dictionary_without_paths",
-    "extract_object",
-    "filter_paths_by_prefix",
-    "insert_into_dictionary",
-    "key_sequence_to_path",
-    "key_sequence_to_path_ext",
-    "path_to_key_sequence",
-]
+    "ROOT_PATH", "ROOT_VALUE_SEQUENCE", "SEPARATOR_CHARACTER", "append_to_path", "check_valid_key_name",
+    "check_valid_key_name_ext", "copy_dictionary_without_paths", "extract_object", "filter_paths_by_prefix",
+    "insert_into_dictionary", "key_sequence_to_path", "key_sequence_to_path_ext", "path_to_key_sequence",
+]  # fmt: skip
