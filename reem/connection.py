@@ -202,8 +202,8 @@ class RedisInterface:
         local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
             through shared memory, where that can be had; the server has every update all the same, and whatever goes
             wrong on the way, the subscriber fetches it there. "off": always from the server. "early": what this
-            interface publishes is told to subscribers near by before the server has it (`update.early`); if the
-            server never gets it, they are told what is there, with `gap`. See docs/guarantees.md.
+            interface publishes is delivered on this host before the server has it (`update.early`); if the
+            server never gets it, subscribers get what is there, with `gap`. See docs/guarantees.md.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`

@@ -24,7 +24,7 @@ __all__ = ["Mirror"]
 
 @documented_by(core.Mirror)
 class Mirror(Following):
-    """A local copy of a place in the store that follows every change, published or only stored, by whomever.
+    """A local copy of a place in the store that follows every change by any client, published or only stored.
 
     `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the

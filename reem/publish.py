@@ -14,7 +14,7 @@ __all__ = ["PublishSpace", "Publisher"]
 
 
 class PublishSpace(KeyValueStore):
-    """A store that can only be written, and whose subscribers are told of every change.
+    """A store that can only be written, and notifies subscribers of every change.
 
     Written like a `KeyValueStore`. A change and its notice are one transaction; a small value
     travels in the notice, a large one is announced and subscribers fetch the newest.
@@ -28,7 +28,7 @@ class PublishSpace(KeyValueStore):
       Of more than 256 MB of values, in all, the oldest of a key go first, and are counted.
 
     Nothing is applied twice: an update that was under way when the connection broke was applied or not, is not sent
-    again, and counts as dropped. Subscribers are told of updates that were dropped as of any that was lost, by `gap`
+    again, and counts as dropped. Dropped updates are reported to subscribers as any lost one is, by `gap`
     and `missed`. `append`, `extend` and arithmetic depend on what is there, so they raise in an outage whatever is
     said; where the server is back they come behind what is kept. What the server refuses is logged and counted, and
     closing the interface drops what is still kept. The beginning and the end of an outage are logged ("reem.publish").

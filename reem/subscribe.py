@@ -98,7 +98,7 @@ class PatternWatch(Watch):
     """Follows all keys that some patterns name and yields their changes: an iterator.
 
     What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
-    only stored, by whomever; keys that come to be, and those that go (`deleted`). A key that is only stored is found
+    only stored, by any client; new keys, and keys that go (`deleted`). A key that is only stored is found
     within a second of its making.
 
     Args:
@@ -128,7 +128,7 @@ class SilentSubscriber(Following):
         channel: The path to follow, such as "foo" or "foo.bar".
         interface: The server: a RedisInterface, or what it takes as host.
         policy: What an iteration keeps for a loop that is slower than the updates.
-        stored: Follow what is only stored, too, whoever stores it.
+        stored: Follow plain writes too, by any client.
     """
 
     def __init__(
@@ -199,7 +199,7 @@ class CallbackSubscriber(SilentSubscriber):
         callback_function: The function.
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
-        stored: Call for what is only stored, too, whoever stores it.
+        stored: Call for plain writes too, by any client.
     """
 
     def __init__(

@@ -39,7 +39,7 @@ class PatternWatch(Stream[Update]):
     """Follows all keys that some patterns name and yields their changes: an async iterator.
 
     What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
-    only stored, by whomever; keys that come to be, and those that go (`deleted`). A key that is only stored is found
+    only stored, by any client; new keys, and keys that go (`deleted`). A key that is only stored is found
     within a second of its making. `update.data` is all that is at the key, or at the path below it that the pattern
     spells out: of `imu.temp` what is at `imu.temp`, of `robot1.*` all of `robot1`.
 

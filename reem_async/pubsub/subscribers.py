@@ -166,7 +166,7 @@ class SilentSubscriber(Following):
         channel: The path to follow, such as "foo" or "foo.bar".
         interface: The server: a RedisInterface, or what it takes as host.
         policy: What an iteration keeps for a loop that is slower than the updates.
-        stored: Follow what is only stored, too, whoever stores it.
+        stored: Follow plain writes too, by any client.
     """
 
     def __init__(
@@ -316,7 +316,7 @@ class CallbackSubscriber(SilentSubscriber):
         callback_function: A plain function (then it must not block) or a coroutine function.
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
-        stored: Call for what is only stored, too, whoever stores it.
+        stored: Call for plain writes too, by any client.
     """
 
     def __init__(

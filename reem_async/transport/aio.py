@@ -135,7 +135,7 @@ class AsyncTransport:
         if opening is None:
             opening = self._opening[bulk] = self._tasks.start(self._open_lane(bulk), "reem connect")
             opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # all may have gone away
-        # A cancelled caller does not take the connection from the others who wait for it.
+        # A cancelled caller does not take the connection from the others.
         return await asyncio.shield(opening)
 
     async def _open_lane(self, bulk: bool) -> Wire:

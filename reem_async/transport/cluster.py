@@ -204,7 +204,7 @@ class ClusterTransport(CompositeTransport):
     # The layout.
 
     async def look(self, suspects: Collection[Address] = ()) -> None:
-        """Ask a node who has which slots, unless that was just done; the `suspects` only if no other answers.
+        """Ask a node for the layout of the slots, unless that was just done; the `suspects` only if no other answers.
 
         Two nodes are asked in any case, more only within the call's time limit: the next look begins with the others.
 
