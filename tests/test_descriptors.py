@@ -7,6 +7,7 @@ import dataclasses
 import gc
 import os
 import pickle
+import select
 
 import pytest
 
@@ -68,7 +69,7 @@ def test_a_number_that_is_another_file_by_then_is_neither_written_nor_closed(tmp
     if kind == "segment" and reason_against():
         pytest.skip(reason_against())
     owner = wakeups() if kind == "wakeups" else Segment(1000)
-    number = owner._descriptor.number if kind == "wakeups" else owner.descriptor
+    number = owner._write.number if kind == "wakeups" else owner.descriptor
     with open(tmp_path / "file", "w+b") as file:
         os.dup2(file.fileno(), number)
         if kind == "wakeups":
@@ -79,3 +80,23 @@ def test_a_number_that_is_another_file_by_then_is_neither_written_nor_closed(tmp
         os.close(number)
         file.seek(0)
         assert file.read() == b"mine"
+
+
+@pytest.mark.parametrize("kind", ["wakeups", "epoll"])
+def test_numbers_that_are_those_of_another_watch_or_an_epoll_by_then_are_not_closed(kind):
+    """A daemon's next watch, or event loop, often gets the number."""
+    owner = wakeups()
+    ends = [owner._read.number, owner._write.number]
+    for number in ends:
+        os.close(number)
+    others = [wakeups()] if kind == "wakeups" else [select.epoll(), select.epoll()]
+    owner.put(None)
+    del owner
+    gc.collect()
+    if kind == "wakeups":
+        assert [others[0]._read.number, others[0]._write.number] == ends
+        others[0].put(None)
+        others[0].get()
+    else:
+        assert [other.fileno() for other in others] == ends
+        assert [other.poll(0) for other in others] == [[], []]

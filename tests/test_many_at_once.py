@@ -102,6 +102,17 @@ async def test_a_silent_server_is_given_up_by_a_busy_event_loop_too():
         server.close()
 
 
+async def test_callers_that_wait_for_a_connection_learn_that_none_can_be_made(key):
+    """At once, and not 32 of them in each time limit."""
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel takes connections for it
+        interface = reem_async.RedisInterface(f"redis://127.0.0.1:{silent.getsockname()[1]}")
+        accessor, began = reem_async.KeyValueStore(interface)[key()], time.monotonic()
+        results = await asyncio.gather(*(accessor["n"].multiply(2) for _ in range(MANY)), return_exceptions=True)
+        assert {type(result) for result in results} == {NotConnected}
+        assert time.monotonic() - began < 5
+        await interface.close()
+
+
 def test_a_server_that_takes_no_more_clients_says_so():
     with own_server() as server, reem.RedisInterface(server.url), server.admin() as admin:
         admin.config_set("maxclients", admin.info("clients")["connected_clients"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import queue
-import sys
 from typing import NoReturn
 
 __all__ = ["Descriptor", "Wakeups", "wakeups"]
@@ -43,32 +42,34 @@ class Descriptor:
             os.close(self.number)
 
 
-class EventDescriptor:
-    """Wakeups that the kernel counts, in one file descriptor.
+class Pipe:
+    """Wakeups that are bytes in a pipe.
 
     The thread that is woken may get the processor at once, while the other one is still waking it. That one lets go
     of the interpreter to write to a descriptor; a lock it would release with the interpreter in its hands, for which
     the woken thread would have to wait again.
+
+    An eventfd would do with one descriptor, but fstat does not tell it from another eventfd, or from an epoll.
     """
 
     def __init__(self) -> None:
-        self._descriptor = Descriptor(os.eventfd(0, os.EFD_CLOEXEC | os.EFD_SEMAPHORE))
+        self._read, self._write = map(Descriptor, os.pipe())
 
     def put(self, wakeup: None) -> None:
-        if self._descriptor.is_own:
-            os.write(self._descriptor.number, (1).to_bytes(8, sys.byteorder))
+        if self._write.is_own:
+            os.write(self._write.number, b"\0")
 
     def get(self) -> None:
-        os.read(self._descriptor.number, 8)
+        os.read(self._read.number, 1)
 
 
-Wakeups = EventDescriptor | queue.SimpleQueue[None]
+Wakeups = Pipe | queue.SimpleQueue[None]
 """Each wakeup that is put wakes one thread that gets one."""
 
 
 def wakeups() -> Wakeups:
     """Return the wakeups that wake fastest here."""
     try:
-        return EventDescriptor()
-    except (AttributeError, OSError):  # not Linux; or no descriptor is left
+        return Pipe()
+    except OSError:  # no descriptor is left
         return queue.SimpleQueue()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from ..concurrency.locks import Locks
 from ..concurrency.tasks import Tasks
 from ..concurrency.timeouts import time_limit
-from ..errors import ConnectionLost, InterfaceClosed, ReemError, WrongLoop
+from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Held, document_of
@@ -58,6 +59,7 @@ class AsyncTransport:
         self._spare: list[Wire] = []
         self._lendable = asyncio.Semaphore(_LENT)
         self._borrowers = 0  # callers that have a lent connection or wait for one
+        self._failed_attempt: tuple[float, NotConnected] | None = None  # the last one for a lent connection, and when
         self._open: set[Wire] = set()
         # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
         self._leaving: set[Wire] = set()
@@ -271,23 +273,24 @@ class AsyncTransport:
     async def hold(self) -> AsyncIterator[Held]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled.
 
-        A caller that finds 32 lent waits for one. It must not hold another one.
+        A caller that finds 32 lent waits for one. It must not hold another one. If an attempt to connect fails
+        meanwhile, that is its answer too: 1,500 callers would have to wait for 47 time limits of the same server.
         """
         self.check()
-        lendable = self._lendable
+        lendable, asked = self._lendable, time.monotonic()
         self._borrowers += 1
         try:
-            async with lendable, self._one_more() as held:
+            async with lendable, self._one_more(asked) as held:
                 yield held
         finally:
             if self._lendable is lendable:
                 self._borrowers -= 1
 
     @asynccontextmanager
-    async def _one_more(self) -> AsyncIterator[Held]:
+    async def _one_more(self, asked: float) -> AsyncIterator[Held]:
         while self._spare and not self._spare[-1].alive:
             self._spare.pop()
-        wire = self._spare.pop() if self._spare else await self._opened()
+        wire = self._spare.pop() if self._spare else await self._opened_to_lend(asked)
         lent = _Lent(self, wire)
         try:
             # It may have watched keys, and is not asked to forget them after an error: it is closed.
@@ -304,6 +307,16 @@ class AsyncTransport:
             self._spare.append(wire)
         else:
             await wire.close()
+
+    async def _opened_to_lend(self, asked: float) -> Wire:
+        if self._failed_attempt is not None and self._failed_attempt[0] >= asked:
+            error = self._failed_attempt[1]
+            raise type(error)(*error.args) from error
+        try:
+            return await self._opened()
+        except NotConnected as error:
+            self._failed_attempt = time.monotonic(), error
+            raise
 
     async def _close_idle(self, wire: Wire) -> None:
         with contextlib.suppress(ReemError):
