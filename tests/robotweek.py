@@ -276,6 +276,8 @@ class Week:
             return []  # it has just been started
         found = []
         for name in SMALL:
+            if any(isinstance(each, np.ndarray) for each in (truth[name] or {}).values()):
+                continue  # an outage came before it was deleted again
             for when in ({}, {"at": time.time() - 0.1}):
                 where = f"{address[0]}view/{name}"
                 answer = httpx.get(where, params={"format": "json", **when}, timeout=PATIENCE, trust_env=False)
