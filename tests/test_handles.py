@@ -87,7 +87,7 @@ def test_a_slice_says_to_read_the_whole_first(kvs, akvs_handle, key):
     """Of arrays and lists, where a user of numpy types it."""
     for handle in (kvs[key()]["n"], akvs_handle):
         for wrong in (np.s_[0:1], np.s_[0, 1]):
-            with pytest.raises(BadType, match=r"\.n: one item is reached by its index.*; read the whole first"):
+            with pytest.raises(BadType, match=r"\.n: an index names one item.*; read the whole first"):
                 handle[wrong]
 
 

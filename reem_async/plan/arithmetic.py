@@ -1,9 +1,9 @@
 """Plans that calculate on the server: one atomic command, checked against Python's arithmetic.
 
-RedisJSON wraps integers around without a word when they leave 64 bits. So the server calculates only
-where the number was seen to be far from that; everything else is read, calculated here and written
-back under WATCH. Still the old value is read in the same transaction and the result compared with
-what it has to be: somebody else may have made the number large, and then the old one is put back.
+RedisJSON wraps integers around silently when they leave 64 bits. So the server calculates only if the number was seen
+to be far from that; else the number is read, calculated here, and written back under WATCH. Another client may have
+made the number large in between, so the transaction also reads the old value, and the result is compared with Python's;
+if it is wrong, it is corrected.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 """The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
 
 _FAR = 2**62
-"""Results that ought to be below this are left to the server."""
+"""The server calculates results that should be below this."""
 
 
 def calculate(
@@ -52,14 +52,14 @@ def calculate(
     """
 
     def attempt(known: Any) -> Plan:
-        # A number seen here a moment ago says how near the ends of 64 bits the result will be. It is only a guess: the
-        # transaction reads the number before and after, so whatever somebody else made of it meanwhile shows.
+        # A number seen before tells how near the ends of 64 bits the result will be. It is only a guess: the
+        # transaction reads the number before and after.
         if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
             return computed()
         return _on_server(keys, path, command, operation, operand, text, announcement, cache, computed)
 
     def computed() -> Plan:
-        # If others were faster, the number that was seen is such a guess, and nobody can be faster than the server.
+        # If another client wrote in between, the number that was read is such a guess for the next attempt.
         return compute(keys, path, lambda number: operation(number, operand), announcement, cache, attempt)
 
     return attempt(cache.number(keys.document, path))
@@ -76,7 +76,7 @@ def _on_server(
     cache: ShapeCache,
     computed: Callable[[], Plan],
 ) -> Plan:
-    """Plan to have the server calculate; what it does in another way than Python is `computed`, or put right."""
+    """Plan to let the server calculate; a result that differs from Python's is `computed` again, or corrected."""
     place = to_jsonpath(path)
     commands = [
         get_command(keys, path),
@@ -89,17 +89,16 @@ def _on_server(
         old = _number(present(replies[0], keys, path), keys, path)
         if replies[1] == [None]:  # a float that is stored as text
             return computed()
-        # So RedisJSON calls a float that would be infinite; it has left the old value.
+        # RedisJSON's message for an infinite result; the old value stays.
         if isinstance(replies[1], Exception) and "not a number" in str(replies[1]):
             raise _overflow(keys, path, old)
         checked(replies[1], keys, path)
         text = present(replies[2], keys, path)
         new, due = loads(text, keys)[0], operation(old, operand)
-        # The types as well: to whoever reads them 2 and 2.0 are different values.
         if type(new) is type(due) and new == due:
             cache.saw_number(keys.document, path, new)
             return new
-        return _put_right(keys, path, text, old, due, announcement)
+        return _corrected(keys, path, text, old, due, announcement)
 
     return Plan(commands, decode, atomic=True)
 
@@ -112,16 +111,17 @@ def compute(
     cache: ShapeCache,
     otherwise: Callable[[Any], Plan] | None = None,
 ) -> Plan:
-    """Plan to replace the number at `path` by `function` of it; again if somebody else was faster.
+    """Plan to replace the number at `path` by `function` of it, again if another client wrote in between.
 
-    Then `otherwise`, if it is given, is told the number that was seen, and says what is next.
+    Then `otherwise`, if given, makes the next plan from the number that was read.
     """
 
     def look(replies: Sequence[Reply]) -> Any:
         permitted(replies[0], keys.document)
         old = _number(present(replies[1], keys, path), keys, path)
-        # Refused here, so that nothing is sent that the server would wrap around.
-        new = _in_range(function(old), keys, path, old)
+        new = function(old)
+        if not _fits(new):
+            raise _overflow(keys, path, old)
         place = from_front(replies[2:], keys, path, MissingKey)
         return _guarded(keys, place, new, announcement, lambda: again(old), lambda: finish(new))
 
@@ -135,22 +135,22 @@ def compute(
     return Plan([("WATCH", keys.document), get_command(keys, path), *lengths(keys, path)], look, held=True)
 
 
-def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, announcement: Announcement) -> Plan:
+def _corrected(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, announcement: Announcement) -> Plan:
     """Plan to replace a wrapped result by the right one, or by the old value if that is out of range."""
     fits = _fits(due)
 
     def look(replies: Sequence[Reply]) -> Any:
         permitted(replies[0], keys.document)
-        # Another value by now: its writer may have calculated with the wrong one, or replaced it. Nobody can tell.
+        # Another value by now: its writer may have calculated with the wrong one, or replaced it.
         if present(replies[1], keys, path) != wrong:
             raise Overflow(
                 f"{show(full(keys, path))}: the result left the range of 64 bits and was wrapped around by the server; "
-                "somebody else changed it before it could be put right: write it again"
+                "another client changed it before it could be corrected: write it again"
             )
         return _guarded(keys, path, due if fits else old, announcement, again, finish, unfinished)
 
     def again() -> Plan:
-        return _put_right(keys, path, wrong, old, due, announcement)
+        return _corrected(keys, path, wrong, old, due, announcement)
 
     def finish() -> Any:
         if not fits:
@@ -160,7 +160,7 @@ def _put_right(keys: Keys, path: Path, wrong: bytes, old: Any, due: Any, announc
     def unfinished(error: Exception) -> PartialWrite:
         return PartialWrite(
             f"{show(full(keys, path))}: the result left the range of 64 bits, was wrapped around by the server, and "
-            f"could not be put right: {error}; write it again (it was {old!r})"
+            f"could not be corrected: {error}; write it again (it was {old!r})"
         )
 
     return Plan([("WATCH", keys.document), get_command(keys, path)], look, held=True, unfinished=unfinished)
@@ -175,7 +175,7 @@ def _guarded(
     then: Callable[[], Any],
     unfinished: Callable[[Exception], Exception] | None = None,
 ) -> Plan:
-    """Plan to set a number on the watched connection; `again` is what to do if somebody else was faster."""
+    """Plan to set a number on the watched connection; `again` makes the next plan if the document has changed."""
     text = encode(value, full(keys, path), lambda _: None, lambda _: "").text
     commands = [("JSON.SET", keys.document, to_jsonpath(path), text), *announcement.commands(path)]
 
@@ -203,12 +203,6 @@ def _number(text: bytes, keys: Keys, path: Path) -> Any:
 
 def _fits(number: Any) -> bool:
     return math.isfinite(number) if isinstance(number, float) else _LOWEST <= number <= _HIGHEST
-
-
-def _in_range(number: Any, keys: Keys, path: Path, old: Any) -> Any:
-    if not _fits(number):
-        raise _overflow(keys, path, old)
-    return number
 
 
 def _overflow(keys: Keys, path: Path, old: Any) -> Overflow:

@@ -1,16 +1,17 @@
-"""Ships' keys after a change: those that nothing refers to any more, and what became of the change itself.
+"""Attachments after a change: remove those that the document does not refer to, and judge the change itself.
 
-Whatever is refused after the document was written is a `PartialWrite`, never an error that means that nothing was.
+If the server refuses something after the document was written, the error is a `PartialWrite`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from ..errors import BadKey, MissingKey, PartialWrite, PathRefused, WrongKind
 from . import Command, Plan, Reply, blamed
-from .changes import REFUSED, Change
+from .changes import REFUSED, DocumentChange
 from .keys import Keys
 from .paths import Path, below, may_hold, parse_suffix, show
 from .placeholders import find
@@ -19,45 +20,37 @@ from .replies import checked, diagnose, explained, full, loads, registered
 from .shapes import ShapeCache
 from .sizes import Staged
 
-# Ships' keys that the document does not refer to: finding them under WATCH, and removing them.
-
-
-# What an array begins with (the .npy format): so one is recognised that no registry names any more.
+# An array begins with this (the .npy format): so one that no registry names any more is recognised.
 _ARRAY = b"\x93NUMPY"
 
 
 def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
-    """Return the command after which a transaction fails if document or registry, or what is coming, has changed."""
+    """Return the WATCH of document, registry and staged values."""
     return ("WATCH", keys.document, keys.registry, *(each.name for each in coming))
 
 
 def permitted(reply: Reply, *names: str) -> None:
-    """Raise what a reply to the WATCH of `names` means if it is an error: nothing would be watched."""
+    """Raise the error if the server refused the WATCH of `names`."""
     if isinstance(reply, Exception):
         raise blamed(reply, ("WATCH", " ".join(names)))
 
 
 def survey(keys: Keys, path: Path) -> tuple[Command, ...]:
-    """Return the commands that `unreferred` takes the replies of."""
+    """Return the commands whose replies `unreferred` reads."""
     return get_command(keys, ()), get_command(keys, path), ("SMEMBERS", keys.registry)
 
 
 def unreferred(replies: Sequence[Reply], keys: Keys) -> tuple[bytes, ...] | None:
-    """Return the suffixes that nothing refers to once what is at the surveyed path is replaced.
-
-    None if the user may not read: then nobody knows.
-    """
+    """Return the suffixes that nothing refers to once the surveyed path is replaced; None if the user may not read."""
     whole, part, members = replies
     if isinstance(whole, Exception) or isinstance(part, Exception):
         return None
-    # A suffix that stands both inside and outside of the part cannot be: `find` refuses a document that names one
-    # twice.
+    # No suffix is both inside and outside of the part: `find` refuses a document that names one twice.
     kept = _referred(whole, keys) - _referred(part, keys)
     return tuple(sorted(registered(members, keys) - kept))
 
 
 def _referred(text: Reply, keys: Keys) -> set[bytes]:
-    """Return the suffixes that a reply to JSON.GET refers to."""
     if text is None or text == b"[]":
         return set()
     return {slot.placeholder.suffix.encode() for slot in find(loads(text, keys), keys.name)}
@@ -66,17 +59,16 @@ def _referred(text: Reply, keys: Keys) -> set[bytes]:
 def clean(
     keys: Keys, cache: ShapeCache, then: Callable[[], Any], unfinished: Callable[[Exception], Exception] | None = None
 ) -> Plan:
-    """Plan to remove the ships' keys that the document does not refer to, then go on with `then`.
+    """Plan to remove the attachments that the document does not refer to, then go on with `then`.
 
-    Looks and removes under WATCH: if anybody writes to the document in between, it looks again.
-    `unfinished` makes the error to raise from the one that kept it from that.
+    Under WATCH: if another client writes to the document in between, it starts again. `unfinished` is that of `Plan`.
     """
 
     def look(replies: Sequence[Reply]) -> Any:
         permitted(replies[0], keys.document, keys.registry)
         text = replies[1]
         if isinstance(text, Exception):
-            if not isinstance(explained(text, keys, ()), WrongKind):  # nobody knows what the document refers to
+            if not isinstance(explained(text, keys, ()), WrongKind):  # so what the document refers to is unknown
                 return Plan([("UNWATCH",)], lambda _: then(), held=True)
             text = None  # a foreign type refers to nothing
         members = registered(replies[2], keys)
@@ -90,8 +82,7 @@ def clean(
         return Plan(removal, lambda replies: remove(replies, left), atomic=True, held=True, unfinished=unfinished)
 
     def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
-        # Somebody wrote to the document since the look: what it refers to may be something else now.
-        if replies is None:
+        if replies is None:  # the document was changed in between
             return clean(keys, cache, then, unfinished)
         cache.saw_members(keys.document, left)
         return then()
@@ -101,7 +92,7 @@ def clean(
 
 
 def place_of(member: bytes) -> Path:
-    """Return where a member of the registry belongs; what REEM did not enter there belongs to no place."""
+    """Return the path of a member of the registry; a foreign member is at no place."""
     try:
         return parse_suffix(member.decode())
     except (BadKey, UnicodeDecodeError):
@@ -109,19 +100,19 @@ def place_of(member: bytes) -> Path:
 
 
 def left_behind(known: Iterable[bytes], path: Path, written: Collection[bytes]) -> list[bytes]:
-    """Return the known keys that belong at `path`, which leads through no list, and are not written there again."""
+    """Return the known attachments at `path`, which leads through no list, that are not written there again."""
     return [member for member in known if member not in written and below(place_of(member), path)]
 
 
 def orphans(keys: Keys, found: Sequence[bytes]) -> Plan:
-    """Plan to find the ships' keys of one top-level key that its document does not refer to; the result is suffixes.
+    """Plan to find the attachments of one top-level key that its document does not refer to; the result is suffixes.
 
-    One transaction. They are left behind where a document expires, or is deleted or renamed by a program without REEM.
-    Only keys that the registry names, or that hold an array, are taken for ships' keys.
+    One transaction. They are left behind if a document expires, or is deleted or renamed by a program without REEM.
+    Only keys that the registry names, or that hold an array, count as attachments.
 
     Args:
         keys: The top-level key.
-        found: The suffixes of the Redis keys that carry its tag, as a look through all keys has found them.
+        found: The suffixes of the Redis keys that carry its tag, found by SCAN.
 
     Raises (in decode):
         BadData, RedisError: Document or registry cannot be read, so it is not known what belongs to the key.
@@ -132,8 +123,7 @@ def orphans(keys: Keys, found: Sequence[bytes]) -> Plan:
 def remove_orphans(keys: Keys, found: Sequence[bytes], cache: ShapeCache) -> Plan:
     """Plan to remove what `orphans` finds; the result is what was removed.
 
-    Two round trips under WATCH, again if another client writes to the key in between: what a document refers to is
-    never removed.
+    Two round trips under WATCH, again if another client writes to the key in between.
     """
 
     def look(replies: Sequence[Reply]) -> Any:
@@ -172,46 +162,31 @@ def _orphans(replies: Sequence[Reply], keys: Keys, found: Sequence[bytes]) -> li
     return sorted((members | arrays) - _referred(text, keys))
 
 
-# What became of a change: its result, or the next plan, which puts things right and then says so.
-#
-# Whatever is refused after the document was written is a `PartialWrite`, never an error that means that nothing was.
+@dataclass(slots=True)
+class ChangeOutcome:
+    """The outcome of a change: its result, or the next plan, which cleans up and then returns the result."""
 
-
-class Outcome:
-    """What became of a change.
-
-    Args:
-        it: The change.
-        cache: What is known of the server.
-        commands: What was sent for it.
-        replies: One for each of them.
-        main: The place of the command that changes the document.
-    """
-
-    __slots__ = ("cache", "commands", "it", "main", "refusal", "replies")
-
-    def __init__(
-        self, it: Change, cache: ShapeCache, commands: Sequence[Command], replies: Sequence[Reply], main: int
-    ) -> None:
-        self.it = it
-        self.cache = cache
-        self.commands = commands
-        self.replies = replies
-        self.main = main
-        self.refusal: PathRefused | None = None  # in the server's words
+    it: DocumentChange
+    cache: ShapeCache
+    commands: Sequence[Command]
+    replies: Sequence[Reply]
+    main: int  # the position of the command that changes the document
+    refusal: PathRefused | None = None  # in the server's words
 
     def next(self) -> Any:
         """Return the result, or the next plan; raise what the replies mean."""
         members = self._members()
         judged = self._judged()
-        # The notice went out in the same transaction as the command, before anybody knew that it would be refused.
+        # The notice went out in the same transaction as the command that was refused.
         refused = judged is REFUSED or isinstance(judged, Exception)
-        if refused and (told := self.it.announcement.retract(self.it.path)):
-            return Plan(told, lambda _: self._settle(members, judged), atomic=True, unfinished=self._untold)
+        if refused and (correction := self.it.announcement.retract(self.it.path)):
+            return Plan(
+                correction, lambda _: self._settle(members, judged), atomic=True, unfinished=self._not_retracted
+            )
         return self._settle(members, judged)
 
     def _members(self) -> frozenset[bytes]:
-        """Return what the registry held right after the change, as far as the server tells."""
+        """Return what the registry held right after the change; nothing if the user may not read it."""
         # In the order in which `writes._change` sends: the command, SADD if there are attachments, then SMEMBERS.
         reply = self.replies[self.main + (2 if self.it.attachments else 1)]
         if isinstance(reply, Exception):
@@ -226,7 +201,7 @@ class Outcome:
         reply = self.replies[self.main]
         if isinstance(reply, Exception):
             error = explained(reply, self.it.keys, self.it.path)
-            # The server says of every item that it cannot set that its index is out of range, also where no list is.
+            # The server calls every item that it cannot set out of range, also where there is no list.
             if type(error) is not PathRefused:
                 return error
             self.refusal = error
@@ -235,8 +210,7 @@ class Outcome:
             judged = self.it.judge(reply)
         except Exception as error:
             return error
-        # The command itself went well. Another one of the transaction failed: servers go on with the rest, and undo
-        # nothing.
+        # Servers execute the rest of a transaction when one command fails, and undo nothing.
         refused = [pair for pair in zip(self.commands, self.replies, strict=True) if isinstance(pair[1], Exception)]
         return self._partial(*refused[0]) if refused and judged is not REFUSED else judged
 
@@ -250,11 +224,11 @@ class Outcome:
         if members and self.cache.was_broken_off(self.it.keys.document):
             return True
         if judged is REFUSED or isinstance(judged, Exception):
-            # Of nothing that was not there to be deleted, or appended to, there can be leftovers of a broken call.
+            # A deletion of nothing may have found leftovers of an interrupted call.
             return bool(self.it.attachments) or (isinstance(judged, MissingKey) and not self.it.path and bool(members))
         if not members or not self.it.replaces or self.it.gone is not None:
             return False
-        # A key below the path that this change did not write: another program put it there, and the cache did not know.
+        # An attachment below the path that this change did not write: another client has stored it in between.
         written = {each.suffix.encode() for each in self.it.attachments}
         return any(member not in written and may_hold(self.it.path, place_of(member)) for member in members)
 
@@ -280,16 +254,13 @@ class Outcome:
     def _left(self, judged: Any, error: Exception) -> PartialWrite:
         what = "the document was written"
         if judged is REFUSED or isinstance(judged, Exception):
-            what = (
-                f"the document was not written ({judged})" if judged is not REFUSED else "the document was not written"
-            )
+            what = "the document was not written" + (f" ({judged})" if judged is not REFUSED else "")
         return PartialWrite(
             f"{self._where}: {what}, but arrays that nothing refers to could not be removed: {error}; "
             "they stay, unseen, until the next write there"
         )
 
-    def _untold(self, error: Exception) -> PartialWrite:
+    def _not_retracted(self, error: Exception) -> PartialWrite:
         return PartialWrite(
-            f"{self._where}: it was refused, but subscribers were told of it, and could not be told otherwise: "
-            f"{error}; write again"
+            f"{self._where}: refused after subscribers were notified, and the correction failed: {error}; write again"
         )

@@ -1,4 +1,4 @@
-"""A change of one document as a value: what is done, what goes by ship, and what tells subscribers."""
+"""A change of one document as a value: the command, its attachments, and its announcement to subscribers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .keys import Keys
 from .paths import Path
 
 REFUSED = object()
-"""Judging a reply: the server did nothing and did not say why."""
+"""Result of `DocumentChange.judge`: the server did nothing and gave no reason."""
 
 
 class EncodedAttachment(NamedTuple):
@@ -21,7 +21,7 @@ class EncodedAttachment(NamedTuple):
         suffix: The key's name after the tag.
         label: The ship's label.
         commands: What stores it.
-        blob: Its bytes in pieces, where the ship works that way: they can travel in a notice.
+        blob: Its bytes in pieces, if the ship is a `BlobShip`: a notice can carry them.
     """
 
     suffix: str
@@ -31,59 +31,57 @@ class EncodedAttachment(NamedTuple):
 
 
 class Announcement:
-    """What notifies subscribers of one change, in the transaction that makes it. This one notifies no one.
+    """Notifies subscribers of one change, in the transaction that makes it. This one does nothing.
 
-    Its number is reserved before the change is planned, so that planning uses up nothing.
+    The number is reserved before the change is planned, so that planning uses up no number.
     """
 
     __slots__ = ()
 
     def commands(self, path: Path) -> Sequence[Command]:
-        """Return the commands that announce a change at `path`, under a number of their own."""
+        """Return the commands that announce a change at `path`."""
         return ()
 
     def unsent(self) -> None:
-        """Note that the last commands were not sent: their number is free for the next ones."""
+        """Note that the last commands were not sent: the next ones use their number."""
 
     def retract(self, path: Path) -> Sequence[Command]:
-        """Return what announces that the server has refused the change after all; nothing if that shows by itself."""
+        """Return the commands that correct the announcement of a change which the server refused."""
         return ()
 
     async def share(self, path: Path) -> None:
-        """Put a large value that is about to be set where subscribers of the same host find it.
+        """Put a large value that is about to be set into shared memory.
 
         Raises:
-            NotConnected: The server is out of reach; nothing was set.
+            NotConnected: The server cannot be reached; nothing was set.
         """
 
     def release(self) -> None:
-        """Give back a number that was not used: nothing is to come any more of the change."""
+        """Give back a number that was not used; the change is over."""
 
     def not_applied(self) -> None:
-        """Note that the change was sent and not applied: its number is free from now on."""
+        """Note that the change was sent and not applied: its number is free."""
 
 
 SILENT = Announcement()
 
 
-class Change(NamedTuple):
+class DocumentChange(NamedTuple):
     """One change of a document.
 
     Attributes:
         keys: The document's names.
-        path: What is changed, below the top-level key. Where it counts from the end of a list, that list is watched.
-        command: The JSON command that does it.
+        path: The place, below the top-level key. Where it counts from the end of a list, the document is watched.
+        command: The JSON command.
         judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
-        attachments: What goes by ship.
-        replaces: Whether what was at `path` is gone afterwards.
-        gone: The suffixes of those that it replaces, if this is known for certain: the document is watched.
-        announcement: What notifies subscribers.
-        absent: What to raise if a list on the way has no such item from its end.
+        attachments: The values that ships store.
+        replaces: Whether the old value at `path` is gone afterwards.
+        gone: The suffixes of the attachments that it replaces, known since the document is watched: they are removed
+            in the transaction. None: unknown, so those left over are found in the registry and removed afterwards.
+        announcement: Notifies subscribers.
+        absent: The error if a list on the path has no such item from its end.
     """
 
-    # What becomes of ships' keys that the change leaves without a placeholder:
-    #   gone is None    the registry comes back in the same transaction, and what is too much is removed after it
-    #   gone is known   the document is watched, so exactly these are removed in the transaction
     keys: Keys
     path: Path
     command: Command

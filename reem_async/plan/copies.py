@@ -1,4 +1,4 @@
-"""What a notice means to a local copy of one path."""
+"""How updates change a local copy of one path, and which updates a read value contains."""
 
 from __future__ import annotations
 
@@ -11,44 +11,35 @@ from .trees import MISSING, get, removed, replaced
 
 
 class AnnouncedChange(Protocol):
-    """As much of an update as tells what it touches."""
+    @property
+    def path(self) -> Path: ...
 
     @property
-    def path(self) -> Path:
-        """Where it was made."""
-
-    @property
-    def deleted(self) -> bool:
-        """What was there is gone."""
+    def deleted(self) -> bool: ...
 
 
 def concerns(notice: AnnouncedChange, followed: Path) -> bool:
-    """Return whether an update may change what is at the followed path."""
+    """Return whether an update may change the value at the followed path."""
     for position, (theirs, ours) in enumerate(zip(notice.path, followed, strict=False)):
         if theirs == ours:
             continue
         if not isinstance(theirs, int) or not isinstance(ours, int):
             return False
-        # Another item of the same list: the same one if we count from the end, and moved if that one is gone.
+        # Another item of the same list: it may be the same one if ours counts from the end, and a deletion moves ours.
         return ours < 0 or (notice.deleted and position == len(notice.path) - 1)
     return True
 
 
 def is_whole(notice: Notice, followed: Path, tree: Any) -> bool:
-    """Return whether the notice alone tells what is now at the followed path, given what was there."""
+    """Return whether the notice and the old `tree` suffice to know the new value at the followed path."""
     if notice.path[: len(followed)] != followed[: len(notice.path)]:
         return False
-    if notice.deleted:  # deleting an item moves the next one to its place
-        return len(notice.path) > len(followed) or not _deletes_item(notice)
+    if notice.deleted:  # deleting an item of a list moves the next one to its place
+        return len(notice.path) > len(followed) or not (notice.path and isinstance(notice.path[-1], int))
     if notice.value is ANNOUNCED:
         return False
-    # The server may have refused it for want of a parent; where there was something, there is a parent.
+    # The server may have refused it because the parent is missing; where a value was, there is a parent.
     return not notice.path or len(notice.path) > len(followed) or tree is not MISSING
-
-
-def _deletes_item(notice: Notice) -> bool:
-    """Return whether an item of a list was deleted, so that those after it have moved."""
-    return bool(notice.path) and isinstance(notice.path[-1], int)
 
 
 def applied(tree: Any, notice: Notice, followed: Path) -> Any:
@@ -59,10 +50,8 @@ def applied(tree: Any, notice: Notice, followed: Path) -> Any:
     return removed(tree, inner) if notice.deleted else replaced(tree, inner, notice.value)
 
 
-# What a value that was read from the server tells of the updates that announced it.
-#
-# A large update is only announced. Who wants its value reads it a little later, and finds what is there by then. The
-# transaction that reads also reads `{foo}:last`, publisher and number of the last update that is in what was read. All
+# A large update is only announced. A subscriber reads its value a little later, when newer updates may have changed it.
+# The transaction that reads also reads `{foo}:last`: publisher and number of the last update that is in the value. All
 # updates of a top-level key come in one order, so this note draws a line through them:
 #
 #       updates, in their order                      read: {image, n: 1, state: "done"}, and the note "p 2"
@@ -72,28 +61,27 @@ def applied(tree: Any, notice: Notice, followed: Path) -> Any:
 #     . . . . . . . . . . . . . . . . . . . . . . . . . . . . . . . . . . .  the line
 #       p 3   cam.n = 5                              with its value         and none of these
 #
-# What was read is the value of p 1 only if no update between p 1 and the line touched its place. Here p 2 did: the
-# "raw" that p 1 wrote is nowhere any more. So p 1 is skipped, and counted; it is never told with a value that it did
-# not have, nor p 2 before it. What is left of p 1 depends on where it was touched:
+# The value read is that of p 1 only if no update between p 1 and the line touched its place. Here p 2 did: the "raw"
+# of p 1 is lost. So p 1 is skipped and counted; it is never delivered with a value that it did not have. What is left
+# of p 1 depends on the place that the later update touched:
 #
-#     at its place, or at one that holds it    nothing: the later update has replaced it
-#     inside of it, on a way through dicts     all but what was touched: {image, n: 1}. With it, and then p 2, a copy
-#                                              is what the server had after p 2
-#     inside of a list                         items may have moved, and deleting one twice deletes two. The list is
-#                                              left out too; as it was read, it is what the last update inside it led to
+#     the same place, or one that holds it    nothing: the later update has replaced it
+#     inside of it, through dicts only        all but that place: {image, n: 1}. With it, and then p 2, a copy equals
+#                                             the server's document after p 2
+#     inside of a list in it                  items may have moved, and deleting one twice deletes two. The list is
+#                                             left out too; the list that was read is that of the last update inside it
 #
-# What comes behind the line is applied to what was read, as to any other copy. If the note names an update that nobody
-# here has heard of although all from before the read have been heard, then updates were lost, and nothing is known of
-# the others: they are skipped, and the key is read again.
+# Updates behind the line are applied to the value read, as to any copy. If the note names an update that did not
+# arrive although all from before the read have arrived, updates were lost: the others are skipped, and the key is read
+# again.
 
 
 class Rest(NamedTuple):
     """What is left of an update that later ones have touched.
 
     Attributes:
-        value: What it wrote, without what was touched; MISSING if nothing is left.
-        lists: Which lists (full paths) have to be taken as they were read, and behind which of the later
-            updates, by its place among them.
+        value: Its value without the places that were touched; MISSING if nothing is left.
+        lists: The lists (full paths) to take from the value read, and the position of the later update behind which.
     """
 
     value: Any
@@ -101,12 +89,12 @@ class Rest(NamedTuple):
 
 
 def is_own(path: Path, later: Iterable[AnnouncedChange]) -> bool:
-    """Return whether what was read at `path` is what an update wrote there, `later` ones being in it too."""
+    """Return whether the value read at `path` is still that of an update, though it has the `later` ones too."""
     return not any(concerns(each, path) for each in later)
 
 
 def rest_of(value: Any, path: Path, later: Sequence[AnnouncedChange]) -> Rest:
-    """Return what is left of an update of `path`, given what was read there and the `later` ones that are in it."""
+    """Return what is left of an update of `path`, given the `value` read there, which has the `later` ones too."""
     lists: dict[Path, int] = {}
     for each in later:
         if not concerns(each, path):

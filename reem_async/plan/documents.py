@@ -1,9 +1,8 @@
-"""Python value -> JSON text and parcels for the ships; anything that cannot be stored is refused here.
+"""Encode Python values as JSON text and attachments; refuse what cannot be stored.
 
-The fast way is one pass of orjson and a few searches at memory speed for what orjson would change
-without a word: NaN becomes null, UUIDs and enums become strings, long floats lose their last bit on
-the server. Only where one of these may be present does a Python walk look at every node, decide
-exactly, and name the path of what it refuses.
+The fast way is one pass of orjson and a few searches at memory speed for what orjson would change silently: NaN
+becomes null, UUIDs and enums become strings, long floats lose their last bit on the server. Only if one of these may be
+present, a walk in Python visits every node, decides exactly, and names the path of what it refuses.
 """
 
 from __future__ import annotations
@@ -29,28 +28,20 @@ DEEPEST = 100
 """Levels of nesting a document may have; RedisJSON parses up to 127."""
 
 PLAIN_ARRAYS = frozenset({np.ndarray, np.memmap, np.matrix, np.recarray})
-"""Array classes that hold their items and nothing else. Others may have a unit or a mask, which would be lost."""
+"""Array classes that hold only items. Others may have a unit or a mask, which would be lost."""
 
 _MANY = 32
-"""Floats in a list from which converting them together pays."""
+"""Floats in a list from which converting them together is faster."""
 
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"{}[]"))
 
 _PLAIN: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__index__, float: float.__float__}
-"""How to get at what a subclass holds; its own __str__ and the like may say something else."""
+"""Get the plain value of an instance of a subclass, whose own __str__ and the like may return something else."""
 
-# orjson makes text of dataclasses and datetimes unless it is told to leave them to us; they are refused, or go by ship.
+# By default orjson writes dataclasses and datetimes as text; here they are refused, or a ship carries them.
 _OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
 # RedisJSON stores signed integers of 64 bits, and unsigned ones above them; orjson writes just these.
 _LOWEST, _HIGHEST = -(2**63), 2**64 - 1
-
-
-class Fits(Protocol):
-    """Chooses the ship for a value that is not JSON, or None, and describes the attachment."""
-
-    def __call__(self, value: Any, /) -> Carrier | None:
-        """Return the ship for `value`."""
-        ...
 
 
 class Carrier(Protocol):
@@ -59,8 +50,12 @@ class Carrier(Protocol):
     label: str
 
     def describe(self, value: Any, /) -> tuple[int, str]:
-        """Return bytes and a summary; raises BadType or BadValue for what it cannot carry."""
+        """Return bytes and a summary; raises BadType or BadValue."""
         ...
+
+
+Fits = Callable[[Any], Carrier | None]
+"""Returns the ship for a value that is not JSON, or None."""
 
 
 class Attachment(NamedTuple):
@@ -72,36 +67,29 @@ class Attachment(NamedTuple):
     size: int
 
 
-class Encoded(NamedTuple):
-    """A value ready to be sent: the document's text and what goes by ship."""
-
+class EncodedValue(NamedTuple):
     text: bytes
     attachments: tuple[Attachment, ...] = ()
 
 
-def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> Encoded:
-    """Return `value` as it will be stored at `place`.
+def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> EncodedValue:
+    """Encode `value` for the full path `place`.
 
     Args:
-        value: What to store.
-        place: The full path, top-level key first; for messages, and it counts for the depth.
+        value: The value.
+        place: Top-level key first; for messages, and it counts for the depth.
         fits: Chooses ships.
-        name: Turns a path below `place` into the name of a ship's key.
+        name: Turns a path below `place` into the suffix of an attachment's key.
 
     Raises:
-        BadType, BadValue, BadKey, TooDeep: What cannot be stored, with its path and what to do.
+        BadType, BadValue, BadKey, TooDeep: It cannot be stored; with the path and what to do.
     """
     text = plain(value, len(place) - 1)
-    return Encoded(text) if text is not None else walk(value, place, fits, name)
+    return EncodedValue(text) if text is not None else walk(value, place, fits, name)
 
 
 def plain(value: Any, above: int) -> bytes | None:
-    """Return `value` as JSON if it is known to stay what it is that way; else None: `walk` through it.
-
-    Args:
-        value: What to store.
-        above: Levels that there are above it in its document.
-    """
+    """Return `value`, with `above` levels above it in its document, as JSON; None if only a `walk` can encode it."""
     try:
         text = orjson.dumps(value, option=_OPTIONS)
     except TypeError:
@@ -114,7 +102,7 @@ def number_text(value: float, place: Path) -> bytes:
 
     Raises:
         BadType: Not an int or float.
-        BadValue: NaN, infinite, out of range, or a float that no text carries.
+        BadValue: NaN, infinite, out of range, or a float without an exact text.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -129,10 +117,8 @@ def number_text(value: float, place: Path) -> bytes:
 
 
 def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
-    """Return whether the text may differ from the value in meaning; False is certain.
-
-    Each search begins with one byte, which is found at memory speed: most documents lack it.
-    """
+    """Return whether the text may differ from the value in meaning; False is certain."""
+    # Each search begins with one byte, which is found at memory speed: most documents lack it.
     return (
         (b"$" in text and placeholders.marked(text))
         or ((b"." in text or b"-" in text or b"+" in text) and may_lose(text))
@@ -148,7 +134,7 @@ def nested_over(text: bytes, value: Any, limit: int) -> bool:
     if text.find(b"{", 1) < 0 and text.find(b"[", 1) < 0:
         return limit < 1
     before, after = text[: len(text) // 2], text[len(text) // 2 :]
-    # At no place of the one half more is open than was opened in it, of the other than will be closed in it.
+    # In the first half no more are open than were opened in it, in the second no more than are closed in it.
     if _up_to(limit, before, b"{", b"[") and _up_to(limit, after, b"}", b"]"):
         return False
     brackets = text.translate(None, _NOT_BRACKETS)
@@ -157,12 +143,12 @@ def nested_over(text: bytes, value: Any, limit: int) -> bool:
         if len(stripped) == len(brackets):
             break
         brackets = stripped
-    # What is left are very deep levels, or brackets inside of strings.
+    # The rest are very deep levels, or brackets inside of strings.
     return bool(brackets) and _levels(value, limit) > limit
 
 
 def _up_to(limit: int, text: bytes, one: bytes, other: bytes) -> bool:
-    """Return whether two bytes occur no more than `limit` times together; replacing finds them at memory speed."""
+    """Return whether two bytes occur no more than `limit` times together; `replace` finds them at memory speed."""
     left = limit - len(text) + len(text.replace(one, b"", limit + 1))
     return left >= 0 and len(text) - len(text.replace(other, b"", left + 1)) <= left
 
@@ -170,9 +156,8 @@ def _up_to(limit: int, text: bytes, one: bytes, other: bytes) -> bool:
 def _may_be_converted(text: bytes, value: Any) -> bool:
     """Return whether orjson may have converted something.
 
-    marshal (whose output is only looked at) is the one C-speed walk of the standard library that
-    refuses UUIDs, enums and subclasses, which orjson turns into something else without being asked. It
-    writes what is not finite, of which orjson makes `null`, with 7f or ff as its last byte.
+    marshal is the one walk at C speed in the standard library that refuses UUIDs, enums and subclasses, which orjson
+    converts silently. It writes NaN and infinity, which become `null` in JSON, with 7f or ff as the last byte.
     """
     try:
         dumped = marshal.dumps(value)
@@ -182,35 +167,32 @@ def _may_be_converted(text: bytes, value: Any) -> bool:
 
 
 def _levels(value: Any, limit: int) -> int:
-    """Return how deep containers are nested, looking at containers only; stops past the limit."""
+    """Return how deep containers are nested; stops past the limit."""
     level, depth = [value] if isinstance(value, dict | list | tuple) else [], 0
     while level and depth <= limit:
         depth += 1
-        level = [item for each in level for item in _items(each) if isinstance(item, dict | list | tuple)]
+        items = [each.values() if isinstance(each, dict) else each for each in level]
+        level = [item for each in items for item in each if isinstance(item, dict | list | tuple)]
     return depth
-
-
-def _items(container: Any) -> Iterable[Any]:
-    return container.values() if isinstance(container, dict) else container
 
 
 def walk(
     value: Any, place: Path, fits: Fits, name: Callable[[Path], str], claimed: frozenset[type] = frozenset()
-) -> Encoded:
-    """Do as `encode`, with a look at every node; values of the types `claimed` are offered to ships first."""
+) -> EncodedValue:
+    """Encode as `encode` does, visiting every node; values of the types `claimed` are offered to ships first."""
     walker = _AskingWalker(place, fits, name, claimed) if claimed else _Walker(place, fits, name)
     tree = walker.convert(value, ())
-    return Encoded(orjson.dumps(tree), tuple(walker.attachments))
+    return EncodedValue(orjson.dumps(tree), tuple(walker.attachments))
 
 
 class _Walker:
-    """Turns a value into a tree orjson writes without surprises, collecting parcels."""
+    """Turns a value into a tree that orjson writes exactly, and collects attachments."""
 
     def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str]) -> None:
         self._place = place
         self._fits = fits
         self._name = name
-        self._open: set[int] = set()  # containers being visited: meeting one again is a circle
+        self._open: set[int] = set()  # ids of the containers around the current node: one of them inside is a circle
         self.attachments: list[Attachment] = []
 
     def convert(self, value: Any, path: Path) -> Any:
@@ -251,7 +233,7 @@ class _Walker:
         return result
 
     def _list(self, value: Sequence[Any], path: Path) -> Any:
-        # Scans and trajectories are such lists: converted together they take a third of the time.
+        # Scans and trajectories are such lists; converting the floats together takes a third of the time.
         if len(value) >= _MANY and set(map(type, value)) == {float}:
             for index, item in enumerate(value):
                 if not math.isfinite(item):
@@ -278,11 +260,11 @@ class _Walker:
         return str.__str__(key)
 
     def _other(self, value: Any, path: Path) -> Any:
-        # Ships come before subclasses: whoever wrote one for a subclass of dict wants it to be used.
+        # Ships come before subclasses: a ship for a subclass of dict is meant to be used.
         ship = self._fits(value)
         if ship is not None:
             return self._parcel(ship, value, path)
-        # An enum that is a str or a number besides is stored as that.
+        # An enum that is also a str or a number is stored as that.
         if isinstance(value, enum.Enum) and not isinstance(value, str | int | float):
             raise self._refusal(value, path)
         if isinstance(value, np.generic):
@@ -316,7 +298,6 @@ class _Walker:
                 f"{show(self._place + path)}: {shorten(value)} is a long double, which differs between machines; "
                 f"use {use}"
             )
-        # datetime64 has no equal among Python's plain types.
         if type(plain) not in (bool, int, float, str) or isinstance(value, np.datetime64 | np.timedelta64):
             raise BadType(
                 f"{show(self._place + path)}: the numpy scalar {shorten(value)} has no plain Python equal; "
@@ -333,7 +314,7 @@ class _Walker:
 
 
 class _AskingWalker(_Walker):
-    """Offers what JSON could hold to ships before it becomes JSON."""
+    """Offers values of the claimed types, which JSON could hold, to ships first."""
 
     def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str], claimed: frozenset[type]) -> None:
         super().__init__(place, fits, name)
@@ -360,8 +341,7 @@ _LIBRARIES = {
 
 
 def _remedy(value: Any) -> str:
-    """Return what to do with a value that cannot be stored."""
-    # Imported here: a program whose values can all be stored does not wait for them.
+    # Imported here, since they take time and only refusals need them.
     import dataclasses
     import numbers
     import pathlib

@@ -1,10 +1,9 @@
 """Decimal text for floats that RedisJSON reads back bit for bit.
 
-RedisJSON parses numbers the quick way: it collects up to 64 bits of digits, then multiplies or
-divides once by a power of ten. That is off by one unit in the last place for one long decimal in
-nine. Since the procedure is known, digits and exponent can be chosen so that its one rounding lands
-on the wanted float (and so that a correctly rounding parser lands there too). For about two floats
-in a thousand no such text exists; those are stored in hexadecimal, see `documents`.
+RedisJSON parses numbers quickly: it collects up to 64 bits of digits, then multiplies or divides once by a power of
+ten. That is off by one unit in the last place for one long decimal in nine. Since the procedure is known, digits and
+exponent can be chosen so that its one rounding gives the wanted float, and so does a correctly rounding parser. For
+about two floats in a thousand no such text exists; those are stored in hexadecimal, see `placeholders`.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ import numpy as np
 _POWERS = tuple(float(f"1e{k}") for k in range(309))
 _POWERS_ARRAY = np.array(_POWERS[:23])
 _EXACT_PLACES = 22
-"""The largest power of ten that is a float itself: up to there any sound parser reads the same."""
+"""The largest power of ten that is a float itself: up to there all parsers agree."""
 _LIMIT = 2**64
 _LOG2_OF_10 = math.log2(10.0)
 
-# Up to 15 significant digits with a small exponent are parsed exactly. These find what may be longer;
-# both begin with a literal character, which the regular expression engine looks for at memory speed.
+# Up to 15 significant digits with a small exponent are parsed exactly. These find longer ones. Both begin with a
+# literal character, which the regular expression engine finds at memory speed.
 _LONG = re.compile(rb"\.(?:\d{6}|(?<=\d{10}\.)\d)")
 _EXPONENT = re.compile(rb"e[-+]\d")
 
@@ -84,7 +83,6 @@ def _rare_text(value: float) -> bytes | None:
 
 
 def _shortest(size: float) -> tuple[int, int]:
-    """Return repr(size) as digits and power of ten."""
     mantissa, _, power = repr(size).partition("e")
     whole, _, fraction = mantissa.partition(".")
     return int(whole + fraction), int(power or 0) - len(fraction)
@@ -102,14 +100,14 @@ def _as_parsed(digits: int, exponent: int) -> float:
 
 
 def _search(size: float) -> tuple[int, int] | None:
-    """Return digits and exponent that are parsed to `size`, trying each power of ten that can work."""
+    """Return digits and exponent that are parsed to `size`, trying each possible power of ten."""
     bits = math.frexp(size)[1]
     first = int((53 - bits) / _LOG2_OF_10)
     for places in range(first - 2, first + 6):
         scaled = _scale(size, places)
         if not 1 <= scaled < _LIMIT:
             continue
-        # `_scale` rounds too, so the digits that work may be those beside it.
+        # `_scale` rounds too, so the neighbours are tried as well.
         for near in (scaled, math.nextafter(scaled, 0.0), math.nextafter(scaled, math.inf)):
             digits = int(near)
             if digits < _LIMIT and _as_parsed(digits, -places) == size and float(f"{digits}e{-places}") == size:

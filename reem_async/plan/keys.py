@@ -1,7 +1,6 @@
-"""The names on the server: everything that belongs to one top-level key.
+"""The names on the server of everything that belongs to one top-level key, and plans that list keys.
 
-The braces are Redis Cluster's hash tag: whatever carries the same tag lives on the same node, so
-that one transaction can hold it all.
+The braces are Redis Cluster's hash tag: keys with the same tag are on the same node, so one transaction can hold them.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ class Keys(NamedTuple):
     Attributes:
         name: The key as the user knows it.
         document: The RedisJSON document, namespace included.
-        tag: What every ship's key begins with: `{foo}`.
-        registry: The set of the suffixes of all ships' keys that exist.
+        tag: The beginning of every attachment's key: `{foo}`.
+        registry: The set of the suffixes of all attachments.
         channel: Where notices of updates are published.
-        last: Which notice was published last; kept for a minute.
+        last: The note: publisher and number of the last notice; kept for a minute.
         publish: The command for notices: SPUBLISH in a cluster, where a channel belongs to the key's node.
     """
 
@@ -38,13 +37,11 @@ class Keys(NamedTuple):
 
     @property
     def sharded(self) -> bool:
-        """Whether it is in a cluster."""
         return self.publish == "SPUBLISH"
 
 
 @lru_cache(maxsize=4096)
 def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = False) -> Keys:
-    """Return the server-side names of the top-level key `name`."""
     tag = "{" + namespace + name + "}"
     # Channels are shared by all databases of a server, keys are not.
     channel = f"{tag}:notices" + (f"@{database}" if database else "")
@@ -52,11 +49,8 @@ def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = F
     return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last", publish)
 
 
-# Plans that look through the keys of one server.
-
-
 DOCUMENT = "ReJSON-RL"
-"""What TYPE says of a JSON document."""
+"""The reply of TYPE for a JSON document."""
 
 _PAGE = "1000"
 
@@ -73,11 +67,7 @@ def page(glob: str = "", kind: str = "", cursor: Any = b"0") -> Plan:
 
 
 def first_page(glob: str = "", kind: str = "") -> Plan:
-    """Plan to list the first keys, as `page` does, of a server that is taken for the only one.
-
-    Raises (in decode):
-        ClusterNode: It is one node of several, which have the other keys.
-    """
+    """Plan to list the first keys, as `page` does; its decode raises ClusterNode if the server is one of several."""
 
     def decode(replies: Sequence[Reply]) -> Any:
         standing, found = replies
@@ -95,13 +85,13 @@ def _alone(standing: Reply, found: Reply) -> Reply:
 
 
 def _scan(glob: str, kind: str, cursor: Any) -> Command:
-    # COUNT is how many buckets the server looks through, so a page may be empty though there are more keys.
+    # COUNT is the number of buckets that the server visits, so a page may be empty though there are more keys.
     matching = ("MATCH", glob) if glob else ()
     return ("SCAN", cursor, *matching, "COUNT", _PAGE, *(("TYPE", kind) if kind else ()))
 
 
 def count(database: int) -> Plan:
-    """Plan to ask one server how many keys a database of it holds; the result is None if this user may not ask."""
+    """Plan to count the keys of a database of one server; the result is None if the user may not ask."""
 
     def decode(replies: Sequence[Reply]) -> int | None:
         if isinstance(replies[0], NotAllowed):
@@ -109,7 +99,7 @@ def count(database: int) -> Plan:
         found = re.search(rb"(?m)^db%d:keys=(\d+)" % database, _raised(replies[0]))
         return int(found[1]) if found is not None else 0
 
-    return Plan([("INFO", "keyspace")], decode)  # DBSIZE is a right of its own, which programs do not have
+    return Plan([("INFO", "keyspace")], decode)  # DBSIZE is a right of its own, which deploy/users.acl does not give
 
 
 def _raised(reply: Reply) -> Reply:

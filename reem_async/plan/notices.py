@@ -1,8 +1,8 @@
-"""Notices: what a publisher tells the subscribers of a top-level key about one update.
+"""Notices: the messages that announce one update to the subscribers of a top-level key.
 
-A line of JSON, then, for small updates, the document text and the ships' bytes as they were sent to
-the server: nothing is serialized twice, and a subscriber needs no trip back. Larger updates are only
-announced. What arrives is not trusted: anything unexpected is refused as `BadData`.
+A line of JSON. For small updates the document text and the bytes of attachments follow, as they were sent to the
+server: nothing is serialized twice, and a subscriber needs no round trip. Larger updates are only announced. Notices
+that arrive are not trusted: anything unexpected is refused as `BadData`.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from .placeholders import Unreadable, find, marked
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14
-"""Bytes of value up to which it travels in the notice."""
+"""Bytes of value up to which the notice carries it."""
 
 _DEEPEST = 128
-"""Levels of a document that servers take; path and value together have no more."""
+"""Levels of a document that servers accept; path and value together have no more."""
 _LONGEST_PATH = 2048
-"""Characters; paths are kept for speed, and a stranger may publish any number of them."""
+"""Characters; paths are cached, and a foreign program may publish any number of them."""
 _LONGEST_PUBLISHER = 64
-"""Characters; publishers are kept too."""
+"""Characters; publishers are kept in memory too."""
 _MOST = 1 << 53
-"""No counter gets there, and every program that reads JSON has integers up to it."""
+"""No counter gets there, and every JSON parser has integers up to it."""
 _LATEST = 253_402_300_800
-"""Seconds from 1970 to the year 10000, where calendars end."""
+"""Seconds from 1970 to the year 10000, the last that datetime has."""
 _LARGEST = 1 << 18
-"""Bytes of a notice: far more than one with LARGEST_INLINE bytes of value and the names of its arrays has."""
+"""Bytes of a notice: far more than LARGEST_INLINE bytes of value and the names of its arrays."""
 
 ANNOUNCED = object()
-"""In place of a value that is to be fetched."""
+"""In the place of a value that must be fetched."""
 
 
 class Notice(NamedTuple):
-    """One update, as a subscriber got to know of it.
+    """One update, as a subscriber received it.
 
     Attributes:
-        publisher: Who made it: an id that is unique per interface.
+        publisher: An id that is unique per interface.
         sequence: Counts this publisher's updates of this top-level key, from 1.
         time: Seconds since 1970 on the publisher's clock.
-        path: What was updated, below the top-level key.
-        deleted: It was removed.
+        path: The place that was updated, below the top-level key.
+        deleted: Whether the value was removed.
         value: The value, or ANNOUNCED.
         size: Bytes of the value, document text and arrays; 0 where only the server knows (arithmetic).
-        slot: Where a large value is in the publisher's memory too; None if it is not.
-        early: This was told before the server had the update.
+        slot: The place of a large value in the publisher's shared memory, or None.
+        early: Whether it arrived before the server had the update.
     """
 
     publisher: str
@@ -74,35 +74,34 @@ NOTE_KEPT = 60
 """Seconds for which the note of a last update is kept."""
 
 View = Callable[["Slot", int], "memoryview | None"]
-"""Returns the first bytes of a slot, so many, read-only; None if they are not to be had."""
+"""Returns so many bytes of a slot, read-only; None if the slot cannot be read."""
 
 
 def published(keys: Keys, publisher: str, sequence: int, payload: bytes, *, everywhere: bool = False) -> list[Command]:
-    """Return the commands that publish a notice, and note that it was the last.
+    """Return the commands that publish a notice and store the note that it was the last.
 
-    Of a snapshot that holds this note one can tell which notices it has: those up to this one. It
-    expires, since it only matters while a snapshot is on its way. In a cluster a notice goes to those who
-    know the key; `everywhere` it goes to all nodes besides, for those who look for keys.
+    A value that is read together with the note contains the updates up to this one. The note expires, since it is only
+    needed until a reply with it has arrived. In a cluster a notice goes to subscribers of the key; with `everywhere`
+    also to all nodes, for clients that find keys by pattern.
     """
-    noted: Command = ("SET", keys.last, note_of(publisher, sequence), "EX", str(NOTE_KEPT))
-    told: Command = (keys.publish, keys.channel, payload)
-    return [noted, ("PUBLISH", keys.channel, payload), told] if everywhere else [noted, told]
+    note: Command = ("SET", keys.last, note_of(publisher, sequence), "EX", str(NOTE_KEPT))
+    notice: Command = (keys.publish, keys.channel, payload)
+    return [note, ("PUBLISH", keys.channel, payload), notice] if everywhere else [note, notice]
 
 
 def note_of(publisher: str, sequence: int) -> str:
-    """Return what is noted of a key's last notice."""
     return f"{publisher} {sequence}"
 
 
 def parsed_note(note: Any) -> tuple[str, int]:
-    """Return publisher and number of a note as the server has it, or a number of 0 if it is none."""
+    """Return publisher and number of a note as the server sent it; the number is 0 if it is none."""
     text = bytes(note).decode(errors="replace") if isinstance(note, bytes | bytearray) else ""
     publisher, _, sequence = text.partition(" ")
     return publisher, int(sequence) if sequence.isascii() and sequence.isdigit() and len(sequence) < 19 else 0
 
 
-def told_at(path: Path) -> Path:
-    """Return the place that a change is told at: `path` itself, or the deepest above it if that is too long."""
+def notify_path(path: Path) -> Path:
+    """Return the path to announce a change at: `path`, or its longest beginning that is not too long."""
     room = _LONGEST_PATH
     for depth, key in enumerate(path):
         if isinstance(key, str):
@@ -113,7 +112,6 @@ def told_at(path: Path) -> Path:
 
 
 def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:
-    """Return a notice without the value, which has `size` bytes."""
     return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], size)
 
 
@@ -126,9 +124,9 @@ def in_slot(
     text: bytes,
     attachments: Sequence[EncodedAttachment],
 ) -> bytes:
-    """Return a notice that says where the value is in the publisher's memory; to others it is one without value.
+    """Return a notice with the slot of the value, which subscribers on other hosts ignore.
 
-    So it is to all, if it would be too long: of thousands of arrays.
+    It has no slot if it would be too long, because of thousands of arrays.
     """
     sizes = sizes_of_parts(text, attachments)
     parts: list[Any] = [[*slot, sizes[0]]]
@@ -138,14 +136,14 @@ def in_slot(
 
 
 def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> list[int]:
-    """Return the bytes of what a slot holds of an update: the text of the document, then each attachment."""
+    """Return the bytes of each part in a slot: the text of the document, then each attachment."""
     return [len(text), *(sum([len(piece) for piece in each.blob or ()]) for each in attachments)]
 
 
 def with_value(
     publisher: str, sequence: int, time: float, path: Path, text: bytes, attachments: Sequence[EncodedAttachment]
 ) -> bytes:
-    """Return a notice with the value if it is small and made of bytes, else without."""
+    """Return a notice that carries the value if it is small and made of bytes."""
     size, travels = len(text), True
     for each in attachments:
         size += sum([len(piece) for piece in each.blob or ()])
@@ -165,7 +163,7 @@ def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, p
 
 
 def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
-    """Return the notice in `payload`; its value may be looked at in the publisher's memory, if there is a `view`.
+    """Return the notice in `payload`, with a value in shared memory if there is a `view`.
 
     Raises:
         BadData: Not a notice of REEM, or one of a version this program does not know.
@@ -210,7 +208,6 @@ def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, ki
 
 
 def _path(path: list[Any]) -> Path:
-    """Return the path in a notice; raises BadData for one that nobody can have written to."""
     if not path:
         return ()
     try:
@@ -221,9 +218,9 @@ def _path(path: list[Any]) -> Path:
 
 @lru_cache(maxsize=4096)
 def _sound_path(path: tuple[Any, ...]) -> Path:
-    """Return `path` if something can be there.
+    """Return `path` if a value can be there.
 
-    Of paths that are equal, such as (1,) and (1.0,), only a sound one is remembered: so it is returned for the others.
+    Of equal paths, such as (1,) and (1.0,), only a sound one is cached, and is returned for the others too.
     """
     if len(path) >= _DEEPEST or sum([len(key) for key in path if type(key) is str]) > _LONGEST_PATH:
         raise BadKey("too long")
@@ -234,23 +231,22 @@ def _sound_path(path: tuple[Any, ...]) -> Path:
 
 
 def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships, deepest: int) -> Any:
-    """Return the value a notice carries."""
     position, blobs = start + size, []
     try:
         for _, _, length in parts:
             blobs.append(payload[position : position + length])
             position += len(blobs[-1])
             if len(blobs[-1]) != length:
-                raise BadData(f"of an array of {length} bytes there are {len(blobs[-1])}")
+                raise BadData(f"array truncated: expected {length} bytes, got {len(blobs[-1])}")
         if position != len(payload):
             raise BadData("its parts have other sizes than it says")
         return _rebuilt(payload[start : start + size], parts, blobs, ships, deepest)
-    except Exception as error:  # a ship may raise anything over bytes that are not its own
+    except Exception as error:  # a ship may raise anything over foreign bytes
         raise BadData(f"a notice holds a value that cannot be rebuilt: {error!s:.200}") from None
 
 
 def _value_in(slot: Slot, size: int, parts: list[Any], view: View, ships: Ships, deepest: int) -> Any:
-    """Return the value that is in a slot; ANNOUNCED if it is not to be had there, for whatever reason."""
+    """Return the value in a slot; ANNOUNCED if it cannot be read there."""
     try:
         sizes = [size, *(length for _, _, length in parts)]
         if not all(type(length) is int and 0 <= length < _MOST for length in sizes):
@@ -261,14 +257,14 @@ def _value_in(slot: Slot, size: int, parts: list[Any], view: View, ships: Ships,
             return ANNOUNCED
         blobs = [content[start : start + length] for start, length in zip(begins[1:-1], sizes[1:], strict=True)]
         return _rebuilt(bytes(content[:size]), parts, blobs, ships, deepest)
-    except Exception:  # a stranger's memory: the server has what is true
+    except Exception:  # the memory of another program; the server has the true value
         return ANNOUNCED
 
 
 def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deepest: int) -> Any:
-    """Return the tree, with what the ships make of their fields; raises anything over what is not REEM's.
+    """Return the tree with its attachments; raises anything over foreign bytes.
 
-    It is ANNOUNCED if a ship of this interface has to be awaited, or reads in another way than the publisher's wrote.
+    It is ANNOUNCED if a ship has to be awaited, or reads in another way than the publisher's wrote.
     """
     replies: dict[tuple[str, str], Any] = {}
     for (label, suffix, _), blob in zip(parts, blobs, strict=True):
@@ -287,25 +283,19 @@ def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deep
     return holder[0]
 
 
-# Where the bytes of an update are in shared memory, as its notice says it. Names and arithmetic; no memory here.
-
-
 _ALIGNED = 64
 """Bytes: each part of a slot begins at a multiple, as the data of an .npy file does; numpy is slow on odd addresses."""
 
-_MOST_SLOTS = 1 << 53
-"""As for every number in a notice."""
-
 
 class Slot(NamedTuple):
-    """One place in the shared memory of a publisher.
+    """A slot in the shared memory of a publisher, as a notice names it.
 
     Attributes:
-        host: Which processes can reach it: those of one user in one host, or container, that was not restarted since.
+        host: Identifies the processes that can reach it: one user on one boot of a host or container.
         process: The publisher's process id.
         descriptor: Its file descriptor of the memory.
-        inode: What it must be of: descriptors and process ids are used again.
-        number: Which slot, from 0.
+        inode: The inode of that file: descriptors and process ids are reused.
+        number: The slot's number, from 0.
         stamp: A random number that the slot has as long as it holds these bytes.
     """
 
@@ -318,17 +308,17 @@ class Slot(NamedTuple):
 
 
 def starts(sizes: Iterable[int]) -> list[int]:
-    """Return where parts of these sizes begin in a slot, and where the last one ends."""
+    """Return the offsets of parts of these sizes in a slot, and the end of the last one."""
     sizes = list(sizes)
     begins = list(accumulate((-(-size // _ALIGNED) * _ALIGNED for size in sizes), initial=0))
     return [*begins[:-1], begins[-2] + sizes[-1]] if sizes else [0]
 
 
 def named(words: Any) -> tuple[Slot, int] | None:
-    """Return the slot that a notice names, and the bytes of the text in it; None if these are no such words."""
+    """Return the slot that a notice names, and the bytes of the text in it; None if the words are not valid."""
     if type(words) is not list or len(words) != len(Slot._fields) + 1 or type(words[0]) is not str:
         return None
     numbers: Sequence[Any] = words[1:]
-    if not all(type(number) is int and 0 <= number < _MOST_SLOTS for number in numbers):
+    if not all(type(number) is int and 0 <= number < _MOST for number in numbers):
         return None
     return Slot(*words[:-1]), words[-1]

@@ -1,8 +1,7 @@
 """Paths: where a value lives, as a tuple of keys and indexes.
 
-A path is never handled as text except at three borders: what a user types (`parse`), what a user
-reads in messages (`show`), and what the server is sent (`to_jsonpath`, `suffix`). Comparing paths
-means comparing tuples, so `foo` has nothing to do with `foobar`.
+A path is text at three borders only: what a user types (`parse`), what a user reads in messages (`show`), and what is
+sent to the server (`to_jsonpath`, `suffix`). Elsewhere tuples are compared, so `foo` has nothing to do with `foobar`.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from .keys import keys_of
 Path = tuple[str | int, ...]
 
 LONGEST_TOP_KEY = 512
-"""Bytes that a top-level key may have in UTF-8, the namespace before it included."""
+"""Bytes of UTF-8 in a top-level key and its namespace."""
 
 _LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1
-"""Beyond, RedisJSON panics, and the server ends."""
+"""Beyond, RedisJSON panics and the server exits."""
 _LONGEST_INDEX = 40
 """Characters; Python refuses to read numbers of thousands of digits."""
 
@@ -57,8 +56,8 @@ def check_element(key: object, parent: Path) -> str | int:
         return key if type(key) is str else str.__str__(key)
     if isinstance(key, slice | tuple):
         raise BadType(
-            f"{show(parent)}: one item is reached by its index, not several by {shorten(key)}; read the whole first, "
-            "and take them of that"
+            f"{show(parent)}: an index names one item, not several ({shorten(key)}); read the whole first, and index "
+            "that"
         )
     if isinstance(key, bool) or not hasattr(key, "__index__"):
         raise BadType(
@@ -71,19 +70,13 @@ def check_element(key: object, parent: Path) -> str | int:
 
 
 def check_name(key: object, parent: Path) -> str:
-    """Return `key` if it can be a key of the dict at `parent`; raises BadKey."""
     if not isinstance(key, str):
         raise BadKey(f"{show(parent)}: the keys of a dict are str, not {shorten(key)} ({type(key).__name__})")
     return str(check_element(key, parent))
 
 
 def check_namespace(namespace: object) -> str:
-    """Return `namespace` if it can go before top-level keys, else raise.
-
-    Raises:
-        BadType: Not a str, or one with braces.
-        BadValue: It does not end with a separator, so that it would meet with others, or cannot be sent.
-    """
+    """Return `namespace` if it can go before top-level keys; raises BadType or BadValue."""
     if not isinstance(namespace, str) or "{" in namespace or "}" in namespace:
         raise BadType(f"the namespace {shorten(namespace)} is not a str without braces")
     if not is_namespace(namespace):
@@ -98,12 +91,12 @@ def check_namespace(namespace: object) -> str:
 
 
 def is_namespace(text: str) -> bool:
-    """Return whether `text` may go before keys: it is empty, or ends with a separator, no letter or digit."""
+    """Return whether `text` is empty or ends with a separator: neither letter nor digit."""
     return not text[-1:].isalnum()
 
 
 def check_top_key(key: object, room: int = LONGEST_TOP_KEY) -> str:
-    """Return `key` if it can name a top-level entry and has at most `room` bytes, else raise BadKey."""
+    """Return `key` if it can be a top-level key and has at most `room` bytes, else raise BadKey."""
     if not isinstance(key, str) or isinstance(key, enum.Enum):
         raise BadKey(f"the top-level key {shorten(key)} is not a str; use str(key)")
     key = str.__str__(key)
@@ -126,7 +119,6 @@ def _encodable(text: str) -> bool:
 
 
 def shorten(value: object, limit: int = 60) -> str:
-    """Return repr(value), cut to `limit` characters, for error messages."""
     try:
         text = repr(value)
     except Exception:  # a broken __repr__ must not hide the real error
@@ -136,23 +128,18 @@ def shorten(value: object, limit: int = 60) -> str:
 
 @lru_cache(maxsize=4096)
 def to_jsonpath(path: Path) -> str:
-    """Return the JSONPath below the document's root, every element quoted: `$["a"][0]`.
+    """Return the JSONPath below the document's root, every element quoted: `$["a"][0]`; raises BadKey.
 
-    The server takes what stands between the quotes as it is, so nothing is escaped; what could end the
-    quotes early is refused here too: paths also come from notices, which anybody may have published.
-
-    Raises:
-        BadKey: The server's paths cannot address it.
+    The server knows no escapes between the quotes. Elements are checked here too, since paths also come from notices,
+    which any program may have published.
     """
     return "$" + "".join(_bracket(check_element(key, path[:place])) for place, key in enumerate(path))
 
 
 def _bracket(key: str | int) -> str:
     if isinstance(key, int):
-        # The server takes an index that is too negative for the first item, but not such a slice.
+        # The server reads an index that is too negative as the first item, but not such a slice.
         return f"[{key}]" if key >= -1 else f"[{key}:{key + 1}]"
-    # RedisJSON knows no escapes inside of quotes, so the kind of quotes is chosen by the key; `check_element` refuses
-    # both.
     return f"['{key}']" if '"' in key else f'["{key}"]'
 
 
@@ -169,16 +156,12 @@ def _step(key: str | int) -> str:
 
 
 def parse_suffix(text: str) -> Path:
-    """Return the path that `suffix` turned into `text`; what follows a `~` only makes a name unique.
-
-    Raises:
-        BadKey: Not the text form of a path.
-    """
+    """Return the path that `suffix` turned into `text`, without the unique tail behind `~`; raises BadKey."""
     return _parse_short(text) if len(text) <= _SHORT else _split(text, _TOKEN)
 
 
 def _split(text: str, tokens: re.Pattern[str], added: int = 0) -> Path:
-    """Return the path in `text`, whose first `added` characters its user has not typed."""
+    """Return the path in `text`; the user did not type the first `added` characters."""
     position, path = 0, []
     while position < len(text) and not (tokens is _TOKEN and text[position] == "~"):
         token = tokens.match(text, position)
@@ -190,7 +173,7 @@ def _split(text: str, tokens: re.Pattern[str], added: int = 0) -> Path:
     return tuple(path)
 
 
-# Long texts are not kept: a stranger may have put any number of them on the server.
+# Long texts are not cached: a foreign program may have put any number of them on the server.
 _parse_short = lru_cache(maxsize=4096)(lambda text: _split(text, _TOKEN))
 _SHORT = 512
 
@@ -218,27 +201,20 @@ def parse(text: str) -> Path:
     if not isinstance(text, str):
         raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
     path = parse_shown(text)
-    # Any text may be a top-level key. A path that begins with a dot may be meant from somewhere else.
+    # A top-level key may be any text. A path that begins with a dot has none.
     unchecked = 0 if text.startswith(".") else 1
     return (*path[:unchecked], *(check_element(key, path[:unchecked]) for key in path[unchecked:]))
 
 
 def parse_shown(text: str) -> Path:
-    """Return the path that `show` turned into `text`; it may have keys that the server's paths cannot address.
-
-    Raises:
-        BadKey: Not a path.
-    """
+    """Return the path that `show` turned into `text`, even if the server cannot address it; raises BadKey."""
     if text in ("", "."):
         return ()
     return _split(text, _TYPED) if text[0] in ".[" else _split("." + text, _TYPED, 1)
 
 
 def show(path: Path) -> str:
-    """Return a full path, top-level key first, the way people write it: `foo.bar[0]`.
-
-    A top-level key that would be read as a path is quoted, as others are: `["m.a"].x`.
-    """
+    """Return a full path as text: `foo.bar[0]`, or `["m.a"].x` if a key looks like a path."""
     if not path:
         return "(root)"
     top = str(path[0])
@@ -247,13 +223,12 @@ def show(path: Path) -> str:
 
 @lru_cache(maxsize=4096)
 def counts_from_end(path: Path) -> bool:
-    """Return whether any index is negative."""
     return any(isinstance(key, int) and key < 0 for key in path)
 
 
 @lru_cache(maxsize=4096)
 def has_index(path: Path) -> bool:
-    """Return whether it leads through a list, whose items move when others are deleted."""
+    """Return whether the path leads through a list, whose items move when others are deleted."""
     return any(isinstance(key, int) for key in path)
 
 
@@ -263,9 +238,9 @@ def below(path: Path, ancestor: Path) -> bool:
 
 
 def may_hold(written: Path, member: Path) -> bool:
-    """Return whether a write at `written` may have replaced what was stored when `member` was named.
+    """Return whether a write at `written` may have replaced the attachment `member`.
 
-    Indexes count as equal: deleting from a list moves its items, their names stay.
+    All indexes count as equal: a deletion moves items of a list, while the names of their attachments stay.
     """
     return len(written) <= len(member) and all(
         ours == theirs or (isinstance(ours, int) and isinstance(theirs, int))
@@ -273,24 +248,24 @@ def may_hold(written: Path, member: Path) -> bool:
     )
 
 
-# Patterns: which top-level keys, and which paths below them, somebody wants to hear of or list.
+# Patterns: globs of top-level keys and of paths below them.
 
 
-# The server's globs know sets, [abc], and escapes. What users type has neither: brackets are list indexes there.
+# The server's globs know sets, [abc], and escapes. Those of users have neither: brackets are list indexes there.
 _SPECIAL = re.compile(r"([*?\[\]\\^])")
 _BRACKETS = re.compile(r"([\[\]\\^])")
 _PATTERN_TOKEN = re.compile(rb"\\.|.", re.DOTALL)
 _TAIL = "}:notices"
 _LONGEST_TAIL = len("{}:notices@") + 10
-"""Bytes of a channel beside the key."""
+"""Bytes of a channel without the key."""
 
 
 class Pattern(NamedTuple):
     """A glob over paths, such as `arm`, `cam_*` or `robot.*.battery`.
 
     Attributes:
-        top: The glob for the top-level key: `*` and `?` stand for other characters.
-        rest: Globs for what is below it; empty for all.
+        top: The glob of the top-level key, with `*` and `?`.
+        rest: Globs of the elements below it; empty for all.
     """
 
     top: str
@@ -302,27 +277,22 @@ class Pattern(NamedTuple):
         return _BRACKETS.sub(r"\\\1", self.top)
 
     def concerns(self, path: Path) -> bool:
-        """Return whether a change at the full `path` changes something that the pattern names."""
         return all(_alike(ours, theirs) for ours, theirs in zip((self.top, *self.rest), path, strict=False))
 
 
 def _alike(ours: str | int, theirs: str | int) -> bool:
-    # Most patterns are names spelled out, or "*": both are told without a regular expression.
+    # Most patterns are plain names or "*", which need no regular expression.
     return ours == theirs or ours == "*" or (isinstance(ours, str) and fnmatchcase(str(theirs), _literal(ours)))
 
 
 @lru_cache(maxsize=1024)
 def _literal(glob: str) -> str:
-    """Return a glob in which only `*` and `?` stand for other characters."""
+    """Return a glob for fnmatch in which only `*` and `?` are special."""
     return _BRACKETS.sub(r"[\1]", glob)
 
 
 def parse_pattern(text: str) -> Pattern:
-    """Return the pattern a user typed; `**` at the end may be left out.
-
-    Raises:
-        BadKey: Not a pattern of dotted keys.
-    """
+    """Return the pattern that a user typed, without `**` at its end; raises BadKey."""
     top, *rest = parse(text) or ("*",)
     while rest and rest[-1] == "**":
         rest.pop()
@@ -330,14 +300,13 @@ def parse_pattern(text: str) -> Pattern:
 
 
 def parse_patterns(texts: Sequence[str]) -> list[Pattern]:
-    """Return several patterns; raises BadKey, and BadType for what is no list of them."""
     if isinstance(texts, str | bytes) or not isinstance(texts, Iterable):
         raise BadType(f"patterns={shorten(texts)} is not a list of patterns; use [{shorten(texts)}]")
     return [parse_pattern(text) for text in texts]
 
 
 def spelled_out(rest: Path) -> Path:
-    """Return the beginning of what is below the top of a pattern in which nothing stands for something else."""
+    """Return the beginning of a pattern's `rest` up to the first element with `*` or `?`."""
     for place, key in enumerate(rest):
         if isinstance(key, str) and ("*" in key or "?" in key):
             return rest[:place]
@@ -351,13 +320,13 @@ def escaped(text: str) -> str:
 
 def channel_pattern(pattern: Pattern, namespace: str, database: int) -> bytes:
     """Return the glob pattern of the channels of all top-level keys that a pattern names."""
-    # A stand-in for the key: nothing else in the name of a channel is NUL.
+    # NUL in the key's place: nothing else in the name of a channel is NUL.
     channel = keys_of("\0", namespace="", database=database).channel
     return channel.replace("\0", escaped(namespace) + pattern.glob).encode()
 
 
 def fits(glob: bytes, channel: bytes) -> bool:
-    """Return whether the server finds that `channel` fits its pattern `glob`, of which each `?` is one byte."""
+    """Return whether `channel` fits a pattern of the server, in which `?` is one byte."""
     return _compiled(glob).fullmatch(channel) is not None
 
 
@@ -376,7 +345,7 @@ def name_of(channel: bytes, namespace: str) -> str:
 
 
 def names_key(channel: bytes) -> bool:
-    """Return whether `channel` is that of a key which can be: a pattern brings whatever strangers publish on."""
+    """Return whether `channel` is that of a valid key: a pattern also matches channels of foreign programs."""
     return len(channel) <= LONGEST_TOP_KEY + _LONGEST_TAIL and _names_key(channel)
 
 

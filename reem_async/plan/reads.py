@@ -1,14 +1,14 @@
-"""Plans that read: one command for plain JSON, one transaction where ships hold a part.
+"""Plans that read: one command for plain JSON, one transaction for a document with attachments.
 
-A transaction is what makes document and arrays of one instant. Which arrays to ask for is known
-from the last read; the placeholders in the reply say whether that guess was right. If not, the
-read is done again with what they name: a mixture is never returned.
+The transaction makes document and arrays of one instant. The last read tells which arrays to ask for; the placeholders
+in the reply show whether that guess was right. If not, the read is repeated with those: a mixture is never returned.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Awaitable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -25,28 +25,28 @@ from .shapes import ShapeCache
 from .sizes import LARGE
 from .trees import MISSING
 
-# Reads of a document whose arrays come and go faster than it is read. Each takes a round trip of about 0.1 ms, so 50
-# are far more than any program needs, and no writer keeps a reader for ever.
+# Attempts at a document whose arrays change their places in between. A round trip takes about 0.1 ms, so 50 are far
+# more than any program needs, and no writer blocks a reader for ever.
 _TRIES = 50
 
 HeldValues = Mapping[tuple[str, str], Any]
-"""Values that ships made of attachments, by label and suffix, which are what the server has."""
+"""Values of attachments, by label and suffix, that are equal to those on the server."""
 
 _NOTHING: HeldValues = {}
 
 
 class RawRead(NamedTuple):
-    """What a read brought, ships' replies not yet interpreted.
+    """The result of a read, before ships interpret their replies.
 
     Attributes:
         holder: A list of one: the tree, with placeholders where `slots` says.
         name: The top-level key.
-        slots: Where each ship's value goes, the ship, and the reply to interpret.
-        commands: What was asked in the end, and
-        raw: what was received for it, to tell later whether anything changed.
-        also: The replies to what was asked besides, if it was asked for.
-        left: What stands in the tree for attachments that were left at the server, by label and suffix.
-        unreadable: What stands in the tree for values that could not be read; None if that is an error.
+        slots: Of each attachment, its place in the tree, the ship, and the reply to interpret.
+        commands: The last commands that were sent, and
+        raw: their replies: `exchange` compares with these.
+        also: The replies to the additional commands, if there were any.
+        left: The objects in the tree for attachments that were not fetched, by label and suffix.
+        unreadable: The objects in the tree for values that cannot be read; None if that is an error.
     """
 
     holder: list[Any]
@@ -59,7 +59,7 @@ class RawRead(NamedTuple):
     unreadable: list[Unreadable] | None = None
 
     def give_up(self, slot: PlaceholderSlot, error: Exception) -> Unreadable:
-        """Return what stands for a value that cannot be read; raises the error if the read is to have all values."""
+        """Return an Unreadable; raises the error if the read is not tolerant."""
         if self.unreadable is None:
             raise error
         it = Unreadable(place_of(self.name, slot.placeholder.suffix), str(error))
@@ -68,7 +68,7 @@ class RawRead(NamedTuple):
 
 
 def interpreted(raw_read: RawRead, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
-    """Return what the ship makes of a reply: the value, something for `awaited`, or what `RawRead.give_up` says."""
+    """Return what the ship makes of a reply: the value, something for `awaited`, or an Unreadable."""
     try:
         return interpret(raw_read.name, slot, ship, reply)
     except BadData as error:
@@ -76,7 +76,6 @@ def interpreted(raw_read: RawRead, slot: PlaceholderSlot, ship: Registered, repl
 
 
 async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any]) -> Any:
-    """Return the value that a ship has to be awaited for, or what `RawRead.give_up` says."""
     try:
         return await value
     except Exception as error:
@@ -84,11 +83,6 @@ async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any
 
 
 def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
-    """Return what the ship makes of a reply: the value, or something to await.
-
-    Raises:
-        BadData: With the path, if the ship cannot believe it.
-    """
     try:
         return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
@@ -99,8 +93,7 @@ def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) 
 
 
 def _plain(reply: Reply) -> Reply:
-    """Return a reply as redis-py would: large strings are bytes there, not bytearrays."""
-    # The transport reads large strings into a bytearray, without a copy. Ships of users know redis-py's bytes only.
+    # The transport reads large strings into a bytearray, without a copy. Ships of users expect redis-py's bytes.
     if isinstance(reply, bytearray):
         return bytes(reply)
     if isinstance(reply, list):
@@ -111,7 +104,6 @@ def _plain(reply: Reply) -> Reply:
 
 
 def get_command(keys: Keys, path: Path) -> Command:
-    """Return the command that fetches the JSON at `path`."""
     return ("JSON.GET", keys.document, to_jsonpath(path))
 
 
@@ -126,32 +118,30 @@ def read(
     *,
     tolerant: bool = False,
 ) -> Plan:
-    """Plan to read the value at `path`; the result is `RawRead`, or MissingKey is raised.
+    """Plan to read the value at `path`; the result is a `RawRead`, or MissingKey is raised.
 
-    What is asked `also` is of the same instant, in one transaction; then that nothing is there is no error: the
-    result holds MISSING. One round trip, if the arrays there are those the last read met; else two or more.
+    The commands `also` are executed in the same transaction. With these, a missing value is no error: the result holds
+    MISSING. One round trip, if the arrays are those of the last read; else two or more.
 
-    Attachments that are `held` are not fetched. Which these are is looked at again as the reply is decoded: what has
-    left `held` by then is fetched in another round trip. Attachments of more than `largest` bytes are not fetched:
-    an `Unfetched` is in the tree, the same as in `held` if that has one; their keys are only touched.
+    Attachments in `held` are not fetched. `held` is looked at again when the reply is decoded: an attachment that has
+    left it by then is fetched in another round trip. Attachments of more than `largest` bytes are not fetched either:
+    an `Unfetched` is in the tree, the one in `held` if there is one; their keys are only touched.
 
     A `tolerant` read has an `Unreadable` in the place of each attachment that cannot be read, now or by `interpreted`:
-    it is gone or damaged, its ship is lacking, the user may not read it. Any other read raises BadData or NotAllowed.
+    it is gone or damaged, its ship is missing, the user may not read it. Any other read raises BadData or NotAllowed.
     """
-    # States of a read: without a guess it asks for the document alone, and is done if there are no placeholders in it.
-    # Else `_Fetch` asks for document and arrays in one transaction, until the placeholders are those that were asked
-    # for.
+    # Without a guess, first ask for the document alone; if it has no placeholders, that is all. Else `_Fetch` asks for
+    # document and arrays in one transaction, until the placeholders are those that were asked for.
     known = cache.layout(keys.document, path)
-    # What a ship wrote that is lacking here is an error if it is there still; that a reply says, not a guess.
+    # A missing ship is an error only if the reply still has its placeholder.
     known = tuple([each for each in known if ships.has(each.label) or each.size > largest])
     if known:
-        return _Fetch(keys, path, ships, cache, known, also, held, largest, tolerant=tolerant).plan()
+        return _Fetch(keys, path, ships, cache, known, also, held, largest, tolerant).plan()
 
     command = get_command(keys, path)
 
     def decode(replies: Sequence[Reply]) -> Any:
         text = _found(replies[0], keys, path, bool(also))
-        # Only where a note is asked for besides: a follower wants to know that nothing is there, and as of when.
         if text is None:
             return RawRead([MISSING], keys.name, [], (command,), (None,), tuple(replies[1:]))
         holder = loads(text, keys)
@@ -160,13 +150,13 @@ def read(
         if not slots:
             return RawRead(holder, keys.name, [], (command,), (text,), tuple(replies[1:]), unreadable=unreadable)
         met = tuple(slot.placeholder for slot in slots)
-        return _Fetch(keys, path, ships, cache, met, also, held, largest, tolerant=tolerant).plan()
+        return _Fetch(keys, path, ships, cache, met, also, held, largest, tolerant).plan()
 
     return Plan([command, *also], decode, atomic=bool(also))
 
 
 def _found(reply: Reply, keys: Keys, path: Path, may_lack: bool) -> bytes | None:
-    """Return the text of a reply to JSON.GET; None if nothing is there and that `may` be."""
+    """Return the text of a reply to JSON.GET; None if nothing is there and it `may_lack`."""
     try:
         return present(reply, keys, path)
     except MissingKey:
@@ -176,7 +166,6 @@ def _found(reply: Reply, keys: Keys, path: Path, may_lack: bool) -> bytes | None
 
 
 def present(reply: Reply, keys: Keys, path: Path) -> bytes:
-    """Return the text of a reply to JSON.GET; raise MissingKey if there is nothing."""
     text: bytes | None = reply if type(reply) is bytes else checked(reply, keys, path)
     # nil: there is no document. An empty list: there is one, and nothing at the path.
     if text is None or text == b"[]":
@@ -184,35 +173,21 @@ def present(reply: Reply, keys: Keys, path: Path) -> bytes:
     return text
 
 
+@dataclass(slots=True)
 class _Fetch:
-    """Reads document and ships' keys in one transaction, again if the guess was wrong."""
+    """Reads document and attachments in one transaction, again if the guess was wrong."""
 
-    __slots__ = ("also", "cache", "held", "keys", "largest", "path", "refused", "ships", "tolerant", "tries", "wanted")
-
-    def __init__(
-        self,
-        keys: Keys,
-        path: Path,
-        ships: Ships,
-        cache: ShapeCache,
-        wanted: tuple[Placeholder, ...],
-        also: tuple[Command, ...] = (),
-        held: HeldValues = _NOTHING,
-        largest: float = math.inf,
-        *,
-        tolerant: bool,
-    ) -> None:
-        self.tolerant = tolerant
-        self.refused: dict[tuple[str, str], Exception] = {}  # what the user may not read
-        self.held = held
-        self.largest = largest
-        self.keys = keys
-        self.path = path
-        self.ships = ships
-        self.cache = cache
-        self.wanted = wanted
-        self.also = also
-        self.tries = 0
+    keys: Keys
+    path: Path
+    ships: Ships
+    cache: ShapeCache
+    wanted: tuple[Placeholder, ...]
+    also: tuple[Command, ...]
+    held: HeldValues
+    largest: float
+    tolerant: bool
+    tries: int = 0
+    refused: dict[tuple[str, str], Exception] = field(default_factory=dict)  # attachments that the user may not read
 
     def plan(self) -> Plan:
         where = show(full(self.keys, self.path))
@@ -225,11 +200,10 @@ class _Fetch:
         asked = {(each.label, each.suffix): self.ships.labelled(each.label, where) for each in fetched}
         left = {(each.label, each.suffix) for each in lacking if each.size > self.largest}
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
-        # Read-only, and enough for CLIENT TRACKING: the server tells of changes to keys that were read, whatever the
-        # command.
+        # Enough for CLIENT TRACKING: the server reports changes of keys that any command has read.
         touches = [("TYPE", self.keys.tag + suffix) for _, suffix in left]
         commands = (get_command(self.keys, self.path), *reads, *touches, *self.also)
-        # By the sizes in the placeholders of the last read; a wrong one only chooses the other connection.
+        # By the sizes at the last read; if they are wrong, the other connection is used.
         bulk = sum(each.size for each in fetched) >= LARGE
         return Plan(
             commands,
@@ -240,7 +214,7 @@ class _Fetch:
         )
 
     def _unobtainable(self, it: Placeholder) -> Exception | None:
-        """Return why an attachment is not asked for by a tolerant read; None if it is."""
+        """Return why a tolerant read does not ask for an attachment; None if it does."""
         if not self.tolerant or it.size > self.largest:  # then no ship is needed
             return self.refused.get((it.label, it.suffix))
         if not self.ships.has(it.label):
@@ -248,7 +222,7 @@ class _Fetch:
         return self.refused.get((it.label, it.suffix))
 
     def _without_refused(self, places: list[tuple[str, str]], replies: Sequence[Reply]) -> Plan | None:
-        """Plan to read what the user may read; None if that is not even the document."""
+        """Plan to read the attachments that the user may read; None if the document itself was refused."""
         refused = {place: it for place, it in zip(places, replies[1:], strict=False) if isinstance(it, NotAllowed)}
         if not refused or isinstance(replies[0], Exception):
             return None
@@ -272,19 +246,18 @@ class _Fetch:
         met = tuple(slot.placeholder for slot in slots)
         got = dict(zip(asked, replies[1:], strict=False))
         places = [(each.label, each.suffix) for each in met]
-        # Left at the server: by its size now, which may be another one than when it was asked for.
+        # Not fetched: by its size now, which may have changed since it was asked for.
         touched = {place for place, each in zip(places, met, strict=True) if each.size > self.largest} & (
             left | got.keys()
         )
         errors = {place: self._unobtainable(each) for place, each in zip(places, met, strict=True)}
-        # A placeholder of which nothing was asked: the document was changed since the last read. What came is thrown
-        # away, since arrays of a later instant do not belong to it.
+        # A placeholder that was not asked for: the document has changed since the last read. Start again, since arrays
+        # of a later instant do not belong to it.
         if any(
             place not in got and place not in self.held and place not in touched and errors[place] is None
             for place in places
         ):
             return self._again(met)
-        # Only now: a guess that was wrong must not be remembered.
         self.cache.saw_layout(self.keys.document, self.path, met)
         placed: list[tuple[PlaceholderSlot, Registered, Reply]] = []
         unfetched: dict[tuple[str, str], Unfetched] = {}
@@ -304,10 +277,9 @@ class _Fetch:
         return raw_read
 
     def _strange(self, reply: Reply, suffix: str) -> BadData | None:
-        """Return an error if another type of data is under a ship's key, None if it is a reply for the ship."""
         if not isinstance(reply, Exception):
             return None
-        # A stranger has put a list or a hash under the ship's key; any other error is the server's own.
+        # A foreign program has put a list or a hash under the attachment's key; any other error is the server's own.
         if isinstance(explained(reply, self.keys, self.path), WrongKind):
             where = place_of(self.keys.name, suffix)
             return BadData(f"{where}: what is under {self.keys.tag}{suffix} is not what the ship wrote: {reply}")
@@ -324,7 +296,7 @@ class _Fetch:
 
 
 def exists(keys: Keys) -> Plan:
-    """Plan to find out whether there is a document in one round trip; what REEM did not write is none."""
+    """Plan to find out whether there is a document, not a foreign key, in one round trip."""
 
     def decode(replies: Sequence[Reply]) -> bool:
         try:
@@ -343,7 +315,6 @@ def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
 
     def decode(replies: Sequence[Reply]) -> Any:
         name = type_name(checked(replies[0], keys, path))
-        # JSON.TYPE answers an empty list, or nil, where nothing is.
         if name is None:
             raise missing(keys, path, replies[0])
         return _PYTHON_TYPES.get(name) or Plan([get_command(keys, path)], decode_text)
@@ -394,8 +365,7 @@ def _no_dict(keys: Keys, path: Path) -> WrongType:
 
 
 def nothing(keys: Keys, path: Path, why: MissingKey) -> RawRead:
-    """Return what a read brought that raised `why`."""
-    # What JSON.GET has answered: `exchange` compares it with the reply that it gets under WATCH.
+    """Return the result of a read that raised `why`, with the reply of JSON.GET for `exchange` to compare with."""
     reply = None if isinstance(why, MissingDocument) else b"[]"
     return RawRead([], keys.name, [], (get_command(keys, path),), (reply,))
 
@@ -430,16 +400,13 @@ def length(keys: Keys, path: Path) -> Plan:
 
 
 def entries_command(document: str, place: str) -> Command:
-    """Return the command that tells how many entries a dict has; `count_in` reads its reply.
-
-    JSON.OBJLEN of a key that is not there names the path in its error, at which RedisJSON 2.8 panics, and the
-    server ends, if the path has a character whose code point ends in 00, such as U+4E00. Who asks for the keys
-    in its place gets more than is needed, but never that.
-    """
+    """Return the command for the number of entries of a dict; `count_in` reads its reply."""
+    # JSON.OBJLEN of a missing key names the path in its error. RedisJSON 2.8 panics then, and the server exits, if the
+    # path has a character whose code point ends in 00, such as U+4E00. JSON.OBJKEYS does not.
     return ("JSON.OBJLEN" if place.isascii() else "JSON.OBJKEYS", document, place)
 
 
 def count_in(reply: Reply) -> int | None:
-    """Return the number in a reply to JSON.OBJLEN or JSON.ARRLEN, or of the keys in one to JSON.OBJKEYS; or None."""
+    """Return the number in a reply to JSON.OBJLEN, JSON.ARRLEN or JSON.OBJKEYS; or None."""
     first = reply[0] if isinstance(reply, list) and reply else None
     return len(first) if isinstance(first, list) else first

@@ -34,7 +34,7 @@ from .paths import Path, show, to_jsonpath
 
 _REFUSALS: dict[str, tuple[type[Refused], str]] = {
     "NOAUTH": (LoginRefused, "the server needs a password: RedisInterface(..., username=..., password=...)"),
-    "WRONGPASS": (LoginRefused, "the server does not take this user name and password; nothing was tried again"),
+    "WRONGPASS": (LoginRefused, "the server refused this user name and password; the login was not retried"),
     "NOPERM": (
         NotAllowed,
         "the user may not do this; deploy/users.acl lists the rights REEM needs, `ACL LOG` shows what was refused",
@@ -46,7 +46,7 @@ _REFUSALS: dict[str, tuple[type[Refused], str]] = {
     "READONLY": (ServerReadOnly, "the server is a read-only replica, nothing was written; connect to its primary"),
     "MISCONF": (
         ServerReadOnly,
-        "the server cannot save to its disk and takes no writes, nothing was written; its log says why (disk full?)",
+        "the server cannot save to its disk and refuses writes, nothing was written; its log says why (disk full?)",
     ),
     "NOREPLICAS": (
         ServerReadOnly,
@@ -60,21 +60,21 @@ _REFUSALS: dict[str, tuple[type[Refused], str]] = {
         ServerNotReady,
         "the server is a replica that has lost its primary, nothing was applied; connect to the primary",
     ),
-    "BUSY": (ServerNotReady, "the server is busy with somebody's script, nothing was applied; call again"),
+    "BUSY": (ServerNotReady, "the server is busy with a script, nothing was applied; call again"),
 }
 _NO_JSON = re.compile(r"ERR unknown command [`'\"]?JSON\.", re.IGNORECASE)
-# Characters of a server's own words that are quoted in an error.
+# Characters of a server's message that an error quotes.
 _LONGEST_QUOTE = 120
 _DEEPEST = 130
-"""Levels of a reply: RedisJSON parses documents of up to 127. Deeper ones would end in a RecursionError elsewhere."""
+"""Levels of a reply: RedisJSON parses up to 127. Deeper ones would cause a RecursionError elsewhere."""
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 
 def refusal(text: str) -> Refused | None:
-    """Return the error to raise for an error reply that is about the server, None for one about the command."""
+    """Return the error for an error reply about the server, None for one about the command."""
     if _NO_JSON.match(text):
         return NoJsonSupport(no_json())
-    # So servers begin when they refuse EXEC itself; the reason comes behind.
+    # The beginning of an error of EXEC; the reason follows.
     text = text.removeprefix("EXECABORT Transaction discarded because of: ")
     kind, remedy = _REFUSALS.get(text.partition(" ")[0], (None, ""))
     return kind(f"{remedy} (it says: {text[:_LONGEST_QUOTE]})") if kind is not None else None
@@ -95,8 +95,8 @@ def decoded(plan: Plan, replies: list[Reply]) -> Any:
         return rest
     except (ReemError, RedisError):
         raise
-    # Decoders take the shape of replies for granted. What has another shape comes from no Redis server: something else
-    # listens at the address, or a proxy has mixed up two connections.
+    # Decoders take the shape of replies for granted. Replies of another shape come from another kind of server, or a
+    # proxy has mixed up two connections.
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         commands = ", ".join(str(command[0]) for command in plan.commands)
         raise BadData(
@@ -111,38 +111,32 @@ def full(keys: Keys, path: Path) -> Path:
 
 
 def loads(text: bytes, keys: Keys) -> list[Any]:
-    """Return the list of one value that the server answers to a path in JSON.
-
-    Raises:
-        BadData: Not JSON, not a list of one, or nested deeper than documents are.
-    """
+    """Return the list of one value in a reply to JSON.GET; raises BadData if it is none, or nested too deep."""
     try:
         holder = orjson.loads(text)
     except orjson.JSONDecodeError:
         raise BadData(f"{keys.name}: the server sent {text[:60]!r}, which is not JSON") from None
     if type(holder) is not list or len(holder) != 1:
         raise BadData(f"{keys.name}: the server sent {text[:60]!r} where a list of one value was due")
-    # Whoever gets the value may walk through it by recursion.
+    # The caller may walk through the value by recursion.
     if nested_over(text, holder, _DEEPEST):
         raise BadData(f"{keys.name}: the server sent a value of over {_DEEPEST} levels, which RedisJSON does not hold")
     return holder
 
 
 def checked(reply: Reply, keys: Keys, path: Path) -> Reply:
-    """Return `reply`; raise what it means if it is an error."""
     if isinstance(reply, Exception):
         raise explained(reply, keys, path)
     return reply
 
 
 def explained(error: Exception, keys: Keys, path: Path) -> Exception:
-    """Return the error to raise for an error reply: one that says what to do, or the server's own."""
+    """Return the error to raise for an error reply: one with a remedy, or the server's own."""
     text = str(error)
     where = show(full(keys, path))
-    # About the user's rights or the server's state, not about the path: such an error is given a place to name.
     if isinstance(error, Refused | ClusterReply):
         return turned_down(error).at(where)
-    # RedisJSON has no codes for its errors, so they are told by their words.
+    # RedisJSON's errors have no codes.
     if "wrong Redis type" in text or text.startswith("WRONGTYPE"):
         return WrongKind(keys.document, where)
     if "that doesn't exist" in text:
@@ -155,7 +149,7 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
 
 
 def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
-    """Return what the registry of ships' keys holds, from a reply to SMEMBERS; raises BadData if it is none."""
+    """Return the members of the registry from a reply to SMEMBERS; raises BadData."""
     # The usual case, without building a frozenset. RESP3 has sets, and a reply from EXEC a list.
     if not reply and type(reply) in (list, set):
         return _NO_MEMBERS
@@ -166,7 +160,6 @@ def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
 
 
 def no_json() -> str:
-    """Return what to do about a server whose JSON is not RedisJSON's."""
     return (
         "the server has JSON, but not this command of RedisJSON; use Redis 8 (see compose.yaml), valkey-bundle, a "
         "server without any JSON, or start one with `reem up`"
@@ -174,8 +167,8 @@ def no_json() -> str:
 
 
 def settable(keys: Keys, path: Path) -> Plan:
-    """Plan to find out whether something can be set at `path`. Its decode raises PathRefused if not."""
-    # The types of everything on the way, in one round trip: the first that cannot hold the next one is the reason.
+    """Plan to find out whether a value can be set at `path`. Its decode raises PathRefused if not."""
+    # The types of all values on the path, in one round trip: the first that cannot hold the next one is the reason.
     places = [path[:length] for length in range(len(path) + 1)]
     commands = [("JSON.TYPE", keys.document, to_jsonpath(place)) for place in places]
 
@@ -187,7 +180,7 @@ def settable(keys: Keys, path: Path) -> Plan:
                 refusal = PathRefused if place else MissingTop
                 raise refusal(f"{whole}: there is no {outer} to write into")
             if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
-                # To the server an array is a short text.
+                # On the server an array is a text, its placeholder.
                 is_array = kind == "string" and isinstance(inner, int)
                 hint = "; or it is an array: change a copy and write an array as a whole" if is_array else ""
                 raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}{hint}")
@@ -200,7 +193,7 @@ def settable(keys: Keys, path: Path) -> Plan:
 def diagnose(keys: Keys, path: Path, refusal: PathRefused | None) -> Plan:
     """Plan to find out why a write at `path` was refused. Its decode always raises PathRefused.
 
-    That is the `refusal` if the user may not find out more.
+    It raises the `refusal` if the user may not read.
     """
     plan = settable(keys, path)
 
@@ -217,39 +210,33 @@ def diagnose(keys: Keys, path: Path, refusal: PathRefused | None) -> Plan:
 
 
 def out_of_range(keys: Keys, path: Path) -> PathRefused:
-    """Return the error for an item beyond the end of a list."""
     return PathRefused(f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer")
 
 
 def type_name(reply: Reply) -> str | None:
-    """Return the name of the JSON type in a reply to JSON.TYPE: [[b"object"]], [b"object"], [None], [[]] or None."""
-    # RESP2 and RESP3, and versions of RedisJSON, nest it in as many lists as they like.
+    # The reply is [[b"object"]], [b"object"], [None], [[]] or None, depending on the protocol and RedisJSON's version.
     while isinstance(reply, list):
         reply = reply[0] if reply else None
     return reply.decode() if isinstance(reply, bytes) else None
 
 
 def missing(keys: Keys, path: Path, reply: Reply = ()) -> MissingKey:
-    """Return the error for a path where nothing is stored, given the reply that says so.
-
-    The server answers nil, or a list of one nil, where not even the top-level key is there.
-    """
+    """Return the error for an empty path; the reply is nil, or [nil], if even the top-level key is missing."""
     kind = MissingDocument if reply is None or reply == [None] else MissingKey
     return kind(f"nothing is stored at {show(full(keys, path))}")
 
 
-# Indexes that count from the end: which items they name at the instant of their look.
+# Indexes that count from the end of a list.
 
 
 def lengths(keys: Keys, path: Path) -> list[Command]:
-    """Return the commands that `from_front` takes the replies of: how long lists are that are counted from the end."""
+    """Return the commands whose replies `from_front` reads: the lengths of lists that are counted from the end."""
     return [("JSON.ARRLEN", keys.document, to_jsonpath(path[:position])) for position in _from_end(path)]
 
 
 def from_front(replies: Sequence[Reply], keys: Keys, path: Path, absent: type[Exception]) -> Path:
     """Return `path` with every index counted from the front; raises `absent` if there is no such item."""
-    # Which item -1 names is true for one instant only, so whoever uses the result watches the document, and starts
-    # again if it was changed.
+    # The result holds for one instant only, so the caller watches the document and starts again if it was changed.
     front = list(path)
     for position, reply in zip(_from_end(path), replies, strict=True):
         index = path[position]
@@ -268,7 +255,6 @@ def _from_end(path: Path) -> Iterator[int]:
 
 
 def _count(reply: Reply, keys: Keys, path: Path, absent: type[Exception]) -> int | None:
-    """Return the number in a reply to JSON.ARRLEN, None if there is no list."""
     if isinstance(reply, Exception):
         error = explained(reply, keys, path)
         raise absent(str(error)) if isinstance(error, MissingKey) else error

@@ -1,6 +1,6 @@
-"""What counts as large: it goes over a connection of its own, and ahead of transactions that are watched.
+"""Sizes: large values have a connection of their own and are staged ahead of watched transactions.
 
-And what is too large: upon that a server closes the connection, without a word.
+Values that are too large are refused here: a server would close the connection without an error.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from ..errors import BadValue
 from . import Command, Plan, Reply
 
 LARGE = 1 << 16
-"""Bytes from which others should not have to wait behind a value, in either direction."""
+"""Bytes from which other calls should not wait behind a value, in either direction."""
 
 
 class Limits(NamedTuple):
-    """What a server takes.
+    """Limits of a server.
 
     Attributes:
-        argument: Bytes that one argument of a command may have, and so an array, or the text of a document.
-        call: Bytes that all commands of a transaction may have together.
+        argument: Bytes of one argument, so of an array, or of the text of a document.
+        call: Bytes of all commands of a transaction.
     """
 
     argument: int
@@ -28,17 +28,16 @@ class Limits(NamedTuple):
 
 
 USUAL = Limits(512 << 20, 1 << 30)
-"""As servers come: proto-max-bulk-len and client-query-buffer-limit."""
+"""The defaults of proto-max-bulk-len and client-query-buffer-limit."""
 
 _WORDS = 1 << 16
-"""Bytes of a call for what else is in it, and what the server has read ahead."""
+"""Bytes of a call for its other words, and for what the server has read ahead."""
 
 
 def has_large(commands: Sequence[Command]) -> bool:
-    """Return whether any argument of `commands` is so large that others should not wait behind it."""
     for command in commands:
         for word in command:
-            # A str is a name or a number here; what is large comes as bytes, a memoryview, or a tuple of pieces.
+            # A str is a name or a number; large values are bytes, a memoryview, or a tuple of pieces.
             if type(word) is not str and _size(word) >= LARGE:
                 return True
     return False
@@ -59,7 +58,7 @@ def sizes_of(commands: Iterable[Command]) -> list[int]:
 
 
 def limits() -> Plan:
-    """Plan to ask a server for its limits; the result is `USUAL` if the user may not."""
+    """Plan to ask a server for its limits; the result is `USUAL` if the user may not ask."""
     names = ("proto-max-bulk-len", "client-query-buffer-limit")
 
     def decode(replies: Sequence[Reply]) -> Limits:
@@ -71,8 +70,8 @@ def limits() -> Plan:
 
 
 def check_sizes(sizes: Sequence[tuple[str, int]], most: Limits) -> None:
-    """Raise BadValue if a server with these limits would not take a call, given its places and the bytes for each."""
-    # The largest is named, also where only the sum is too much: it is what is worth storing apart.
+    """Raise BadValue if a call is too large for a server, given its paths and the bytes of each."""
+    # Names the largest, also if only the sum is too much: that value should be stored in another call.
     where, size = max(sizes, key=lambda it: it[1])
     if size > most.argument:
         raise BadValue(
@@ -87,40 +86,32 @@ def check_sizes(sizes: Sequence[tuple[str, int]], most: Limits) -> None:
         )
 
 
-# Large values that are sent before the transaction that puts them in place.
+# Staging: large values are sent before the transaction that puts them in place.
 #
-# A transaction under WATCH is given up if anybody writes to the same top-level key between the look and its end. An
-# array of 8 MB takes longer to arrive than a robot's other programs wait between two writes: as part of the transaction
-# it would never get through. So it is sent first, under a name that nothing refers to, and the transaction renames it.
-# Should its sender die in between, the server forgets it after a minute.
+# A transaction under WATCH fails if another client writes to the same top-level key before its end. An array of 8 MB
+# takes longer to arrive than the pause between two writes of a robot's other programs: such a transaction would never
+# succeed. So the array is sent first, under a key that nothing refers to, and the transaction renames that key. If the
+# sender dies in between, the key expires after a minute.
 
 
 STAGED = ":staged:"
-"""Follows the tag of a top-level key in the names of what was sent and not yet put in place."""
+"""Follows the tag of a top-level key in the names of staged values."""
 
 KEPT = 60
-"""Seconds for which a server keeps what was not put in place."""
+"""Seconds until a staged value expires."""
 
 
 class Staged(NamedTuple):
-    """A value on its way.
-
-    Attributes:
-        name: Where it waits.
-        upload: What sends it there.
-    """
+    """A staged value: its key, and the command that sends it there."""
 
     name: str
     upload: Command
 
 
 def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Command], list[Staged]]:
-    """Return commands that put large values in place by renaming, and what has to be sent before.
+    """Return commands that put the large values of `commands` in place by renaming, and the values to stage before.
 
-    Args:
-        commands: Those that would send the values themselves.
-        tag: Of the top-level key.
-        unique: Makes the names of what is on its way.
+    The names of their keys are made of the top-level key's `tag` and something `unique`.
     """
     coming: list[Staged] = []
     moving: list[Command] = []
@@ -137,28 +128,27 @@ def stage(commands: Sequence[Command], tag: str, unique: str) -> tuple[list[Comm
 
 
 def as_given(moved: Sequence[Command], coming: Sequence[Staged], replies: Sequence[Reply]) -> list[Reply]:
-    """Return the replies to a transaction as it was given to `stage`: a large SET became two commands of `moved`."""
+    """Return the replies as `stage` got the commands: a large SET became two commands of `moved`."""
     names = {each.name for each in coming}
     extra = {place for place, command in enumerate(moved) if command[0] == "PERSIST" and command[1] in names}
     answers, outcome = list(replies), replies[-1]
     if isinstance(outcome, list):
         answers[-1] = [reply for place, reply in enumerate(outcome, 1) if place not in extra]
     for place in extra:
-        if isinstance(answers[place], Exception):  # it is why the transaction was refused
+        if isinstance(answers[place], Exception):  # the reason why the transaction was refused
             answers[place + 1] = answers[place]
     return [reply for place, reply in enumerate(answers) if place not in extra]
 
 
 def is_large(command: Command) -> bool:
-    """Return whether a command stores a value that takes long to arrive."""
     return len(command) == 3 and command[0] == "SET" and has_large((command,))
 
 
 def looks_at(coming: Sequence[Staged]) -> list[Command]:
-    """Return the commands that tell, once the names are watched, whether all that was sent is there."""
+    """Return the commands whose replies `are_missing` reads."""
     return [("TYPE", each.name) for each in coming]
 
 
 def are_missing(replies: Sequence[Reply]) -> bool:
-    """Return whether replies to `looks_at` say that something must be sent again: it was forgotten, or left behind."""
+    """Return whether a staged value must be sent again: it has expired, or is on the node that the slot has left."""
     return b"none" in replies

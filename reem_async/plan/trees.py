@@ -1,8 +1,7 @@
-"""Local copies of documents: trees that are never changed, only replaced.
+"""Immutable trees: local copies of documents.
 
-An update makes new containers along its path and shares the rest, so a reader that holds the old
-tree keeps seeing the old instant. The rules are those of the server, so that a copy that follows
-every update stays equal to the document.
+An update makes new containers along its path and shares the rest, so a reader that holds the old tree keeps the old
+instant. The rules are those of the server, so a copy that applies every update stays equal to the document.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ class _Missing:
 
 
 MISSING: Final = _Missing()
-"""Stands for a tree or a value that is not there."""
+"""In the place of a tree or value that does not exist."""
 
 _SHARED = frozenset({str, int, float, bool, type(None), bytes, np.ndarray})
 """Types of leaves that are never changed in place: arrays of a copy are read-only."""
 
 
 class CannotApply(Exception):
-    """The update does not fit the tree: its parent is not there or cannot hold it."""
+    """The update does not fit the tree: its parent is missing or cannot hold it."""
 
 
 def get(tree: Any, path: Path) -> Any:
-    """Return what is at `path`, or MISSING; inside of what cannot be read that is all that is known."""
+    """Return the value at `path`, or MISSING; inside of an Unreadable, that."""
     for key in path:
         if isinstance(key, str):
             tree = tree.get(key, MISSING) if type(tree) is dict else _inside(tree)
@@ -44,7 +43,6 @@ def get(tree: Any, path: Path) -> Any:
 
 
 def _inside(tree: Any) -> Any:
-    """Return what is inside of what cannot hold the element of a path."""
     return tree if type(tree) is Unreadable else MISSING
 
 
@@ -59,7 +57,6 @@ def replaced(tree: Any, path: Path, value: Any) -> Any:
             raise CannotApply
         return {**tree, key: replaced(tree.get(key), rest, value)}
     if isinstance(key, int) and type(tree) is list and -len(tree) <= key < len(tree):
-        # Only the containers on the way are copied: whoever holds the old tree keeps the old instant.
         items = tree.copy()
         items[key] = replaced(items[key], rest, value)
         return items
@@ -67,7 +64,7 @@ def replaced(tree: Any, path: Path, value: Any) -> Any:
 
 
 def removed(tree: Any, path: Path) -> Any:
-    """Return `tree` without what is at `path`; unchanged if nothing is there."""
+    """Return `tree` without the value at `path`; the same tree if there is none."""
     if get(tree, path) is MISSING:
         return tree
     if not path:
@@ -83,8 +80,8 @@ def removed(tree: Any, path: Path) -> Any:
 def copied(tree: Any) -> Any:
     """Return `tree` with containers of its own, for a user to keep.
 
-    Leaves that cannot be changed are shared, arrays too. Objects that a user's own ship has made are copied by
-    `copy.deepcopy`; those that it cannot copy are shared.
+    Immutable leaves are shared, arrays too. Objects that a user's own ship has made are copied by `copy.deepcopy`, or
+    shared if that fails.
     """
     kind = type(tree)
     if kind is dict:
@@ -97,9 +94,6 @@ def copied(tree: Any) -> Any:
         return deepcopy(tree)
     except Exception:
         return tree
-
-
-# Where two trees differ.
 
 
 def same(one: Any, other: Any) -> bool:
@@ -117,7 +111,7 @@ def same(one: Any, other: Any) -> bool:
         return _same_arrays(one, other)
     try:
         return bool(one == other) and (kind is not float or one != 0 or str(one) == str(other))  # -0.0 == 0.0
-    except Exception:  # a type that a ship of the user's carries may compare as it likes
+    except Exception:  # types of a user's ship may raise anything
         return False
 
 
@@ -131,7 +125,6 @@ def _same_arrays(one: Any, other: Any) -> bool:
 
 
 def is_addressable(key: str | int) -> bool:
-    """Return whether a path can lead through a key."""
     try:
         check_element(key, ())
     except BadKey:
@@ -140,10 +133,10 @@ def is_addressable(key: str | int) -> bool:
 
 
 def difference(old: Any, new: Any) -> Path | None:
-    """Return the path of the deepest place that holds all that differs between two trees; None if nothing does.
+    """Return the path of the deepest place that holds all differences between two trees; None if they are equal.
 
-    An entry of a dict that is in one of them only is such a place. A list of another length is one as a whole: which of
-    its items came or went cannot be seen. So is a dict of which an entry differs that no path can address.
+    It may be an entry of a dict that only one tree has. It is not inside of a list of another length, since the items
+    that came or went are unknown, nor at an entry of a dict that no path can address.
     """
     path: list[str | int] = []
     while True:
@@ -157,7 +150,7 @@ def difference(old: Any, new: Any) -> Path | None:
         if not differing:
             return None
         key = differing[0]
-        # Several entries differ: what holds all of them is here. One differs: it may be deeper inside.
+        # Several entries differ: this is the place. One differs: the place may be deeper inside.
         if len(differing) > 1 or not is_addressable(key):
             return tuple(path)
         path.append(key)

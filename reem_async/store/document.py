@@ -22,7 +22,7 @@ from ..errors import (
 )
 from ..plan import Plan
 from ..plan.arithmetic import Operation, calculate, compute
-from ..plan.changes import SILENT, Announcement, Change, EncodedAttachment
+from ..plan.changes import SILENT, Announcement, DocumentChange, EncodedAttachment
 from ..plan.documents import number_text
 from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
 from ..plan.reads import RawRead, nothing
@@ -355,7 +355,7 @@ class DocumentWriter:
     async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
         await self._if_still(before, delete_change(self.keys, path, announcement=turn.reserve(deleted=True)))
 
-    async def _if_still(self, before: RawRead, it: Change) -> None:
+    async def _if_still(self, before: RawRead, it: DocumentChange) -> None:
         # What was read names its arrays, and the transaction fails if anything is not as it was read: these are all.
         it = it._replace(gone=tuple(slot.placeholder.suffix.encode() for slot, _, _ in before.slots))
         await self.session.run(exchange(it, before.commands, before.raw, self.session.cache))
@@ -381,5 +381,7 @@ class DocumentWriter:
         if plan is not None:
             await self.session.run(plan)
 
-    def _setting(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Change:
+    def _setting(
+        self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]
+    ) -> DocumentChange:
         return set_change(self.keys, path, text, attachments, turn.reserve(text, attachments))

@@ -14,7 +14,7 @@ from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys
-from ..plan.notices import Slot, announce, in_slot, published, sizes_of_parts, told_at, with_value
+from ..plan.notices import Slot, announce, in_slot, notify_path, published, sizes_of_parts, with_value
 from ..plan.paths import Path, counts_from_end, show
 from ..session import Session
 from .accessor import _NOTHING, Accessor, Writer
@@ -114,7 +114,7 @@ class UpdateAnnouncement(Announcement):
     def _numbered(self, path: Path, payload: Callable[[_Stamp, Path], bytes]) -> list[Command]:
         # The reserved number; a further one where the replies say that what was told is to be told anew.
         self._made = stamp = self._reserved.pop() if self._reserved else self._session.stamp(self._keys)
-        place = told_at(path)
+        place = notify_path(path)
         # Told as a change of the place above: what is there is looked at.
         text = payload(stamp, path) if place is path else announce(*stamp, self._time or time.time(), place)
         return published(self._keys, *stamp, text, everywhere=self._everywhere)
@@ -143,7 +143,7 @@ class ValueAnnouncement(UpdateAnnouncement):
         In early mode, notify it now. One round trip more for each early update, and else for one update a second.
         """
         sizes = sizes_of_parts(self._text, self._attachments)
-        if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or told_at(path) is not path:
+        if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or notify_path(path) is not path:
             return
         local = self._session.local
         if not local.host:
