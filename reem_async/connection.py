@@ -19,7 +19,6 @@ __all__ = ["RedisInterface"]
 
 
 def _on_event_loop(options: Options) -> ToOneServer:
-    """Return a transport for event loops."""
     return AsyncTransport(options)
 
 
@@ -40,13 +39,13 @@ class RedisInterface:
             `NumpyShip` and `BytesShip`. A number in its place is the port.
         namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
             separator, any character but a letter or digit: "robot1:", "robots/r1:".
-        timeout: Seconds without a byte moving after which a call is given up; `reem_async.timeout` sets
+        timeout: Seconds without a byte moving after which a call times out; `reem_async.timeout` sets
             another limit for some calls.
         local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
-            through shared memory, where that can be had; the server has every update all the same, and whatever goes
-            wrong on the way, the subscriber fetches it there. "off": always from the server. "early": what this
-            interface publishes is delivered on this host before the server has it (`update.early`); if the
-            server never gets it, subscribers get what is there, with `gap`. See docs/guarantees.md.
+            through shared memory, if available; the server stores every update too, and a subscriber that cannot read
+            the memory fetches it there. "off": always from the server. "early": updates of this interface reach
+            subscribers on this host before the server has stored them (`update.early`); if the server never gets an
+            update, they get the server's value, with `gap`. See docs/guarantees.md.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
@@ -108,8 +107,8 @@ class RedisInterface:
     def client(self) -> Any:
         """A plain client of redis-py for the same server, made when first asked for and closed with this interface.
 
-        Replies are str. What it writes no subscriber is told of, and keys of REEM are best left to REEM. On a server
-        without JSON its JSON commands raise NoJsonSupport, which says what to use.
+        Replies are str. Its writes notify no subscriber, so do not write keys of REEM with it. On a server without JSON
+        its JSON commands raise NoJsonSupport.
 
         Raises:
             Misuse: This is an interface to several servers.
@@ -127,10 +126,10 @@ class RedisInterface:
 
     @property
     def state(self) -> State:
-        """What is known of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed".
+        """The state of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed".
 
-        Nothing is sent. A connection that broke is made again by the next call ("lost"),
-        or by itself where somebody follows updates ("reconnecting", for ever, with growing pauses up to 1 s).
+        Nothing is sent. After a connection was "lost" the next call reconnects. If there are subscribers, it reconnects
+        by itself: "reconnecting", for ever, with growing pauses up to 1 s.
         """
         return self.session.transport.states.last.state
 
@@ -150,12 +149,11 @@ class RedisInterface:
 
     @property
     def unreadable(self) -> int:
-        """How many messages on the channels that are followed, and values in what is followed, could not be read.
+        """How many messages and values could not be read by subscribers.
 
         A value that cannot be read, such as an array that was evicted, has an `Unreadable` in its place and is logged
-        once. Any client may publish what is no update of REEM, and a later version may send what this one does
-        not know. Such a message costs itself alone: what follows its key is read anew, with `gap`, and the
-        first of each channel is logged.
+        once. A message cannot be read if it is not an update of REEM, or of a later version: its key is read again,
+        with `gap`, and the first of each channel is logged.
         """
         return self.session.transport.states.unreadable
 
@@ -163,7 +161,7 @@ class RedisInterface:
         """Connect now, and check that the server can be used. Optional; one round trip, idempotent.
 
         Raises:
-            NotConnected: Nobody listens there.
+            NotConnected: No server listens there.
             redis.exceptions.AuthenticationError: Wrong user or password.
         """
         await self.session.initialize()
@@ -200,5 +198,4 @@ class RedisInterface:
 
 
 def rebuilt(kind: Callable[..., Any], host: Any, ships: Any, options: dict[str, Any]) -> Any:
-    """Make an interface from the parts of a pickled one."""
     return kind(host, ships, **options)

@@ -16,7 +16,7 @@
     +-- MissingKey               also KeyError, redis ResponseError: nothing is stored there
     +-- PathRefused              also KeyError, redis ResponseError: the parent is missing or cannot hold the element
     +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
-    +-- Conflict                 somebody else changed what was edited, or kept writing to the key; nothing written
+    +-- Conflict                 another client changed what was edited, or kept writing to the key; nothing written
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     +-- QueueFull                a subscriber with the policy Every fell too far behind
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
@@ -30,7 +30,7 @@ Errors that come from the server or from the connection stay `redis.exceptions.R
 
     redis.exceptions.RedisError
     +-- ConnectionLost           (ReemError, redis ConnectionError) broken before the reply: outcome unknown
-    +-- NotConnected             (ReemError, redis ConnectionError) nobody listening: nothing was applied
+    +-- NotConnected             (ReemError, redis ConnectionError) no server listening: nothing was applied
     +-- WrongKind                (ReemError, redis ResponseError) a foreign Redis type is under that key
     +-- PartialWrite             (ReemError, redis ResponseError) the server refused a part; says which
     +-- Refused                  (ReemError) the server turned the call down: nothing of it was applied
@@ -98,11 +98,11 @@ ClusterReply = (
     | redis.exceptions.ClusterDownError
     | redis.exceptions.TryAgainError
 )
-"""What a node of a cluster answers: for the transport to a cluster to follow, else it becomes a `ClusterNode`."""
+"""Errors of a cluster's nodes: the transport to a cluster follows them, any other raises `ClusterNode`."""
 
 
 class ReemError(Exception):
-    """Root of everything REEM raises by itself."""
+    """Base of all errors of REEM."""
 
     def __repr__(self) -> str:  # redis-py's errors leave the message out
         return Exception.__repr__(self)
@@ -164,7 +164,7 @@ class MissingKey(ReemError, KeyError, redis.exceptions.ResponseError):
 
 
 class MissingDocument(MissingKey):
-    """Not even the top-level key is there: `read` answers None; other calls raise this as MissingKey."""
+    """Even the top-level key is missing: `read` returns None; other calls raise this as MissingKey."""
 
 
 class PathRefused(ReemError, KeyError, redis.exceptions.ResponseError):
@@ -175,7 +175,7 @@ class PathRefused(ReemError, KeyError, redis.exceptions.ResponseError):
 
 
 class MissingTop(PathRefused):
-    """There is no top-level key to write into: a single array makes it, all else is refused with this."""
+    """There is no top-level key to write into; a single array makes one."""
 
 
 class Overflow(ReemError, OverflowError, redis.exceptions.ResponseError):
@@ -183,14 +183,14 @@ class Overflow(ReemError, OverflowError, redis.exceptions.ResponseError):
 
 
 class Conflict(ReemError):
-    """Somebody else changed the value between reading and writing back; nothing was written.
+    """Another client changed the value between reading and writing back; nothing was written.
 
-    Or others kept writing to the same top-level key until the call's time limit was over; nothing was applied.
+    Or other clients kept writing to the same top-level key until the call timed out; nothing was applied.
     """
 
 
 class Contended(Conflict):
-    """Others kept writing to the same top-level key: who tries again by himself on a Conflict had better not now."""
+    """Other clients kept writing to the same top-level key: an immediate retry will probably fail again."""
 
 
 class QueueFull(ReemError):
@@ -291,7 +291,7 @@ class ClusterNode(Refused, redis.exceptions.ResponseError):
     """The server is one node of a Redis Cluster, and the key lives on another.
 
     Attributes:
-        fact: What is the matter, without the advice for whoever is connected to this node alone.
+        fact: The error without the advice for a connection to this node alone.
     """
 
     def __init__(self, fact: str, advice: str = "") -> None:
@@ -305,18 +305,18 @@ class ClusterNode(Refused, redis.exceptions.ResponseError):
 
 
 class NoJsonSupport(Refused, redis.exceptions.ResponseError):
-    """The server has JSON, but not this command of RedisJSON's. Where there is no JSON at all, REEM does without.
+    """The server has JSON, but not this command of RedisJSON. On a server without any JSON, REEM stores text.
 
-    Of a JSON command of `interface.client`, that there is no JSON at all: redis-py does not do without.
+    A JSON command of `interface.client` raises it on a server without JSON too.
     """
 
 
 class InsecureConnection(UserWarning):
-    """What goes over a connection can be read and changed on its way; said once for each address."""
+    """A connection can be read and changed on its way; the warning comes once for each address."""
 
 
 SELF_EXPLANATORY = (MissingKey, PathRefused, ConnectionLost, NotConnected)
-"""Errors whose message is all there is to know: REEM's own frames and causes are left out of their tracebacks."""
+"""Errors whose message says all: REEM's own frames and causes are left out of their tracebacks."""
 
 
 ALL_NODES = "connect with RedisInterface('redis+cluster://host:port,host:port')"
@@ -324,16 +324,16 @@ ALL_NODES = "connect with RedisInterface('redis+cluster://host:port,host:port')"
 
 
 def is_of_command(error: Exception) -> bool:
-    """Return whether a user may not run a command at all; else it is this key or channel that is out of bounds."""
+    """Return whether the user lacks the right to a command, and not only to a key or channel."""
     return isinstance(error, NotAllowed) and "run the" in str(error)
 
 
 def turned_down(error: Exception) -> Refused:
-    """Return what an error reply about the server means to somebody who talks to that one server only."""
+    """Return the error for an error reply about the server, on a connection to that server only."""
     if isinstance(error, Refused):
         return error
     fact = "the server is a node of a Redis Cluster and does not hold this key now"
-    # MOVED and ASK are followed by whoever knows the whole cluster; here nobody does.
+    # Only a client of the whole cluster follows MOVED and ASK.
     if isinstance(error, redis.exceptions.TryAgainError):
         fact = "the key's slot is moving between nodes of a Redis Cluster, and parts of the key are on either"
     elif isinstance(error, redis.exceptions.ClusterDownError):

@@ -31,21 +31,21 @@ from .transport.packing import CommandRecorder
 _FRESH = 3.0
 """Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
 QUIET = 60.0
-"""Seconds after which the next notices are first ones again: who looks for keys has let go of one that was gone."""
-
+"""After this silence (seconds) a publisher's notices of a key go to all nodes again: clients that find keys by pattern
+have dropped the key by then."""
 
 _IDLE, _LOOKS = 120.0, 10.0
-"""Seconds for which a top-level key must not have been published to be forgotten, and between looks for such keys.
+"""Seconds after which the number of an idle top-level key is forgotten, and between searches for such keys.
 
-Longer than the server keeps the note of a key's last update."""
+The first is longer than the server keeps the note of a key's last update."""
 _KEPT = 1000
 """Top-level keys that are never forgotten, however idle."""
 
 
 class _Numbers:
-    """Who publishes, and the number of its last update of each top-level key; what is idle is forgotten.
+    """The publisher's id, and the number of its last update of each top-level key; idle keys are forgotten.
 
-    A key that comes back after that is published under another id, from 1 on: numbers under one id never go back.
+    A key that is published again after that gets another id and starts from 1: numbers of one id never go back.
     """
 
     def __init__(self) -> None:
@@ -57,7 +57,6 @@ class _Numbers:
         self._last: collections.OrderedDict[str, tuple[str, int, float]] = collections.OrderedDict()
 
     def next(self, channel: str) -> tuple[str, int]:
-        """Return the id and the number of the next update."""
         if self._pid != os.getpid():  # a forked child is another publisher
             self.__init__()  # type: ignore[misc]
         now = time.monotonic()
@@ -76,15 +75,14 @@ class _Numbers:
         return publisher, number + 1
 
     def is_quiet(self, channel: str) -> bool:
-        """Return whether nothing was published of a key for long, or ever."""
         last = self._last.get(channel)
         return last is None or time.monotonic() - last[2] > QUIET
 
     def take_back(self, channel: str, publisher: str, number: int) -> None:
-        """Return a number once more, if it was the last."""
+        """Make a number free again, if it was the last."""
         last = self._last.get(channel)
         if last is not None and last[:2] == (publisher, number):
-            self._last[channel] = publisher, number - 1, -math.inf  # nothing was published: it may be quiet as before
+            self._last[channel] = publisher, number - 1, -math.inf  # nothing was published: still quiet
 
     def _forget(self, before: float) -> None:
         # The order of the dict is that of the last use, so the idlest key is the first.
@@ -100,31 +98,27 @@ class _Numbers:
             return False
 
 
-class Subscriptions(Protocol):
-    """What follows updates for an interface in one event loop: `pubsub.manager.SubscriptionManager`."""
+class LoopSubscriptions(Protocol):
+    """The subscriptions of an interface in one event loop: `pubsub.manager.SubscriptionManager`."""
 
-    async def close(self) -> None:
-        """End all of them."""
+    async def close(self) -> None: ...
 
     def end_loops(self) -> None:
-        """End the loops of threads over what is followed. Any thread may."""
+        """End the loops of threads over subscribers. Any thread may call this."""
 
 
 class Background(Protocol):
     """Runs coroutines beside the calls of an interface."""
 
-    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> object:
-        """Run a coroutine, under a name."""
+    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> object: ...
 
-    async def end(self) -> None:
-        """End all of them."""
+    async def end(self) -> None: ...
 
 
 class Closing(Protocol):
-    """Who is told when an interface is closed."""
+    """An object that is closed with the interface."""
 
-    def close(self) -> None:
-        """Give up what could only be done while it was open."""
+    def close(self) -> None: ...
 
 
 class Session:
@@ -134,21 +128,21 @@ class Session:
         host: A host name, a URL, an `EmbeddedServer` or an `EmbeddedCluster`.
         ships: What carries values that are not JSON; None for the default list.
         namespace: Goes before every key and channel; ends with a separator.
-        timeout: Seconds without a byte moving after which a call is given up.
+        timeout: Seconds without a byte moving after which a call times out.
         options: redis-py's connection options.
         new_transport: Makes the transport to one server.
-        local: The shared memory of publishers, and of those who listen to them; None for the usual.
+        local: The shared memory of publishers and subscribers; None for the default.
 
     Attributes:
         ships: Chooses ships.
-        cache: What is known of the server.
-        local: The shared memory of publishers, and of those who listen to them.
-        transport: The way to the server.
-        interface: The interface this belongs to: what is pickled in its place.
-        subscriptions: The subscription manager, made when something is first followed; see `pubsub.manager.manager_of`.
-        tasks: What runs in the background for publishers; ended by `close`.
-        closing: Who is told when this is closed.
-        closed: It is, or is about to be.
+        cache: The shape cache.
+        local: The shared memory of publishers and subscribers.
+        transport: Sends commands to the server.
+        interface: The interface this belongs to: pickled in its place.
+        subscriptions: The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
+        tasks: The background tasks of publishers; ended by `close`.
+        closing: Objects to close with this.
+        closed: Whether it is closed, or about to be.
     """
 
     def __init__(
@@ -163,7 +157,7 @@ class Session:
         local: LocalPath | None = None,
     ) -> None:
         self.namespace = check_namespace(namespace)
-        # The namespace counts: what the server is sent has at most 512 bytes.
+        # A key on the server has at most 512 bytes, the namespace included.
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
@@ -172,7 +166,7 @@ class Session:
         self.interface: Any = None
         self._numbers = _Numbers()
         self._fresh: dict[str, float] = {}
-        self.subscriptions: Subscriptions | None = None
+        self.subscriptions: LoopSubscriptions | None = None
         self.tasks: Background = Tasks()
         self.closing: weakref.WeakSet[Closing] = weakref.WeakSet()
         self.closed = False
@@ -195,25 +189,21 @@ class Session:
                     yield name
 
     def _name(self, document: bytes) -> str | None:
-        """Return the top-level key whose document has a name on the server, None if none can have it."""
         try:
             return self.keys(document.decode()[len(self.namespace) :]).name
         except (UnicodeDecodeError, BadKey):
             return None
 
     def run(self, plan: Plan, at: Transport | None = None) -> Coroutine[Any, Any, Any]:
-        """Send a plan's commands, and those that follow from the replies; awaited, it is the result.
-
-        They go `at` one server, or where their keys are.
-        """
+        """Run a plan and those that follow from its replies, `at` one server or where their keys are."""
         return drive(at or self.transport, plan)
 
     def stamp(self, keys: Keys) -> tuple[str, int]:
-        """Return who publishes, and the number of this publisher's next update of a top-level key."""
+        """Return the publisher's id, and the number of its next update of a top-level key."""
         is_quiet = self.transport.sharded and self._numbers.is_quiet(keys.channel)
         publisher, number = self._numbers.next(keys.channel)
-        # Of a cluster, notices go to the key's own node. Who looks for keys by pattern does not follow a new one there
-        # yet, or no more.
+        # In a cluster, notices go to the key's own node. Clients that find keys by pattern do not follow a new key
+        # there yet, or not any more.
         if is_quiet or (number == 1 and self.transport.sharded):
             now = time.monotonic()
             if len(self._fresh) >= _KEPT:
@@ -223,15 +213,15 @@ class Session:
         return publisher, number
 
     def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
-        """Have the number of a stamp of a top-level key returned again: it was not used.
+        """Make the number of a stamp free again.
 
-        Only for whoever has kept others from asking for one since; see `Transport.ordered`. A handler of signals that
-        has published meanwhile, on the same thread, leaves a number that is never used.
+        The caller holds the turn of the key, see `Transport.ordered`. If a signal handler on the same thread has
+        published in between, the number is never used.
         """
         self._numbers.take_back(keys.channel, *stamp)
 
     def is_fresh(self, keys: Keys) -> bool:
-        """Return whether this publisher has only begun with a top-level key of a cluster: others may not know it."""
+        """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know."""
         until = self._fresh.get(keys.channel)
         if until is None:
             return False
@@ -243,9 +233,9 @@ class Session:
     async def initialize(self) -> None:
         """Connect and check that the server can be used."""
         await self.ships.ready()
-        # Any key will do: what matters is whether the server knows the command, and the user may send it.
+        # Any key will do: the test is whether the server knows the command and the user may send it.
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
-        # Not allowed to use JSON is told at once; that this one key is out of bounds means nothing.
+        # A missing right to JSON commands is an error; a missing right to this key is not.
         elsewhere = isinstance(reply, NotAllowed) and not is_of_command(reply)
         if isinstance(reply, Refused | ClusterReply) and not elsewhere:
             raise turned_down(reply).at(self.options.address)
@@ -253,7 +243,7 @@ class Session:
     async def release(self) -> None:
         """End all subscriptions and close all connections of this event loop; another one may go on."""
         subscriptions, self.subscriptions = self.subscriptions, None
-        # The last comes first, and each is taken, also if one is cancelled.
+        # The steps run from the last to the first, each even if another one is cancelled.
         async with contextlib.AsyncExitStack() as steps:
             steps.push_async_callback(self.transport.release)
             steps.push_async_callback(self.tasks.end)
@@ -266,13 +256,9 @@ class Session:
         async with contextlib.AsyncExitStack() as steps:  # as above
             steps.callback(self.local.close)
             steps.push_async_callback(self.tasks.end)
-            steps.callback(self._tell_of_end)
-            # Before what runs in the background: its calls end with InterfaceClosed, and `closing` counts what it has
-            # kept.
+            for each in list(self.closing):
+                steps.callback(each.close)
+            # Before the background tasks: their calls end with InterfaceClosed, and `closing` counts kept updates.
             steps.push_async_callback(self.transport.close)
             if self.subscriptions is not None:
                 steps.push_async_callback(self.subscriptions.close)
-
-    def _tell_of_end(self) -> None:
-        for each in list(self.closing):
-            each.close()

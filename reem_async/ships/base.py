@@ -1,4 +1,4 @@
-"""What a ship is: it carries one type of value to the server and back."""
+"""The base classes of ships, which carry one type of value to the server and back."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ class SpecialDatatypeShip(ABC):
     and REEM sends them inside the transaction of the whole write or read. Values of exactly the
     types str, int, float, bool, None, dict, list and tuple are JSON; they are offered to ships only if one claims such
     a type: its `check_fit` takes one of a few short samples, or its `claims` names the type. Then every value is
-    looked at in Python, which costs time: an interface whose ships claim none does not pay for it.
+    visited in Python, which takes time.
     """
 
     carries: type | None = None
-    """The one type this ship gives back, if that is known without reading. Optional."""
+    """The type of all values of this ship, if there is only one. Optional."""
 
     claims: tuple[type, ...] = ()
-    """Of the types that JSON has, those of which `check_fit` takes values that are not short. Optional."""
+    """JSON types of which `check_fit` takes long values only. Optional."""
 
     @abstractmethod
     def check_fit(self, value: Any) -> bool | Awaitable[bool]:
@@ -76,13 +76,10 @@ class BlobShip(SpecialDatatypeShip):
         """Return the value from its bytes (any buffer; None if they are gone); raise `BadData` for others."""
 
     def write(self, key: str, value: Any, client: Any) -> None:
-        """Record one SET."""
         client.set(key, b"".join(self.pack(value)))
 
     def read(self, key: str, client: Any) -> None:
-        """Record one GET."""
         client.get(key)
 
     def interpret_read(self, responses: list[Any]) -> Any:
-        """Return the value from the reply to GET."""
         return self.unpack(responses[0])

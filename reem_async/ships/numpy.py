@@ -28,17 +28,13 @@ _MAGIC = b"\x93NUMPY"
 _KINDS = "biufcSUVMm"
 # Byte order, kind, item size, and for dates and durations a unit: "<f8", "|S10", "<M8[10us]".
 _CODE = re.compile(r"[<>|=][biufcSUVMm]\d{1,9}(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
-# Limits for what a stranger may have written: they bound the memory and the recursion that a header can cost. No real
-# robot comes near them: numpy itself has at most 64 dimensions.
+# Limits for foreign arrays: they bound the memory and the recursion that a header can cost.
 _MOST_FIELDS = 1000
-# As many as numpy itself has.
-_MOST_DIMENSIONS = 64
-# Bytes of one item: a record of many fields, or a long text.
-_LARGEST_ITEM = 1 << 20
-# Bytes: 64 KB describe a thousand fields.
-_LARGEST_HEADER = 1 << 16
+_MOST_DIMENSIONS = 64  # numpy's own limit
+_LARGEST_ITEM = 1 << 20  # bytes: a record of many fields, or a long text
+_LARGEST_HEADER = 1 << 16  # bytes: enough for a thousand fields
 _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
-# All that a header is made of. There are no names, operators or f-strings, and integers are short.
+# The tokens of a header. There are no names, operators or f-strings, and integers are short.
 _TOKEN = re.compile(
     r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>\d{1,15}(?![\w'"])|True|False)"""
     r"""|(?P<opening>[\[({])|(?P<closing>[\])}])|(?P<between>[,:])|[ \n]+|(?P<other>[\s\S])"""
@@ -47,10 +43,8 @@ _TOKEN = re.compile(
 _ESCAPE = re.compile(r"\\(?:x([0-9a-f]{2})|u([0-9a-f]{4})|U([0-9a-f]{8})|(.))")
 _SHORT_ESCAPES = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\", "'": "'", '"': '"'}
 _PAIRS = {"(": ")", "[": "]", "{": "}"}
-# Brackets in brackets.
-_DEEPEST = 64
-# Bytes of a header that is kept parsed with many others; longer ones are kept with few others, see below.
-_SHORT = 1 << 9
+_DEEPEST = 64  # brackets in brackets
+_SHORT = 1 << 9  # bytes of a header of which 1024 are cached; of longer ones 16, see below
 _SMALL = 1 << 12
 """Bytes of data up to which copying them costs less than handling two pieces."""
 
@@ -67,50 +61,45 @@ class NumpyShip(BlobShip):
     carries = np.ndarray
 
     def get_label(self) -> str:
-        """Return "numpy"."""
         return "numpy"
 
     def check_fit(self, value: Any) -> bool:
-        """Return whether `value` is an array, and of a class that adds nothing to its items."""
         return type(value) in PLAIN_ARRAYS
 
     def describe(self, value: np.ndarray[Any, Any]) -> tuple[int, str]:
-        """Return bytes and text such as `float64[640,480,3]`; refuse what cannot be carried."""
         return value.nbytes, _summary(value.dtype, value.shape)
 
     def pack(self, value: np.ndarray[Any, Any]) -> tuple[Any, ...]:
-        """Return an .npy file: small in one piece, else the header and the data, shared with a contiguous array."""
-        # Two pieces for large arrays: joining them would copy all of the data once more.
+        # An .npy file: small in one piece, else header and data apart, since joining them would copy all of the data.
         header = _header(value.dtype, value.shape)
         return (header + value.tobytes(),) if value.nbytes <= _SMALL else (header, flat(value))
 
     def unpack(self, blob: Any) -> np.ndarray[Any, Any]:
-        """Return the array, read-only, sharing memory with `blob`."""
         if blob is None:
             raise BadData("the array's bytes are gone from the server (evicted, or removed by a program without REEM)")
         view = memoryview(blob)
         size = _header_size(bytes(view[:12]), len(view))
         dtype, shape = _header_parser(size)(bytes(view[:size]))
-        # Python's integers do not overflow, as numpy's would for a shape that somebody made up.
+        # Python's integers do not overflow, unlike numpy's, for a made-up shape.
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
         try:
             array = (
-                # frombuffer refuses an empty buffer, so arrays without items are made anew.
+                # frombuffer refuses an empty buffer.
                 np.frombuffer(view, dtype, offset=size).reshape(shape) if len(view) > size else np.empty(shape, dtype)
             )
         except ValueError as error:
             raise BadData(f"an array has the shape {list(shape)}, which cannot be: {error}") from None
-        # The reply may be in a cache or belong to other arrays as well; a caller who wants to write makes a copy.
+        # The reply may be in a cache or belong to other arrays too.
         array.flags.writeable = False
         return array
 
 
 def flat(array: np.ndarray[Any, Any]) -> memoryview | bytes:
-    """Return the array's data, in C order, as a flat buffer of bytes; copies only if it must.
+    """Return the array's data, in C order, as a flat buffer of bytes; copies only if necessary.
 
-    The one place that makes an outgoing buffer: a buffer whose len() is not its size in bytes would
-    be announced with a wrong length, and the rest of the data be read as commands.
+    All outgoing buffers are made here: if len() were not the size in bytes, the server would be sent a wrong length and
+    read the rest of the data as commands.
     """
     if array.nbytes == 0:
         return b""
@@ -122,7 +111,7 @@ def flat(array: np.ndarray[Any, Any]) -> memoryview | bytes:
 
 
 def flat_buffer(word: Any) -> Any:
-    """Return `word` ready to be sent if it is any kind of buffer (a ship's argument), else as it is."""
+    """Return `word` ready to be sent if it is a buffer, else as it is."""
     if isinstance(word, np.ndarray):
         return flat(word)
     if isinstance(word, memoryview | bytearray):
@@ -207,12 +196,11 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
         raise BadData(f"an array has the header {header[10:100]!r}, which is not that of plain data") from None
 
 
-# A structured dtype may take 60 KB to describe: few of these are kept, or a stranger could fill the memory.
+# A structured dtype may take 60 KB to describe: only few of these are cached, or foreign arrays could fill the memory.
 _parse_short, _parse_long = lru_cache(maxsize=1024)(_parse_header), lru_cache(maxsize=16)(_parse_header)
 
 
 def _header_parser(size: int) -> Callable[[bytes], tuple[np.dtype[Any], tuple[int, ...]]]:
-    """Return what parses a header of `size` bytes and remembers the outcome."""
     return _parse_short if size <= _SHORT else _parse_long
 
 
@@ -224,8 +212,7 @@ def _literal(text: str) -> Any:
     Raises:
         ValueError: It is something else, or nested too deep.
     """
-    # One level for each open bracket: the bracket, and the items found in it so far. No recursion, so depth costs no
-    # stack.
+    # One level for each open bracket: the bracket, and the items found in it so far. No recursion.
     levels: list[tuple[str, list[Any]]] = [("", [])]
     kind, items = levels[0]
     complete = False  # whether an item is there that a comma or the end has to follow
@@ -234,7 +221,7 @@ def _literal(text: str) -> Any:
         if what is None:
             continue
         if what == "between":
-            # After nothing; or in a dict a colon where a value was complete, a comma where a key was.
+            # Refused: at the beginning; in a dict a colon after a value, or a comma after a key.
             if not complete or (kind == "{" and len(items) % 2 == 1) != (token["between"] == ":"):
                 raise ValueError(text)
             complete = False
@@ -245,27 +232,25 @@ def _literal(text: str) -> Any:
             kind, items = levels[-1]
             items.append(item)
             complete = True
-        # Nothing that belongs here; two items in a row without a comma between them; too many; too deep.
+        # Refused: a foreign token, two items without a comma, too many items, too deep.
         elif what == "other" or complete or len(items) >= _MOST_FIELDS or len(levels) > _DEEPEST:
             raise ValueError(text)
         elif what == "opening":
             kind, items = token["opening"], []
             levels.append((kind, items))
         else:
-            items.append(_unquoted(token["text"]) if what == "text" else _word(token["word"]))
+            word = token["word"]
+            items.append(
+                _unquoted(token["text"]) if what == "text" else word == "True" if word[0] in "TF" else int(word)
+            )
             complete = True
     if len(levels) != 1 or len(items) != 1 or not complete:
         raise ValueError(text)
     return items[0]
 
 
-def _word(text: str) -> int:
-    """Return the number, or the truth, that a word means."""
-    return text == "True" if text[0] in "TF" else int(text)
-
-
 def _closed(kind: str, items: list[Any], complete: bool) -> Any:
-    """Return the list, tuple or dict of what stands between brackets; `complete` if no comma is the last."""
+    """Return the list, tuple or dict of items between brackets; `complete` if the last token is no comma."""
     if kind == "[":
         return items
     if kind == "{":
@@ -276,7 +261,7 @@ def _closed(kind: str, items: list[Any], complete: bool) -> Any:
 
 
 def _unquoted(text: str) -> str:
-    """Return what a quoted text says; raises ValueError or KeyError for escapes that `repr` does not write."""
+    """Return the text in quotes; raises ValueError or KeyError for escapes that `repr` does not write."""
     return _ESCAPE.sub(lambda it: _SHORT_ESCAPES[it[4]] if it[4] else chr(int(it[1] or it[2] or it[3], 16)), text[1:-1])
 
 
@@ -306,7 +291,6 @@ def _checked_field(field: Any, fields: list[int]) -> tuple[Any, ...]:
         raise ValueError(field)
     name, descr, *shape = field
     names = name if isinstance(name, tuple) else (name,)
-    # A name, or a title and a name.
     if len(names) > 2 or not all(isinstance(text, str) for text in names):
         raise ValueError(name)
     checked = (name, _checked(descr, fields))

@@ -14,7 +14,7 @@ from .base import BlobShip, SpecialDatatypeShip
 from .bytes import BytesShip
 from .numpy import NumpyShip
 
-# Stands for the key in the command that a ship records; no real key begins with a zero byte.
+# In the place of the key in the command that a ship records; no real key begins with a zero byte.
 _STAND_IN = "\0the key\0"
 _METHODS = ("check_fit", "write", "read", "interpret_read", "get_label")
 _JSON_TYPES = frozenset({str, int, float, bool, type(None)})
@@ -22,23 +22,20 @@ _SAMPLES: tuple[Any, ...] = (
     *("", "text", 0, 1, 0.0, 0.5, False, True, None),
     *([], [0], [0.5] * 100, ["text"], [[0.5]], (), (0,), (0.5,) * 3, {}, {"a": 0}, {"a": {"b": [0.5]}}),
 )
-"""What ships are shown to find out whether one takes what JSON could hold."""
+"""Values to test whether a ship takes values of JSON's types."""
 
 
 def default_ships() -> list[SpecialDatatypeShip]:
-    """Return the ships an interface has when none are named: numpy arrays and bytes."""
     return [NumpyShip(), BytesShip()]
 
 
 def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
-    """Return whether any of the ship's methods has to be awaited."""
     return any(inspect.iscoroutinefunction(getattr(ship, name, None)) for name in _METHODS)
 
 
 def _is_plain_blob(ship: BlobShip) -> bool:
-    """Return whether `pack` and `unpack` are all there is to it."""
     kind = type(ship)
-    # A subclass that overrides these has its own commands: it takes the general way, not the one for a single string.
+    # A subclass that overrides these has its own commands, and is handled like any other ship.
     plain = all(getattr(kind, name) is getattr(BlobShip, name) for name in ("write", "read", "interpret_read"))
     return plain and not inspect.iscoroutinefunction(kind.unpack)
 
@@ -62,12 +59,10 @@ class Registered:
         self.describes_exactly = type(ship) in (NumpyShip, BytesShip)
 
     def describe(self, value: Any) -> tuple[int, str]:
-        """Return bytes and a summary of `value`."""
         describe = getattr(self.ship, "describe", None)
         return describe(value) if describe else (0, type(value).__name__)
 
     def read_command(self, key: str) -> Command:
-        """Return the command that fetches what is stored under `key`."""
         return tuple([word.replace(_STAND_IN, key) if isinstance(word, str) else word for word in self._read])
 
 
@@ -75,12 +70,12 @@ class Ships:
     """Chooses ships for values and finds them by label.
 
     Args:
-        ships: The ships, first come first served; they replace the default list.
+        ships: The ships; the first that fits is used.
         new_recorder: Makes an object with redis-py's command methods and a list `commands`.
 
     Attributes:
-        claimed: The types that JSON has of which a ship takes some values.
-        asks_first: Whether there are such types, or asynchronous ships have yet to be asked.
+        claimed: JSON types of which a ship takes some values.
+        asks_first: Whether there are such types, or asynchronous ships were not asked yet.
     """
 
     def __init__(self, ships: Iterable[SpecialDatatypeShip], new_recorder: Callable[[], Any]) -> None:
@@ -102,7 +97,7 @@ class Ships:
 
     async def ready(self) -> None:
         """Ask asynchronous ships for their labels and read commands; does nothing the second time."""
-        # Not a flag: several tasks may be in here at once, and the list is complete only at the end.
+        # Not a flag: several tasks may run this at once, and the list is complete only at the end.
         if len(self._registered) == len(self.given):
             return
         found: list[Registered] = []
@@ -112,7 +107,7 @@ class Ships:
             recorder = self.new_recorder()
             await _settled(ship.read(_STAND_IN, recorder))
             found.append(Registered(ship, await _settled(ship.get_label()), _only(recorder.commands, ship)))
-        # Another task may have been here meanwhile: what it found is the same, and is replaced at once.
+        # Another task may have done the same in between: its equal result is replaced.
         self._registered, self._by_label = [], {}
         self._claim(claimed)
         for registered in found:
@@ -124,19 +119,18 @@ class Ships:
 
     def _register(self, registered: Registered) -> None:
         self._registered.append(registered)
-        # The first ship with a label is the one that reads, as it is the first that is asked to write.
+        # The first ship with a label reads, as it also writes.
         self._by_label.setdefault(registered.label, registered)
 
     def fits(self, value: Any) -> Registered | None:
-        """Return the first ship that takes `value`, or None."""
         for each in self._registered:
             if each.ship.check_fit(value):
                 return each
         return None
 
     async def choices(self, value: Any) -> Callable[[Any], Registered | None]:
-        """Return what `fits` would say for everything inside `value`, asking ships that must be awaited."""
-        # By identity: values need not be hashable, and equal ones may be of different types. `value` keeps them alive.
+        """Return `fits` for everything inside `value`, with ships that must be awaited."""
+        # By id: values need not be hashable, and equal ones may be of different types.
         chosen: dict[int, Registered | None] = {}
         for leaf in _leaves(value, set(), self.claimed):
             chosen[id(leaf)] = await self._first_fit(leaf)
@@ -149,22 +143,17 @@ class Ships:
         return None
 
     def has(self, label: str) -> bool:
-        """Return whether there is a ship with this label."""
         return label in self._by_label
 
     def labelled(self, label: str, where: str) -> Registered:
-        """Return the ship with this label.
-
-        Raises:
-            BadData: This interface has none.
-        """
+        """Return the ship with this label; raises BadData if there is none."""
         try:
             return self._by_label[label]
         except KeyError:
             raise self.lacks(label, where) from None
 
     def lacks(self, label: str, where: str) -> BadData:
-        """Return the error for what a ship wrote that this interface does not have."""
+        """Return the error for a missing ship."""
         known = ", ".join(self._by_label) or "none"
         return BadData(
             f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "
@@ -183,13 +172,13 @@ async def _settled(result: Any) -> Any:
 
 
 def _claims(ship: SpecialDatatypeShip) -> Iterator[type]:
-    """Yield the types that JSON has, of which the ship says that it takes some, or does when shown samples."""
+    """Yield the JSON types that the ship names, or takes samples of."""
     yield from getattr(ship, "claims", ())
-    # Known not to take what JSON has; asking them would cost each new interface 40 calls.
+    # They take none; asking them would cost each new interface 40 calls.
     if type(ship) in (NumpyShip, BytesShip):
         return
     for sample in _SAMPLES:
-        with suppress(Exception):  # it was made to look at other types only
+        with suppress(Exception):  # it may expect other types
             if ship.check_fit(sample):
                 yield type(sample)
 
@@ -204,14 +193,13 @@ async def _asked_claims(ship: SpecialDatatypeShip) -> set[type]:
 
 
 def _leaves(value: Any, seen: set[int], claimed: frozenset[type]) -> Iterator[Any]:
-    """Yield what is inside `value` and not of a built-in type that no ship claims; circles are refused later."""
+    """Yield the values inside `value` that may need a ship; circles are refused later."""
     kind = type(value)
     if id(value) in seen:
         return
     if kind in claimed or (kind not in _JSON_TYPES and kind not in (dict, list, tuple)):
         yield value
     if isinstance(value, dict | list | tuple):
-        # Against lists that hold themselves.
         seen.add(id(value))
         for item in value.values() if isinstance(value, dict) else value:
             yield from _leaves(item, seen, claimed)

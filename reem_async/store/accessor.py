@@ -110,11 +110,11 @@ class Accessor(Handle):
     async def read(self) -> Any:
         """Return the value here. Arrays are read-only: they share memory with the reply.
 
-        None if nothing at all is stored under the top-level key, as redis-py's GET does; the store's `contains`
-        tells whether there is.
+        None if nothing is stored under the top-level key, as with redis-py's GET; the store's `contains` tells whether
+        there is.
 
-        One round trip; two or more the first time that arrays are met, or if they moved. Document
-        and arrays are always of one instant.
+        One round trip; two or more the first time that arrays are met, or if they moved. Document and arrays are always
+        of one instant.
 
         Raises:
             MissingKey: Nothing is stored here, though the top-level key is there.
@@ -212,7 +212,7 @@ class Accessor(Handle):
     async def pop(self, key: str | int = -1, *default: Any) -> Any:
         """Remove the element `key`, by default the last item of a list, and return what it was.
 
-        Three round trips, again if somebody else writes to the same top-level key in between; one if there is nothing
+        Three round trips, again if another client writes to the same top-level key in between; one if there is nothing
         and a default is given, which is then returned.
 
         Raises:
@@ -258,7 +258,7 @@ class Accessor(Handle):
     async def setdefault(self, key: str, default: Any = None) -> Any:
         """Return the value at `key` of the dict here; where there is none, store `default` first.
 
-        One round trip if it is there (two or more for arrays, as `read`), else three, again if somebody else writes
+        One round trip if it is there (two or more for arrays, as `read`), else three, again if another client writes
         to the same top-level key in between.
 
         Raises:
@@ -297,7 +297,7 @@ class Accessor(Handle):
         """Add `number` to the number here; returns the result.
 
         One round trip; two the first time, after a write to the top-level key, and near the ends of 64 bits; more if
-        somebody else writes to the same top-level key in between.
+        another client writes to the same top-level key in between.
 
         Raises:
             MissingKey: Nothing is here.
@@ -323,7 +323,7 @@ class Accessor(Handle):
     async def divide(self, number: float) -> Any:
         """Divide the number here by `number`, as Python's `/` does; returns the result.
 
-        Two round trips, again if somebody else writes to the same top-level key in between. Raises
+        Two round trips, again if another client writes to the same top-level key in between. Raises
         as `increment`, and ZeroDivisionError.
         """
         number_text(number, self.full_path)
@@ -361,13 +361,14 @@ class Accessor(Handle):
     async def expire(self, seconds: float) -> None:
         """Have this top-level key expire: document, arrays and what belongs to it go after `seconds`, at once.
 
-        Followers are told of it as of a deletion. Only for a whole top-level key, `kvs["foo"]`.
+        Subscribers see a deletion. Only for a whole top-level key, `kvs["foo"]`.
 
         A later write keeps the time that is left. Arrays that it stores have none: they stay behind when the document
         expires, until `reem doctor --clean`. So call it again after each write with arrays:
         `kvs["seen"] = {...}; kvs["seen"].expire(2)`. A key that is deleted and written again does not expire.
 
-        One transaction, two round trips, again if somebody else writes to the key in between. Needs the right +pexpire.
+        One transaction, two round trips, again if another client writes to the key in between. Needs the right
+        +pexpire.
 
         Args:
             seconds: How long from now, to the millisecond, by the server's clock; an earlier expiry is replaced.
@@ -395,8 +396,8 @@ class Accessor(Handle):
         Raises:
             MissingKey: Nothing is here (on entering).
             WrongType: It is a number, text or None, which cannot be changed in place.
-            Conflict: Somebody else changed it meanwhile, or others kept writing to the same top-level key (on leaving);
-                nothing was written.
+            Conflict: Another client changed it in between, or others kept writing to the same top-level key (on
+                leaving); nothing was written.
         """
         return Edit(self._reader, self._writer, self._path)
 
@@ -418,8 +419,8 @@ class Accessor(Handle):
         Args:
             policy: What to keep for a loop that is slower than the updates: `Newest()` (the
                 default), `Last(n)` or `Every(bound)`, all from `reem_async`, such as `reem_async.Last(100)`.
-            stored: Yield what is only stored, too. It needs the right to use CLIENT TRACKING; without, a warning is
-                logged, and what is published is told.
+            stored: Yield plain writes too. It needs the right to use CLIENT TRACKING; without, a warning is logged, and
+                only published updates arrive.
         """
         return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
 
@@ -431,8 +432,8 @@ class Accessor(Handle):
 
         Args:
             max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale.
-            largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
-                is told in its place. `kvs["arm"]["image"].read()` fetches it.
+            largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one.
+                `kvs["arm"]["image"].read()` fetches it.
         """
         return Mirror(self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest)
 

@@ -85,9 +85,8 @@ async def names(interface: RedisInterface, pattern: str = "*") -> AsyncIterator[
         interface: The server.
         pattern: A glob: `*` and `?` stand for other characters.
 
-    One round trip for about 1000 keys of the server, whoever they belong to; in a cluster all primaries are
-    asked, one after the other. A key that is written, deleted or moved to another node meanwhile may or
-    may not be among them.
+    One round trip for about 1000 keys of the server, foreign ones too; in a cluster all primaries are asked, one after
+    the other. A key that is written, deleted or moved to another node in between may or may not be among them.
 
     Raises:
         ClusterNode: The server is one node of several.

@@ -46,26 +46,25 @@ Attachments = tuple[EncodedAttachment, ...]
 
 
 class Assignment(NamedTuple):
-    """What a call stores or removes at one place, encoded.
+    """One encoded value that a call stores, or a place that it removes.
 
     Attributes:
         path: The place, below the top-level key.
-        text: The text of the document there; None if what is there is removed.
-        attachments: What goes by ship.
-        is_entry: It goes into a dict that has to be there: an array does not make its top-level key.
+        text: The JSON text; None to remove the value.
+        attachments: The values that ships store.
+        is_entry: Whether the dict above must exist: an array does not make its top-level key.
     """
 
     path: Path
     text: bytes | None
-    attachments: tuple[EncodedAttachment, ...] = ()
+    attachments: Attachments = ()
     is_entry: bool = False
 
 
 class Turn:
-    """The turn of one call, and how subscribers are notified of what it changes. This one notifies no one.
+    """The turn of one call, and the announcements of its changes. This one has none, so calls need not wait.
 
-    So calls need not wait for each other. Used as an async context manager: entering waits for the turn of the call,
-    the next one begins when it is left.
+    An async context manager: entering waits for the turn of the call, leaving starts the next one.
 
     Attributes:
         time: When the call was made, in seconds since 1970; None for now.
@@ -84,28 +83,28 @@ class Turn:
     def reserve(
         self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
     ) -> Announcement:
-        """Return the announcement of the next change; of one that sets a value, with its text and attachments."""
+        """Return the announcement of the next change; text and attachments if it sets a value."""
         return SILENT
 
     def not_applied(self, count: int) -> None:
         """Note that the last `count` changes were not applied: their numbers are free."""
 
     def release(self) -> None:
-        """Give back the numbers that the changes so far have not used."""
+        """Give back the numbers that the changes so far did not use."""
 
 
 _SILENT_TURN = Turn()
 
 
 class Outages(Protocol):
-    """What is done while the server is out of reach."""
+    """`outage.Outage`."""
 
     async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
-        """Send the assignments of one call, or do with them what is to be done in an outage."""
+        """Send the assignments of one call; in an outage, keep or drop them."""
         ...
 
     async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
-        """Send what depends on what is there, behind what is kept; raises in an outage."""
+        """Send a change that depends on the stored value, after the kept updates; raises in an outage."""
         ...
 
 
@@ -134,14 +133,14 @@ class DocumentWriter:
     Args:
         session: The server.
         name: The key.
-        outages: What is done in an outage; None if calls raise.
+        outages: The policy for outages; None if calls raise.
 
     Attributes:
         encoder: Encodes the values.
         keeps_order: A later call must not overtake an earlier one.
     """
 
-    # Calls of one task are in order anyhow: each is awaited. Those of several tasks have none.
+    # A task awaits each of its calls, so they are in order. Those of several tasks need not be.
     keeps_order = False
 
     def __init__(self, session: Session, name: object, outages: Outages | None = None) -> None:
@@ -152,11 +151,10 @@ class DocumentWriter:
         self._outages = outages
 
     def turn(self) -> Turn:
-        """Return the turn of a call."""
         return _SILENT_TURN
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
-        """Return what makes another one, which can be pickled."""
+        """Return a factory that can be pickled."""
         return type(self)
 
     async def check(self, value: Any) -> None:
@@ -164,8 +162,7 @@ class DocumentWriter:
         await self.encoder.encoded((), value)
 
     async def set(self, path: Path, value: Any) -> None:
-        """Store `value` at `path`: one transaction."""
-        # The hot path: a value that is plain JSON goes on without anything that ships or sizes may ask for.
+        # The hot path: plain JSON needs no ships and no sizes.
         text = self.encoder.plain(path, value)
         if text is None:
             await self._set_shipped(path, value)
@@ -175,35 +172,31 @@ class DocumentWriter:
         await self._set(path, text, ())
 
     async def _set_shipped(self, path: Path, value: Any) -> None:
-        """Store what is not plain JSON."""
         text, attachments = await self.encoder.walked(path, value)
         if attachments and await self._let_pass(attachments):
-            # Another task may have changed an array meanwhile; all that is stored is to be of one instant.
+            # Another task may have changed an array in between; all parts must be of one instant.
             text, attachments = await self.encoder.walked(path, value)
         await self._set(path, text, attachments)
 
     def _store(self, assignments: Sequence[Assignment]) -> Awaitable[None]:
         return self.in_turn(self.send, assignments) if self._outages is None else self._outages.put(self, assignments)
 
-    def _set(self, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> Awaitable[None]:
+    def _set(self, path: Path, text: bytes, attachments: Attachments) -> Awaitable[None]:
         if self._outages is None:
             return self.in_turn(self._put, path, text, attachments)
         return self._store([Assignment(path, text, attachments)])
 
     def _demand(self, send: Callable[..., Awaitable[Any]], *what: Any) -> Awaitable[Any]:
-        """Send what depends on what is there."""
         return self.in_turn(send, *what) if self._outages is None else self._outages.demand(self, send, what)
 
-    async def _let_pass(self, attachments: tuple[EncodedAttachment, ...]) -> bool:
-        """Let small calls that are under way be answered before a large one; returns whether it waited."""
-        # A publisher that let others pass would publish out of order.
+    async def _let_pass(self, attachments: Attachments) -> bool:
+        """Wait until small calls in progress are answered before a large one; return whether it waited."""
         if self.keeps_order or not any(has_large(each.commands) for each in attachments):
             return False
         return await self.session.transport.let_pass()
 
     async def update(self, path: Path, values: dict[str, Any]) -> None:
         """Store each of `values` in the dict at `path`: one transaction."""
-        # One for the whole call, so that what belongs together can be told by its names.
         tail = unique_tail() if has_index(path) else ""
         encoded = [
             ((*path, check_name(key, (self.name, *path))), await self.encoder.encoded((*path, key), value, tail))
@@ -216,8 +209,7 @@ class DocumentWriter:
             await self._store(assignments)
 
     async def delete(self, path: Path) -> None:
-        """Remove what is at `path`."""
-        # Kept in an outage as a value is: a deletion is the newest state of its place.
+        # Kept in an outage like a value: a deletion is the newest state of its place.
         await self._store([Assignment(path, None)])
 
     async def extend(self, path: Path, values: Sequence[Any]) -> None:
@@ -253,15 +245,15 @@ class DocumentWriter:
         return await self._demand(self._calculate, plan)
 
     async def exchange(self, path: Path, value: Any, before: RawRead) -> None:
-        """Store `value` at `path` if what is there is still `before`; raises Conflict."""
+        """Store `value` at `path` if the stored value is still `before`; raises Conflict."""
         await self._demand(self._put_instead, path, *await self.encoder.encoded(path, value, unique_tail()), before)
 
     async def put_absent(self, path: Path, value: Any, why: MissingKey) -> None:
-        """Store `value` at `path` if still nothing is there, which a read has found by raising `why`; or Conflict."""
+        """Store `value` at `path` if still nothing is there, as the error `why` of a read says; raises Conflict."""
         await self.exchange(path, value, nothing(self.keys, path, why))
 
     async def expire(self, path: Path, seconds: float | None) -> None:
-        """Have the whole top-level key expire; None: end its expiry."""
+        """Let the whole top-level key expire; None removes the expiry."""
         if path:
             raise BadKey(
                 f"{show((self.name, *path))}: only a whole top-level key can expire; use kvs[{self.name!r}], or store "
@@ -270,30 +262,29 @@ class DocumentWriter:
         await self._demand(self._expire, None if seconds is None else _milliseconds(seconds, self.name))
 
     async def take(self, path: Path, before: RawRead) -> None:
-        """Remove what is at `path` if it is still `before`; raises Conflict."""
+        """Remove the value at `path` if it is still `before`; raises Conflict."""
         await self._demand(self._take, path, before)
 
     async def in_turn(self, send: Callable[..., Awaitable[Any]], *what: Any) -> Any:
-        """Call `send` with the turn of this call and `what` it is to send; returns its result.
+        """Return the result of `send`, called with the turn of this call and `what` to send.
 
-        If it is broken off, the next change of the same key looks for what it may have left.
+        If it is interrupted, the next change of the same key removes what it may have left.
         """
         session, document = self.session, self.keys.document
         async with self.turn() as turn:
-            # What cancelled calls have left on its way, over another connection, must not come after this. There is
-            # nearly never anything to wait for, and a coroutine costs time.
+            # Commands of cancelled calls may still be on their way over another connection, and must not come after
+            # this. There are nearly never any, and a coroutine costs time.
             if not session.transport.is_settled(document):
                 await session.transport.settle(document)
             try:
                 return await send(turn, *what)
             except BaseException as error:
-                # Cancelled, interrupted, or without an answer: nobody knows what was applied, and a later change cleans
-                # up.
+                # Cancelled, interrupted, or without a reply: it is unknown what was applied. A later change cleans up.
                 if _may_have_left(error):
                     session.cache.broke_off(document)
                 else:
                     session.cache.forget_numbers(document)
-                # The message says all; the steps of the library on the way here would only hide the caller's own line.
+                # The message says all; REEM's own frames would only hide the caller's line.
                 if isinstance(error, SELF_EXPLANATORY):
                     raise error.with_traceback(None) from None
                 raise
@@ -306,7 +297,7 @@ class DocumentWriter:
         path, text, attachments, _ = assignments[0]
         await (self._remove(turn, path) if text is None else self._put(turn, path, text, attachments))
 
-    async def _put(self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> None:
+    async def _put(self, turn: Turn, path: Path, text: bytes, attachments: Attachments) -> None:
         """Store a value; a single array just below a top-level key that is not there makes that."""
         try:
             if attachments:
@@ -316,18 +307,18 @@ class DocumentWriter:
                 await it.announcement.share(path)
             await self.session.run(change(it, self.session.cache))
         except MissingTop:
-            # Only for `kvs["cam"]["image"] = array`: it would be of no use to have to write {} first.
+            # Only for `kvs["cam"]["image"] = array`, so that no {} must be written first.
             if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
                 raise
         else:
             self._saw_new(path)
             return
-        turn.release()  # that it was refused was told, with numbers of its own
+        turn.release()  # the refusal was announced with numbers of its own
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
 
     def _saw_new(self, path: Path) -> None:
-        """Note that nothing that an old version stored is left, if the whole document was written."""
+        """Note that nothing of an old version is left, if the whole document was written."""
         if not path and self.keys.document not in self.session.cache.new:
             self.session.cache.saw_new(self.keys.document)
 
@@ -342,10 +333,9 @@ class DocumentWriter:
         await self.session.run(together(changes, self.session.cache))
 
     async def _put_instead(
-        self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...], before: RawRead
+        self, turn: Turn, path: Path, text: bytes, attachments: Attachments, before: RawRead
     ) -> None:
-        # Something that was there could be replaced, so its place can take an array as well.
-        if attachments and not before.holder:  # it is put where nothing is
+        if attachments and not before.holder:  # nothing was there, so the place must be checked
             await self._check_place(path, attachments)
         await self._if_still(before, set_change(self.keys, path, text, attachments, announcement=turn.reserve()))
 
@@ -356,7 +346,7 @@ class DocumentWriter:
         await self._if_still(before, delete_change(self.keys, path, announcement=turn.reserve(deleted=True)))
 
     async def _if_still(self, before: RawRead, it: DocumentChange) -> None:
-        # What was read names its arrays, and the transaction fails if anything is not as it was read: these are all.
+        # The transaction fails if anything has changed, so the arrays that were read are all there are.
         it = it._replace(gone=tuple(slot.placeholder.suffix.encode() for slot, _, _ in before.slots))
         await self.session.run(exchange(it, before.commands, before.raw, self.session.cache))
 
@@ -364,10 +354,8 @@ class DocumentWriter:
         it = delete_change(self.keys, path, announcement=turn.reserve(deleted=True))
         await self.session.run(change(it, self.session.cache))
 
-    async def _append(
-        self, turn: Turn, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...]
-    ) -> None:
-        if attachments:  # they would be stored though there is no list to append to
+    async def _append(self, turn: Turn, path: Path, texts: Sequence[bytes], attachments: Attachments) -> None:
+        if attachments:  # they would be stored even if there is no list
             await self.session.run(appendable(self.keys, path))
         it = append_change(self.keys, path, texts, attachments, announcement=turn.reserve())
         await self.session.run(change(it, self.session.cache))
@@ -375,13 +363,11 @@ class DocumentWriter:
     async def _calculate(self, turn: Turn, plan: Callable[[Announcement], Plan]) -> Any:
         return await self.session.run(plan(turn.reserve()))
 
-    async def _check_place(self, path: Path, attachments: tuple[EncodedAttachment, ...]) -> None:
-        """Raise PathRefused if ships' values would be stored for nothing."""
+    async def _check_place(self, path: Path, attachments: Attachments) -> None:
+        """Raise PathRefused if nothing can be set at `path`: the attachments would be stored for nothing."""
         plan = takes(self.keys, path, attachments, self.session.cache)
         if plan is not None:
             await self.session.run(plan)
 
-    def _setting(
-        self, turn: Turn, path: Path, text: bytes, attachments: tuple[EncodedAttachment, ...]
-    ) -> DocumentChange:
+    def _setting(self, turn: Turn, path: Path, text: bytes, attachments: Attachments) -> DocumentChange:
         return set_change(self.keys, path, text, attachments, turn.reserve(text, attachments))

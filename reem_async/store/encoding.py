@@ -1,4 +1,4 @@
-"""From the values of calls to what is stored: the text of a document, and what goes by ship."""
+"""Encode the values of calls: the text of the document, and the attachments."""
 
 from __future__ import annotations
 
@@ -17,43 +17,33 @@ from ..plan.sizes import USUAL, check_sizes, limits, sizes_of
 from ..session import Session
 
 HUGE = 256 << 20
-"""Bytes from which it is looked exactly whether the server takes a value; a ship may need more for it than it says."""
+"""Bytes from which the size of a value is checked exactly; a ship may need more than it says."""
 
 Encoded = tuple[bytes, tuple[EncodedAttachment, ...]]
-"""The text of a document, and what goes by ship."""
 
 
 def unique_tail() -> str:
-    """Return a tail for names of ships' keys: in lists items move while their keys keep their names."""
+    """Return a tail for names of attachments: in lists items move while their attachments keep their names."""
     # 40 bits, behind the path: no two arrays in the lists of one top-level key get the same name by chance.
     return secrets.token_hex(5)
 
 
 class Encoder:
-    """Encodes the values of one top-level key, and refuses what cannot be stored.
-
-    Args:
-        session: The server.
-        keys: The names of the top-level key.
-    """
+    """Encodes the values of one top-level key, and refuses what cannot be stored."""
 
     def __init__(self, session: Session, keys: Keys) -> None:
         self._session = session
         self._keys = keys
 
     def plain(self, path: Path, value: Any) -> bytes | None:
-        """Return the text of a value that is plain JSON; None for any other. Its size is not looked at."""
-        # A ship may claim types that orjson would write by itself: then every value is walked through.
+        """Return the text of a value that is plain JSON; None for any other. Its size is not checked."""
+        # A ship may claim types that orjson would write itself: then every value is walked through.
         return None if self._session.ships.asks_first else plain(value, len(path))
 
     async def encoded(self, path: Path, value: Any, tail: str | None = None) -> Encoded:
-        """Encode a value for `path`, and have the ships record their commands.
+        """Encode a value for `path`; raises BadInput.
 
-        `tail` goes behind the names of ships' keys; if it is not given, one is made up where the path leads through a
-        list.
-
-        Raises:
-            BadInput: It cannot be stored.
+        `tail` ends the names of attachments; if it is None, one is made if the path leads through a list.
         """
         text = self.plain(path, value)
         if text is None:
@@ -62,24 +52,23 @@ class Encoder:
         return text, ()
 
     async def walked(self, path: Path, value: Any, tail: str | None = None) -> Encoded:
-        """Encode a value that is not plain JSON: look at each part of it, and have the ships record their commands."""
+        """Encode a value that is not plain JSON, visiting each part of it."""
         if tail is None:
             tail = unique_tail() if has_index(path) else ""
         ships = self._session.ships
         fits: Any = ships.fits
         if ships.asynchronous:
             await ships.ready()
-            # Asked before the walk, which cannot wait.
+            # Before the walk, which cannot wait.
             fits = await ships.choices(value)
 
         def name(inner: Path) -> str:
             return suffix(path + inner) + (f"~{tail}" if tail else "")
 
         found = walk(value, (self._keys.name, *path), fits, name, ships.claimed)
-        # The sizes that ships name are a quick check, the exact ones are taken where it comes near to what servers
-        # refuse.
+        # First a quick check by the sizes that ships name, then an exact one near the limits of servers.
         is_huge = len(found.text) + sum([each.size for each in found.attachments]) > HUGE
-        # Before packing too: an array that takes no memory (np.broadcast_to) is copied out in full by that.
+        # Before packing too, which copies an array that takes no memory (np.broadcast_to) in full.
         if is_huge and (exact := [each for each in found.attachments if each.ship.describes_exactly]):
             await self._check_limits([(self._where(each.suffix), each.size) for each in exact])
         attachments = [
@@ -93,14 +82,14 @@ class Encoder:
     async def check_sizes(
         self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment] = ()
     ) -> None:
-        """Raise BadValue if the server would close the connection upon so much in one call."""
+        """Raise BadValue if the server would close the connection because of the size of the call."""
         if sum(map(len, texts)) + sum([sum(sizes_of(each.commands)) for each in attachments]) > HUGE:
             await self._ask_for_limits(path, texts, attachments)
 
     async def _ask_for_limits(
         self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment]
     ) -> None:
-        """Look exactly; the server is asked if it is in doubt."""
+        """Check the exact sizes, by the server's limits if they are over the defaults."""
         sizes = [(show((self._keys.name, *path)), len(text)) for text in texts]
         for each in attachments:
             sizes += [(self._where(each.suffix), size) for size in sizes_of(each.commands)]
@@ -110,7 +99,7 @@ class Encoder:
         return self._keys.name + suffix.partition("~")[0]
 
     async def _check_limits(self, sizes: Sequence[tuple[str, int]]) -> None:
-        # Most servers have the usual limits, and a value within them needs no question.
+        # A value within the default limits needs no question.
         try:
             check_sizes(sizes, USUAL)
         except BadValue:
@@ -119,13 +108,13 @@ class Encoder:
 
     def _packed(self, attachment: Attachment) -> EncodedAttachment:
         blob = attachment.ship.blob.pack(attachment.value)
-        # Several pieces stay apart, header and data: the transport sends them as they are, so an array is not copied.
+        # Header and data stay apart: the transport sends the pieces as they are, so an array is not copied.
         command = ("SET", self._keys.tag + attachment.suffix, blob[0] if len(blob) == 1 else blob)
         return EncodedAttachment(attachment.suffix, attachment.ship.label, (command,), blob)
 
     async def _recorded(self, attachment: Attachment) -> EncodedAttachment:
         key, ship = self._keys.tag + attachment.suffix, attachment.ship
-        # A ship of the original kind writes to a client itself; here it is given one that only notes the commands.
+        # The client that the ship writes to only records the commands.
         recorder = self._session.ships.new_recorder()
         result = ship.ship.write(key, attachment.value, recorder)
         if inspect.isawaitable(result):

@@ -1,13 +1,13 @@
-"""What a publisher does in an outage: drop updates, or keep the newest of each place and send it afterwards.
+"""Outages of a publisher: drop updates, or keep the newest of each place and send it afterwards.
 
-                 a call finds no server, or loses it             it answers, and has taken what was kept
+                 a call finds no server, or loses it             it answers, and has stored the kept updates
     within reach ----------------------------------> out of reach ---------------------------------> within reach
 
-Out of reach, calls do not ask the server: what they publish is dropped or kept at once. One background task asks, with
-growing pauses, and then sends what was kept, in the order of the calls.
+While a key is out of reach, calls do not ask the server: their updates are dropped or kept at once. One background task
+asks, with growing pauses, and then sends the kept updates in the order of the calls.
 
-A key is out of reach while it is in `_out`. It gets there, and away again, in its turn (`DocumentWriter.in_turn`) only:
-so what is kept is sent before anything later, and nothing is kept that nobody would send.
+A key is out of reach while it is in `_out`. It is added and removed only in its turn (`DocumentWriter.in_turn`), so
+kept updates are sent before any later one, and every kept update is sent.
 """
 
 from __future__ import annotations
@@ -44,17 +44,16 @@ logger = logging.getLogger("reem.publish")
 _POLICIES = ("raise", "drop", "newest")
 
 _PAUSES = (0.02, 0.05, 0.1, 0.2, 0.25)
-"""Seconds between questions whether the server is back; the last one from then on."""
+"""Seconds between two attempts to reach the server; the last one repeats."""
 
 _MOST = 256 << 20
-"""Bytes of values that are kept, of all keys together."""
+"""Bytes of kept values, of all keys together."""
 
 _OVERHEAD = 500
-"""Bytes of what belongs to a kept value besides, about."""
+"""Bytes that a kept value needs besides its content, about."""
 
 _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
-"""What a call raises in an outage; but for TlsRefused, a NotConnected that no waiting mends."""
-
+"""Errors of an outage; except TlsRefused, a NotConnected that does not end by waiting."""
 
 _Place = tuple[Path, int]
 """A path, and how many items had been removed from its outermost list before."""
@@ -65,8 +64,8 @@ class _Kept(NamedTuple):
 
     Attributes:
         assignment: With bytes of its own.
-        size: Its bytes.
-        time: When it was published, in seconds since 1970.
+        size: Bytes.
+        time: Seconds since 1970 on which it was published.
     """
 
     assignment: Assignment
@@ -75,14 +74,14 @@ class _Kept(NamedTuple):
 
 
 class _Out:
-    """A top-level key that is out of reach, and what is kept of it, in the order of the calls.
+    """A top-level key that is out of reach, and its kept updates in the order of the calls.
 
     A newer value of a place replaces older ones of the same place and inside it. An index of a list names another item
-    after an item was removed. So a removal of an item is never replaced by another one, and what was kept of the
-    list's items before it is not replaced by what comes after it. Only a new list, or what is around it, replaces both.
+    after a removal. So a removal is never replaced by another one, and updates of items before it are not replaced by
+    those after it. Only a value of the whole list, or of a place above, replaces both.
 
     Attributes:
-        sending: How many are on their way and not among those kept.
+        sending: How many are being sent and not among those kept.
     """
 
     def __init__(self, writer: DocumentWriter) -> None:
@@ -93,7 +92,7 @@ class _Out:
         self._removals: dict[Path, int] = {}  # of items, by the outermost list
 
     def put(self, it: _Kept) -> int:
-        """Keep an assignment in place of those that it replaces; returns how many these are."""
+        """Keep an assignment in place of those that it replaces; return their number."""
         path = it.assignment.path
         outermost = _outermost_list(path)
         place = path, self._removals.get(outermost, 0) if outermost is not None else 0
@@ -112,26 +111,16 @@ class _Out:
         return it
 
     def put_back(self, place: _Place, it: _Kept) -> None:
-        """Keep it again, before all others."""
         self.kept = {place: it, **self.kept}
         self.size += it.size
 
 
 def _outermost_list(path: Path) -> Path | None:
-    """Return the path of the outermost list that a path names an item of, None if there is none."""
     return next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
 
 
 class Outage:
-    """The outages of one PublishSpace.
-
-    Args:
-        session: The server.
-        policy: "drop" or "newest".
-
-    Attributes:
-        policy: The same.
-    """
+    """The outages of one PublishSpace, with the policy "drop" or "newest"."""
 
     def __init__(self, session: Session, policy: str) -> None:
         self.policy = policy
@@ -141,37 +130,31 @@ class Outage:
         _every.add(self)
 
     def forget(self) -> None:
-        """Know of no outage, as a forked child does: what is kept is for its parent to send."""
+        """Reset the state, also in a forked child: the parent sends the kept updates."""
         self._out: dict[str, _Out] = {}  # by document
-        self._dropped: dict[str, int] = {}  # likewise: counted in a key's turn, so that threads lose no count
+        self._dropped: dict[str, int] = {}  # likewise; counted in a key's turn, so threads lose no count
         self._is_closed = False
-        self._told = 0  # how many were dropped when the last outage began
-        self._asking: asyncio.AbstractEventLoop | bool = (
-            False  # a task asks whether the server is back, in this event loop
-        )
-        self._away = False  # the server has not answered since it was last called or asked
+        self._dropped_before = 0  # how many were dropped when the last outage began
+        # A task asks whether the server is back, in this event loop; True in the blocking front.
+        self._asking: asyncio.AbstractEventLoop | bool = False
+        self._away = False  # the server did not answer the last call or question
 
     @classmethod
     def chosen(cls, session: Session, policy: str) -> Outage | None:
-        """Return what does as a policy says; None for "raise". Raises BadValue."""
+        """Return the outages with a policy; None for "raise". Raises BadValue."""
         if policy not in _POLICIES:
             raise BadValue(f"outage={policy!r:.40}: say 'raise', 'drop' or 'newest'")
         return None if policy == "raise" else cls(session, policy)
 
     @property
     def dropped(self) -> int:
-        """How many updates were not published, or not for certain."""
         return sum(list(self._dropped.values()))
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept to be sent, or on their way and not answered yet."""
         return sum([len(out.kept) + out.sending for out in list(self._out.values())])
 
-    # Calls.
-
     async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
-        """Send the updates of one call; in an outage do as the policy says."""
         called = time.time()  # before it waits for its turn, and for a server that does not answer
         try:
             await writer.in_turn(self._put, writer, assignments, called)
@@ -180,13 +163,12 @@ class Outage:
                 raise
 
     async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
-        """Send what depends on what is there, behind what is kept; raises in an outage."""
         return await writer.in_turn(self._demand, writer, send, what)
 
     async def _put(self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
         if self._is_out(writer.keys):
             self._take(writer, assignments, called)
-            self._have_asked()
+            self._start_asking()
             return
         try:
             await writer.send(turn, assignments)
@@ -206,30 +188,29 @@ class Outage:
     def _is_out(self, keys: Keys) -> bool:
         if not self._out:
             return False
-        # One server has all keys, and is not waited for once for each of them; of a cluster, other nodes may answer.
-        # Once it answers, a key whose turn has come stays within reach while others wait for theirs.
+        # A single server has all keys, so one call that times out is enough; of a cluster, other nodes may answer. Once
+        # the server answers, a key whose turn has come is within reach while others still wait.
         return keys.document in self._out or (self._away and not self._session.transport.sharded)
 
     def _begin(
         self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float, error: ReemError
     ) -> None:
-        """Note that a key is out of reach, and do with the updates that met this as the policy says."""
+        """Note that a key is out of reach, and apply the policy to the updates of this call."""
         is_first = not self._out
         self._away = True
         self._out.setdefault(writer.keys.document, _Out(writer))
-        if is_first:  # noted before it is logged: a log handler may publish, too
-            self._told = self.dropped
+        if is_first:  # noted before it is logged: a log handler may publish too
+            self._dropped_before = self.dropped
             what = "dropped" if self.policy == "drop" else "kept, the newest of each place,"
-            logger.warning("what is published is %s until the server is back: %s", what, error)
+            logger.warning("updates are %s until the server is back: %s", what, error)
         if isinstance(error, ConnectionLost):  # it was applied or not: sent again, it could be applied twice
             self._count(writer.keys, len(assignments))
         else:
             turn.not_applied(len(assignments))
             self._take(writer, assignments, called)
-        self._have_asked()
+        self._start_asking()
 
     def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
-        """Drop updates, or keep them in place of older ones."""
         out = self._out.setdefault(writer.keys.document, _Out(writer))
         if self.policy == "drop":
             self._drop(writer.keys, len(assignments))
@@ -242,7 +223,7 @@ class Outage:
             self._drop(writer.keys, 1)
 
     def _drop(self, keys: Keys, count: int) -> None:
-        """Count updates that are not published, and use up their numbers, so that subscribers are told of a gap."""
+        """Count updates that are not published, and use up their numbers, so that subscribers see a gap."""
         self._count(keys, count)
         for _ in range(count):
             self._session.stamp(keys)
@@ -251,10 +232,8 @@ class Outage:
         if count:
             self._dropped[keys.document] = self._dropped.get(keys.document, 0) + count
 
-    # The way back.
-
-    def _have_asked(self) -> None:
-        """Have a task ask whether the server is back, if none does."""
+    def _start_asking(self) -> None:
+        """Start a task that asks whether the server is back, if there is none."""
         if not self._out:
             return
         if self._asking is True or (self._asking and not self._asking.is_closed()):
@@ -278,16 +257,16 @@ class Outage:
         except InterfaceClosed:  # `close` counts what was kept
             return
         finally:
-            if self._asking is asking:  # else a closed event loop ended this, and the next one has a task of its own
+            if self._asking is asking:  # else a closed event loop ended this, and the next one has its own task
                 self._asking = False
-        if self._out:  # a call has come just before
-            self._have_asked()
+        if self._out:  # added by a call just now
+            self._start_asking()
         if self._out or self._is_closed:
             return
-        logger.warning("the server answers again; %d updates were dropped", self.dropped - self._told)
+        logger.warning("the server answers again; %d updates were dropped", self.dropped - self._dropped_before)
 
     async def _all_sent(self) -> bool:
-        """Send what is kept of each key; return whether all of it was taken."""
+        """Send the kept updates of each key; return whether all were stored."""
         every = True
         for out in list(self._out.values()):
             if not (await self._answers(out) and await self._sent(out)):
@@ -297,12 +276,12 @@ class Outage:
         return every
 
     async def _answers(self, out: _Out) -> bool:
-        """Ask the server of a key whether it is back; not in the key's turn, which callers would wait for."""
+        """Ask the server of a key whether it is back; not in the key's turn, for which callers would wait."""
         try:
             await self._session.run(exists(out.writer.keys))
         except InterfaceClosed:
             raise
-        except (ReemError, RedisError) as error:  # any other answer, of what this user may not for example, is one
+        except (ReemError, RedisError) as error:  # any other error, such as a missing right, is an answer
             self._away = isinstance(error, _AWAY)
         else:
             self._away = False
@@ -317,16 +296,16 @@ class Outage:
         return True
 
     async def _flush(self, turn: Turn, out: _Out) -> None:
-        """Send what is kept of a key, in its turn. If that is broken off, what is left stays."""
+        """Send the kept updates of a key, in its turn. If that is interrupted, the rest stays."""
         keys = out.writer.keys
         while out.kept:
             out.sending = 1
             place = next(iter(out.kept))
-            it = out.pop(place)  # first: whatever happens now, it is not sent twice
+            it = out.pop(place)  # first, so that it is never sent twice
             turn.time = it.time
             try:
                 await out.writer.send(turn, [it.assignment])
-            except MissingKey:  # it was to be removed, and is not there any more
+            except MissingKey:  # a deletion of a value that is gone
                 continue
             except (NotConnected, ServerNotReady):
                 turn.not_applied(1)
@@ -345,7 +324,7 @@ class Outage:
         self._out.pop(keys.document, None)
 
     def close(self) -> None:
-        """Give up what is kept."""
+        """Drop the kept updates."""
         self._is_closed = True
         left, self._out = self._out, {}
         for out in left.values():
@@ -368,12 +347,12 @@ if hasattr(os, "register_at_fork"):
 
 
 def _owned(it: Assignment) -> Assignment:
-    """Return it with bytes of its own: the caller may change his arrays."""
+    # The caller may change the arrays.
     return it._replace(attachments=tuple([_copied(each) for each in it.attachments]))
 
 
 def _copied(it: EncodedAttachment) -> EncodedAttachment:
-    made: dict[int, Any] = {}  # the bytes of an array stand in its command and in its blob: they are copied once
+    made: dict[int, Any] = {}  # the bytes of an array are in its command and in its blob, but are copied once
 
     def own(word: Any) -> Any:
         if type(word) is tuple:

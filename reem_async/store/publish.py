@@ -23,18 +23,14 @@ from .outage import Outage
 from .store import KeyValueStore
 
 _Stamp = tuple[str, int]
-"""Who publishes, and the number of the update."""
+"""Publisher and number of an update."""
 
 
 class PublishTurn(Turn):
     """The turn of one call that publishes, and the numbers that are reserved for its changes.
 
-    Updates of one interface to one top-level key are numbered and arrive in this order, so such
-    calls wait for each other; those to different keys do not.
-
-    Args:
-        session: The server.
-        keys: The names of the key.
+    Updates of one interface to one top-level key are numbered and arrive in this order, so such calls wait for each
+    other.
     """
 
     __slots__ = ("_announcements", "_keys", "_order", "_session", "time")
@@ -43,7 +39,7 @@ class PublishTurn(Turn):
         self.time: float | None = None
         self._session = session
         self._keys = keys
-        # Belongs to the interface, not to this object: other stores, and threads, may publish to the same key.
+        # Shared by the interface: other stores, and threads, may publish to the same key.
         self._order = session.transport.ordered(keys.channel)
         self._announcements: list[UpdateAnnouncement] = []
 
@@ -56,7 +52,7 @@ class PublishTurn(Turn):
     ) -> None:
         if isinstance(error, Contended):
             self.not_applied(len(self._announcements))
-        # Before the next call's turn begins: it takes the numbers from where this one has left them.
+        # Before the next call's turn begins, which continues with the next number.
         self.release()
         await self._order.__aexit__(kind, error, trace)
 
@@ -75,7 +71,7 @@ class PublishTurn(Turn):
             announcement.not_applied()
 
     def release(self) -> None:
-        # The last reserved number goes back first, as they are only taken back from the end.
+        # The last reserved number first: the session accepts only its newest number.
         while self._announcements:
             self._announcements.pop().release()
 
@@ -90,11 +86,11 @@ class UpdateAnnouncement(Announcement):
         self._keys = keys
         self._time = time
         self._deleted = deleted
-        # States of a number: reserved -> made (in a plan) -> told, when the plan was applied; from reserved, or by
-        # `unsent` and `not_applied` from made, it goes back to the session.
+        # A number is first reserved, then in a plan (made), then used. `release` gives back a reserved number, `unsent`
+        # and `not_applied` one of a plan that was not applied.
         self._reserved: list[_Stamp] = [session.stamp(keys)]
         self._made: _Stamp = self._reserved[0]
-        # In a cluster, those who look for keys by pattern hear of a new key on all nodes for its first seconds.
+        # In a cluster, clients that find keys by pattern get the first notices of a key on any node.
         self._everywhere = session.is_fresh(keys)
 
     def commands(self, path: Path) -> list[Command]:
@@ -112,10 +108,10 @@ class UpdateAnnouncement(Announcement):
             self._session.take_back(self._keys, self._reserved.pop())
 
     def _numbered(self, path: Path, payload: Callable[[_Stamp, Path], bytes]) -> list[Command]:
-        # The reserved number; a further one where the replies say that what was told is to be told anew.
+        # The reserved number; another one for a correction.
         self._made = stamp = self._reserved.pop() if self._reserved else self._session.stamp(self._keys)
         place = notify_path(path)
-        # Told as a change of the place above: what is there is looked at.
+        # A change at a path that is too long is announced at a place above, without the value.
         text = payload(stamp, path) if place is path else announce(*stamp, self._time or time.time(), place)
         return published(self._keys, *stamp, text, everywhere=self._everywhere)
 
@@ -124,9 +120,9 @@ class UpdateAnnouncement(Announcement):
 
 
 class ValueAnnouncement(UpdateAnnouncement):
-    """Notifies subscribers of a value that is set; a small one travels in the notice.
+    """Notifies subscribers of a value that is set; the notice carries a small one.
 
-    If the server refuses it, subscribers are told to look at what is there.
+    If the server refuses the value, another notice has subscribers read the stored one.
     """
 
     __slots__ = ("_attachments", "_slot", "_text")
@@ -138,9 +134,9 @@ class ValueAnnouncement(UpdateAnnouncement):
         self._slot: Slot | None = None
 
     async def share(self, path: Path) -> None:
-        """Put the value into shared memory if it is large and a subscriber on this host listens.
+        """Put the value into shared memory if it is large and there is a subscriber on this host.
 
-        In early mode, notify it now. One round trip more for each early update, and else for one update a second.
+        In early mode, notify it now. One more round trip for each early update, else for one update a second.
         """
         sizes = sizes_of_parts(self._text, self._attachments)
         if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or notify_path(path) is not path:
@@ -149,21 +145,17 @@ class ValueAnnouncement(UpdateAnnouncement):
         if not local.host:
             return
         if local.is_to_ask(self._keys):
-            await self._tell_near(b"")
+            await self._notify_host(b"")
         if not local.has_audience(self._keys):
             return
         pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
         self._slot = local.put(self._keys, pieces, sizes)
-        # Which item an index from the end names is known once the server has the update: it is told then.
+        # An index from the end is resolved by the server, so such an update cannot be early.
         if self._slot is not None and local.early and not counts_from_end(path):
-            await self._tell_near(self._payload(self._reserved[0], path))
+            await self._notify_host(self._payload(self._reserved[0], path))
 
-    async def _tell_near(self, payload: bytes) -> None:
-        """Send something to those near by; how many they are is known from then on.
-
-        Raises:
-            NotConnected: The update itself was not sent.
-        """
+    async def _notify_host(self, payload: bytes) -> None:
+        """Publish to the subscribers on this host and note their number; raises NotConnected."""
         session, keys = self._session, self._keys
         channel = session.local.channel(keys)
         try:
@@ -173,7 +165,7 @@ class ValueAnnouncement(UpdateAnnouncement):
         session.local.answered(keys, count)
 
     def retract(self, path: Path) -> Sequence[Command]:
-        # A notice with the value has told of something that is not there. One without has subscribers read what is.
+        # Without a value, so that subscribers read the stored one.
         return self._numbered(path, super()._payload)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
@@ -184,15 +176,8 @@ class ValueAnnouncement(UpdateAnnouncement):
 
 
 class DocumentPublisher(DocumentWriter):
-    """Writes one top-level key and tells its subscribers, in the same transaction.
+    """Writes one top-level key and notifies its subscribers, in the same transaction."""
 
-    Args:
-        session: The server.
-        name: The key.
-        outages: What is done in an outage; None if calls raise.
-    """
-
-    # So no large array lets small calls pass it: subscribers get updates in the order of the calls.
     keeps_order = True
 
     def __init__(self, session: Session, name: object, outages: Outage | None = None) -> None:
@@ -203,12 +188,10 @@ class DocumentPublisher(DocumentWriter):
         return PublishTurn(self.session, self.keys)
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
-        """Return what makes another one, which can be pickled."""
         return partial(publisher, policy=self._policy)
 
 
 def publisher(session: Session, name: object, policy: str) -> DocumentPublisher:
-    """Return a publisher of its own of one top-level key, with a policy for outages."""
     return DocumentPublisher(session, name, Outage.chosen(session, policy))
 
 
@@ -220,7 +203,7 @@ def _cannot_read(path: Path) -> str:
 
 
 class PublishAccessor(Accessor):
-    """One place of a PublishSpace: as `Accessor`, but what would read raises WriteOnly."""
+    """One place of a PublishSpace: as `Accessor`, but reading raises WriteOnly."""
 
     __slots__ = ()
     _how_to_read = "a KeyValueStore"
@@ -230,7 +213,6 @@ class PublishAccessor(Accessor):
 
     @property
     def reader(self) -> NoReturn:
-        """Raise WriteOnly."""
         self._refuse()
 
     @property
@@ -239,31 +221,24 @@ class PublishAccessor(Accessor):
         return Publisher(self._reader.name, self._reader.session.interface)
 
     async def read(self) -> Any:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def get(self, *default: Any, default_value: Any = _NOTHING) -> Any:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def length(self) -> int:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def type(self) -> builtins.type:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def contains(self, key: str) -> bool:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def keys(self) -> list[str]:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def outline(self) -> NoReturn:
-        """Raise WriteOnly."""
         self._refuse()
 
     async def _take(self, *default: Any) -> Any:
@@ -273,20 +248,17 @@ class PublishAccessor(Accessor):
         self._refuse()
 
     def edit(self) -> NoReturn:
-        """Raise WriteOnly."""
         self._refuse()
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> NoReturn:
-        """Raise WriteOnly."""
         self._refuse()
 
     def watch(self, policy: Any = None, *, stored: bool = True) -> NoReturn:
-        """Raise WriteOnly."""
         self._refuse()
 
 
 class Publisher(Writer):
-    """Writes one top-level key and tells its subscribers, in the same transaction.
+    """Writes one top-level key and notifies its subscribers, in the same transaction.
 
     Args:
         top_key_name: The key.
@@ -297,25 +269,25 @@ class Publisher(Writer):
 
 
 class PublishSpace(KeyValueStore):
-    """A store that can only be written, and notifies subscribers of every change.
+    """A store that can only be written, and that notifies subscribers of every change.
 
-    Written like a `KeyValueStore`. A change and its notice are one transaction; a small value
-    travels in the notice, a large one is announced and subscribers fetch the newest.
+    Written like a `KeyValueStore`. A change and its notice are one transaction. The notice carries a small value; a
+    large one is announced, and subscribers fetch the newest.
 
-    In an outage (NotConnected, ConnectionLost or ServerNotReady) `outage` says what becomes of `write`, `update` and
-    `delete`: they raise, or they return at once, until the server answers again.
+    `outage` is the policy for `write`, `update` and `delete` in an outage (NotConnected, ConnectionLost or
+    ServerNotReady). They raise, or return at once until the server answers again:
 
-    - "drop": What is published is dropped, and counted in `dropped`.
+    - "drop": Updates are dropped, and counted in `dropped`.
     - "newest": The newest update of each place is kept, with the bytes and the time of its call, and sent when the
-      server is back, in the order of the calls, each by itself; what a newer one replaces is counted in `dropped`.
-      Removals of list items are all kept, since an index names another item after each of them.
-      Of more than 256 MB of values, in all, the oldest of a key go first, and are counted.
+      server is back, in the order of the calls, each by itself. A replaced update is counted in `dropped`. Removals of
+      list items are all kept, since an index names another item after each of them. Over 256 MB of values, in all, the
+      oldest of a key are dropped, and counted.
 
-    Nothing is applied twice: an update that was under way when the connection broke was applied or not, is not sent
-    again, and counts as dropped. Dropped updates are reported to subscribers as any lost one is, by `gap`
-    and `missed`. `append`, `extend` and arithmetic depend on what is there, so they raise in an outage whatever is
-    said; where the server is back they come behind what is kept. What the server refuses is logged and counted, and
-    closing the interface drops what is still kept. The beginning and the end of an outage are logged ("reem.publish").
+    Nothing is applied twice: an update in progress when the connection broke was applied or not, is not sent again, and
+    counts as dropped. Subscribers see dropped updates like lost ones, by `gap` and `missed`. `append`, `extend` and
+    arithmetic depend on the stored value, so they always raise in an outage; once the server is back they come after
+    the kept updates. A kept update that the server refuses is logged and counted, and closing the interface drops the
+    rest. The beginning and the end of an outage are logged ("reem.publish").
 
     Args:
         interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.
@@ -342,11 +314,9 @@ class PublishSpace(KeyValueStore):
         return 0 if self._outages is None else self._outages.waiting
 
     async def get(self, path: str, default: Any = None) -> Any:
-        """Raise WriteOnly."""
         await self.at(path).read()
 
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> NoReturn:
-        """Raise WriteOnly."""
         raise WriteOnly(_cannot_read(patterns or ("*",)))
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -8,19 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingKey, WrongType
-from ..plan import Plan
 from ..plan.paths import Path, check_name, show
 from ..plan.reads import RawRead, awaited, exists, first_read, has_key, interpreted, keys_at, length, read, type_of
 from ..session import Session
 
 
 class DocumentReader:
-    """Reads one top-level key.
-
-    Args:
-        session: The server.
-        name: The key.
-    """
+    """Reads one top-level key."""
 
     def __init__(self, session: Session, name: object) -> None:
         self.session = session
@@ -28,12 +22,10 @@ class DocumentReader:
         self.name = self.keys.name
 
     async def read(self, path: Path) -> Any:
-        """Return the value at `path`; raises MissingKey."""
         raw_read = await self.raw_read(path)
         return await opened(raw_read) if raw_read.slots else raw_read.holder[0]
 
     async def no_item(self, path: Path) -> MissingKey:
-        """Return the error for an item that is not there: it may be one of an array."""
         outer, where = path[:-1], show((self.name, *path))
         try:
             kind = await self.type_at(outer)
@@ -47,46 +39,38 @@ class DocumentReader:
         )
 
     async def exists(self) -> bool:
-        """Return whether there is a document under the key."""
         found: bool = await self.session.run(exists(self.keys))
         return found
 
     async def raw_read(self, path: Path) -> RawRead:
-        """Return what the server has at `path`, ships' replies not yet interpreted."""
+        """Return the value at `path` before ships interpret their replies."""
         if self.session.ships.asynchronous:
             await self.session.ships.ready()
-        raw_read: RawRead = await self.session.run(self._reading(path))
+        session = self.session
+        plan = read(self.keys, path, session.ships, session.cache)
+        # Until a key is known not to be of REEM 0.1, its reads check that in the same round trip.
+        raw_read: RawRead = await session.run(first_read(plan, self.keys, path, session.cache))
         return raw_read
 
     async def contains_at(self, path: Path, key: object) -> bool:
-        """Return whether the dict at `path` has the key."""
         name = check_name(key, (self.name, *path))
         found: bool = await self.session.run(has_key(self.keys, path, name))
         return found
 
     async def keys_at(self, path: Path) -> list[str]:
-        """Return the keys of the dict at `path`."""
         names: list[str] = await self.session.run(keys_at(self.keys, path))
         return names
 
-    def _reading(self, path: Path) -> Plan:
-        session = self.session
-        plan = read(self.keys, path, session.ships, session.cache)
-        # Until a key is known not to be of REEM 0.1, its reads ask that too, in the same round trip.
-        return first_read(plan, self.keys, path, session.cache)
-
     async def type_at(self, path: Path) -> type:
-        """Return the Python type of the value at `path`."""
         await self.session.ships.ready()
         kind: type | None = await self.session.run(type_of(self.keys, path, self.session.ships))
         return type(await self.read(path)) if kind is None else kind
 
     async def length_at(self, path: Path) -> int:
-        """Return the length of the value at `path`."""
         count: int | None = await self.session.run(length(self.keys, path))
         if count is not None:
             return count
-        # A text or an array: the server knows the length of its placeholder only.
+        # A text or an array: the server knows only the length of its placeholder.
         value = await self.read(path)
         try:
             return len(value)
@@ -96,7 +80,7 @@ class DocumentReader:
 
 
 async def opened(raw_read: RawRead) -> Any:
-    """Return the value a read brought, everything the ships hold put in its place; see `RawRead.give_up`."""
+    """Return the value of a read, with the ships' values in it; see `RawRead.give_up`."""
     for slot, ship, reply in raw_read.slots:
         value = interpreted(raw_read, slot, ship, reply)
         waits = ship.blob is None and inspect.isawaitable(value)

@@ -18,13 +18,13 @@ from .document import DocumentWriter
 from .reader import DocumentReader
 
 _MOST_TOPS = 1000
-"""Accessors of top-level keys that are kept: only to be quick, any is made anew when it is asked for."""
+"""Accessors of top-level keys that are cached."""
 
 Interface = TypeVar("Interface")
 
 
 def without_options(interface: Interface, options: Mapping[str, Any]) -> Interface:
-    """Return an interface that is there already; raises BadType if it is to have options besides."""
+    """Return an existing interface; raises BadType if options were given with it."""
     if options:
         raise BadType(f"{', '.join(options)}: options go to the RedisInterface when it is made, or with a host")
     return interface
@@ -131,14 +131,13 @@ class KeyValueStore:
     async def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
         """Store each of `values`, and of the named ones, under its top-level key.
 
-        Each is a `write`, one after the other. Not atomic: each key is a document of its own. Should the
-        connection fail, the first ones may have been stored. All keys and values are looked at first.
+        Each is a `write`, one after the other. Not atomic: each key is a document of its own, and if the connection
+        fails, the first ones may have been stored. All keys and values are checked first.
 
         Raises:
             BadValue, BadType, BadKey, TooDeep: A value cannot be stored; nothing was sent.
         """
         every = dict(values, **more)
-        # Every value is looked at before the first is sent, so that a bad one changes nothing.
         for key, value in every.items():
             await self._top(key)._writer.check(value)
         for key, value in every.items():
@@ -147,14 +146,14 @@ class KeyValueStore:
     def watch(self, *patterns: str, policy: Policy | None = None, largest: int | None = None) -> PatternWatch:
         """Return an async iterator over every change of all keys that some patterns name, those that come and go too.
 
-        As `kvs["foo"].watch()` for each key there is (which comes first, `initial`) or comes to be: one that is only
-        stored is found within a second. `update.path` says where it was.
+        As `kvs["foo"].watch()` for each existing key (these come first, `initial`) and each new one: one that is only
+        stored is found within a second. `update.path` names the place.
 
         Args:
             patterns: Globs of paths, such as "arm", "cam_*", "robot1.*" or "robot.*.battery"; all keys if none.
             policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
-            largest: Bytes of an array up to which it is fetched; a larger one stays at the server, and what it is
-                is told in its place, another object when it has changed.
+            largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one,
+                another object when it has changed.
 
         Raises:
             BadKey: Not a pattern.
@@ -175,7 +174,7 @@ class KeyValueStore:
     def track_schema_changes(
         self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
     ) -> None:
-        """Do nothing: a switch of the first REEM, which old programs set to be quicker. Writes are quick without it.
+        """Do nothing: old programs set this switch of the first REEM to be quicker. Writes are quick without it.
 
         Args:
             set_value: Whether shapes may change.
