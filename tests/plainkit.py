@@ -12,7 +12,7 @@ import hiredis
 import orjson
 import redis
 
-from reem_async.plain.documents import MARK, Document
+from reem_async.plain.documents import MARK, TextDocument
 from reem_async.plain.paths import Refusal
 from reem_async.plan.paths import to_jsonpath
 from reem_async.tools.snapshots.plans import settable
@@ -144,7 +144,7 @@ class Comparison:
 
     def ours(self, command):
         """The reply of the text; the text is what it is from then on."""
-        document = Document(self.text)
+        document = TextDocument(self.text)
         name, *words = command
         try:
             reply = document.run((name, self.key, *words))
@@ -197,7 +197,7 @@ def teach(client):
         text = send(self, "GET", words[1], **raw) if kind == b"string" else None
         if kind not in (b"string", b"none") or (text is not None and text[:1] != MARK):
             raise redis.ResponseError("Existing key has wrong Redis type")
-        document = Document(text)
+        document = TextDocument(text)
         try:
             reply = document.run([name, words[1], *map(_bracketed, words[2:3]), *map(_as_bytes, words[3:])])
         except Refusal as refusal:

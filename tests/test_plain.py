@@ -20,7 +20,7 @@ import reem.snapshots
 import reem_async
 from reem.server import EmbeddedCluster, EmbeddedServer
 from reem_async.plain.batches import Known
-from reem_async.plain.documents import MARK, Document
+from reem_async.plain.documents import MARK, TextDocument
 from reem_async.plain.translation import directly, looked_at, translated
 from reem_async.store.catalog import names
 from reem_async.transport.parsing import error_of
@@ -106,7 +106,7 @@ def test_generated_commands_are_answered_as_by_the_module(with_json, seed):
 
 
 def test_numbers_keep_every_bit():
-    document = Document(MARK + b'{"u":18446744073709551615,"i":-9223372036854775808,"f":0.1}')
+    document = TextDocument(MARK + b'{"u":18446744073709551615,"i":-9223372036854775808,"f":0.1}')
     document.run(("JSON.SET", "k", '$["x"]', b"5e-324"))
     document.run(("JSON.NUMINCRBY", "k", '$["f"]', b"0.2"))
     assert orjson.loads(document.string()) == {"u": 2**64 - 1, "i": -(2**63), "f": 0.1 + 0.2, "x": 5e-324}

@@ -1,4 +1,4 @@
-"""`reem migrate`: data of REEM 0.0 and 0.1 into data of today."""
+"""`reem migrate`: convert data of REEM 0.0 and 0.1."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def migrate(
-    yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only what would be done is shown.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Convert. Without it, only show what would be done.")] = False,
     ships: Ships = None,
     match: Annotated[
         str,
@@ -30,13 +30,13 @@ def migrate(
     namespace: Namespace = "",
     as_json: AsJson = False,
 ) -> None:
-    """Convert what REEM 0.1 or older has stored, or a server without JSON, in place.
+    """Convert data of REEM 0.1 or older, or of a server without JSON, in place.
 
-    Without --yes nothing is changed: all is read and checked, and what would be done is shown. End the
-    programs of old versions first. Each key is one transaction, so this can be broken off at any time and
-    started again; what is new is left alone. An old RDB file is loaded by `reem up --from FILE`.
+    Without --yes everything is read and checked, and nothing is changed. End the programs of old versions
+    first. Each key is one transaction, so this can be interrupted at any time and started again; new data
+    is left alone. An old RDB file is loaded by `reem up --from FILE`.
 
-    Exit code 1 if a key cannot be converted; it is left as it is.
+    Exit code 1 if a key cannot be converted; it stays as it is.
 
     Examples:
         reem migrate
@@ -48,7 +48,6 @@ def migrate(
     async def work(interface: RedisInterface) -> int:
         from reem_async.legacy.convert import migrate as convert
 
-        # Shown at once: how long it takes is not known before all keys were looked at.
         with progress_bar(after=0.0) as bar:
             tell = None if as_json else bar("convert" if yes else "check")
             done = await convert(interface, match, dry_run=not yes, progress=tell)
@@ -80,11 +79,9 @@ def _show(done: Migration, as_json: bool) -> None:
 
 
 def _what(key: Migrated) -> str:
-    """Return what is converted, in a few words."""
     if key.was_text:
         return "document of a server without JSON"
     whole = "value taken out of a dict" if key.rooted else ""
-    # Not the marks that old versions put into documents.
     inner = [place for place in key.places if "%%%%" not in place and place != "."]
     shipped = ", ".join(inner[:3]) + (f" and {len(inner) - 3} more" if len(inner) > 3 else "")
     if not inner and key.places:

@@ -26,22 +26,22 @@ from .olddata import METADATA, candidates, special_paths
 from .text import TextConverter, texts
 from .values import ARRAY_LABEL, Tree, array_of
 
-# A key that is written each millisecond can be converted in between; one that never is has a program to be ended.
+# A key that is written each millisecond can be converted in between. For one that cannot, a program must be ended.
 _TRIES = 50
 
 
 class Migrated(NamedTuple):
-    """What became of one old key, or would.
+    """The conversion of one old key.
 
     Attributes:
         name: The top-level key.
-        places: Where a ship's value was put into its document, as `.image`.
-        rooted: Its value, which is no dict, was taken out of one.
-        removed: The Redis keys of the old layout that are removed, those of arrays left behind too.
-        lost: The Redis keys of arrays that are nowhere in the document, but may not have been left behind on purpose:
-            writing `foo.image` made old programs forget `foo.image2`. They stay where they are.
-        problem: Why it was left as it is; empty if it was not.
-        was_text: Its document was text, of a server without JSON, and is one of this server's JSON now.
+        places: The places of ships' values that were put into the document, as `.image`.
+        rooted: Whether its value, which is no dict, was taken out of one.
+        removed: The Redis keys of the old layout that are removed, with those of arrays that were left behind.
+        lost: The Redis keys of arrays that are not in the document, perhaps by mistake: writing `foo.image` made old
+            programs forget `foo.image2`. They stay.
+        problem: Why it could not be converted; empty if it was.
+        was_text: Whether its document was text, of a server without JSON.
     """
 
     name: str
@@ -55,11 +55,11 @@ class Migrated(NamedTuple):
 
 @dataclass(frozen=True)
 class Migration:
-    """What `migrate` did, or would do.
+    """The result of `migrate`.
 
     Attributes:
         keys: The old keys, sorted by name.
-        dry_run: Nothing was changed.
+        dry_run: Whether nothing was changed.
     """
 
     keys: tuple[Migrated, ...]
@@ -67,7 +67,6 @@ class Migration:
 
     @property
     def problems(self) -> tuple[Migrated, ...]:
-        """The keys that were left as they are."""
         return tuple(key for key in self.keys if key.problem)
 
 
@@ -78,26 +77,25 @@ async def migrate(
     dry_run: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Migration:
-    """Convert what REEM 0.0 and 0.1 have stored, in place, so that it reads as it did there.
+    """Convert data of REEM 0.0 and 0.1 in place, so that it reads as it did there.
 
     Arrays and other values of ships are put into their documents, values that are no dict are taken out of the dict
-    they were stored in, and the Redis keys of the old layout are removed, those too that old programs have left
-    behind. What is new is left alone, so a second run finds nothing to do. Each key is one transaction: it is old or
-    new, never half, whenever this is broken off; then run it again. In a cluster, whose nodes share no transaction,
-    what is old is removed right after it. Subscribers are told. A key that cannot be converted is left as it is, and
-    the result says why. End the programs of old versions first.
+    they were stored in, and the Redis keys of the old layout are removed, with those that old programs have left
+    behind. New data is left alone, so a second run finds nothing to do. Each key is one transaction, so this can be
+    interrupted at any time and run again. In a cluster, whose nodes share no transaction, the old keys are removed
+    right after it. Subscribers are notified. A key that cannot be converted stays, and the result says why. End the
+    programs of old versions first.
 
-    So are documents that are text, from a server without JSON (an RDB file that has moved), on a server that has it.
+    Documents that are text, from a server without JSON (an RDB file that has moved), are converted too.
 
     Two round trips for about 1000 keys of the server to find the old ones, three times; then six for each of these.
-    Arrays are read twice. In memory there is one top-level key at a time.
+    Arrays are read twice. One top-level key at a time is in memory.
 
     Args:
-        interface: The server; its namespace is what is converted, and its ships read and write what was stored by
-            ships with their labels.
-        match: Which top-level keys: a name in which `*` and `?` stand for other characters.
-        dry_run: Change nothing; read and check all the same.
-        progress: Called with how many keys are done, and of how many.
+        interface: The server, the namespace to convert, and ships with the labels of the old ones.
+        match: Which top-level keys: a name with `*` and `?`.
+        dry_run: Read and check only.
+        progress: Called with the number of keys that are done, and of all.
 
     Raises:
         ClusterNode: The server is one node of several.
@@ -106,7 +104,7 @@ async def migrate(
     session = interface.session
     await session.ships.ready()
     wanted = Pattern(check_top_key(match))
-    # Texts first: only then are they documents that the search for old keys sees.
+    # Texts first: the search for old keys finds documents only.
     text = [name for name in await texts(session) if wanted.concerns((name,))]
     old = [key for key in await find(session) if wanted.concerns((key.name,))]
     conversions: list[Callable[[], Awaitable[Migrated]]] = [
@@ -124,7 +122,6 @@ async def migrate(
 
 
 async def _given_to_json(session: Session, name: str, dry_run: bool) -> Migrated:
-    """Convert one document that is text."""
     try:
         await TextConverter(session, name).run(dry_run=dry_run)
     except (BadData, WrongKind) as error:
@@ -133,7 +130,6 @@ async def _given_to_json(session: Session, name: str, dry_run: bool) -> Migrated
 
 
 async def _migrated(session: Session, key: OldKey, dry_run: bool) -> Migrated:
-    """Convert one key; again if anybody writes to it meanwhile."""
     for _ in range(_TRIES):
         try:
             return await _Converter(session, key).run(dry_run=dry_run)
@@ -141,16 +137,11 @@ async def _migrated(session: Session, key: OldKey, dry_run: bool) -> Migrated:
             continue
         except (BadData, BadInput, PartialWrite, WrongKind) as error:
             return Migrated(key.name, problem=str(error))
-    return Migrated(key.name, problem=f"it was changed {_TRIES} times meanwhile; end the programs that write to it")
+    return Migrated(key.name, problem=f"it changed {_TRIES} times in between; end the programs that write to it")
 
 
 class _RemovingFirst(Announcement):
-    """Notifies subscribers as `announcement` does, behind the command that removes what is old.
-
-    Args:
-        removal: The command; none where what is old may be on another node.
-        announcement: What notifies them.
-    """
+    """An announcement behind the command that removes the old keys; none if they may be on another node."""
 
     __slots__ = ("_announcement", "_removal")
 
@@ -159,7 +150,6 @@ class _RemovingFirst(Announcement):
         self._announcement = announcement
 
     def commands(self, path: Path) -> Sequence[Command]:
-        # In the order in which it happens: a subscriber that is notified finds nothing old any more.
         return [*self._removal, *self._announcement.commands(path)]
 
     def unsent(self) -> None:
@@ -172,8 +162,8 @@ class _RemovingFirst(Announcement):
 class _Converter:
     """Converts one top-level key.
 
-    Looks at everything without a lock, makes the value of it, then writes it and removes what is old in one
-    transaction, if all is still as it was seen.
+    First read everything and make the value. Then write it and remove the old keys in one transaction, if nothing has
+    changed.
     """
 
     def __init__(self, session: Session, key: OldKey) -> None:
@@ -183,27 +173,25 @@ class _Converter:
         self._writer = DocumentPublisher(session, key.name)
         self._second = self.keys.document + METADATA
         self._key = key
-        self._old: dict[str, tuple[Command, Reply]] = {}  # by place: what was asked of the ship's value, and the reply
+        self._old: dict[str, tuple[Command, Reply]] = {}  # by place: how the ship's value was read, and the reply
 
     async def run(self, *, dry_run: bool) -> Migrated:
-        """Convert it, or see whether that can be done."""
         (second,) = await self._replies([("JSON.GET", self._second, "$")])
         found = special_paths(second)
         labels = found or {}
         raw_read = await self._sealed()
-        # Before the ships' values are put into it.
         tops = set(raw_read.holder[0]) if raw_read.holder and isinstance(raw_read.holder[0], dict) else set()
         tree = Tree(raw_read.holder, [(slot.container, slot.key) for slot, _, _ in raw_read.slots])
-        # A ship of today holds something there: written since, so it is newer than what the old one has.
+        # A value of a new ship there was written later, so the old one is obsolete.
         missing = {place: label for place, label in labels.items() if not tree.holds(place)}
         await self._look(missing)
-        # Whole values first: one of an old ship above others hides them, as it did.
+        # Outer values first: in old programs one hides those inside it.
         put = [place for place in sorted(missing) if tree.put(place, await self._value(place, missing[place]))]
         if raw_read.slots:
             await opened(raw_read)
         root = tree.root(lambda entry: self._deletion(entry, entry in tops, labels))
         rooted = root is not raw_read.holder
-        # The second document last: while it is there, another run knows what there is to remove.
+        # The second document last: another run finds what to remove by it.
         gone = [*(self.keys.document + place for place in labels), *self._key.stale]
         gone += [self._second] if found is not None else []
         if put or rooted:
@@ -214,7 +202,7 @@ class _Converter:
         return Migrated(self.name, tuple(put), rooted, tuple(gone), tuple(self._key.lost))
 
     def _deletion(self, entry: str, in_document: bool, places: Iterable[str]) -> str:
-        """Return the commands that delete an entry: from the document, and what the second document names in it."""
+        """Return the shell commands that delete an entry, from the document and from the second document."""
         paths: list[tuple[str, Path]] = [(self.keys.document, (entry,))] if in_document else []
         inside = [place for place in places if any(path[:1] == (entry,) for path in candidates(place))]
         paths += [(self._second, ("special_paths", place)) for place in inside]
@@ -225,13 +213,13 @@ class _Converter:
             return ()
         replies: Sequence[Reply] = await self.session.run(Plan(commands, lambda replies: replies, bulk=True))
         for reply in replies:
-            # WRONGTYPE is an answer here: somebody has put something else in the place of a ship's value.
+            # WRONGTYPE: a foreign value is in the place of a ship's value.
             if isinstance(reply, Exception) and not str(reply).startswith("WRONGTYPE"):
                 raise reply
         return replies
 
     async def _sealed(self) -> RawRead:
-        """Return the document as programs of today see it; an empty one if there is none."""
+        """Return the document as a new program reads it; an empty one if there is none."""
         plan = read(self.keys, (), self.session.ships, self.session.cache)
         try:
             raw_read: RawRead = await self.session.run(plan)
@@ -240,7 +228,6 @@ class _Converter:
         return raw_read
 
     async def _look(self, labels: dict[str, str]) -> None:
-        """Fetch what the ships hold."""
         commands = [self._ask(place, label) for place, label in labels.items()]
         self._old = dict(zip(labels, zip(commands, await self._replies(commands), strict=True), strict=True))
 
@@ -275,19 +262,17 @@ class _Converter:
             raise BadData(f"{where}: {error}") from None
 
     async def _opened(self, place: str, ship: Registered, reply: Reply) -> Any:
-        """Return what a user's ship makes of what it stored."""
         holder: list[Any] = [None]
         slot = PlaceholderSlot(Placeholder(ship.label, place), holder, 0)
         return await opened(RawRead(holder, self.name, [(slot, ship, reply)], (), ()))
 
     async def _write(self, value: Any, raw_read: RawRead, second: Reply, gone: list[str], *, dry_run: bool) -> None:
-        """Store the value, remove what is old and tell subscribers, if all is as it was seen; raises Conflict."""
-        # In a dry run too, which is to find what would be refused.
+        """Store the value, remove the old keys and notify subscribers, if nothing has changed; raises Conflict."""
+        # In a dry run too, to find values that would be refused.
         encoded = await self._writer.encoder.encoded((), value)
         if dry_run:
             return
-        # All that was looked at is read again under WATCH and compared, the values of the ships as well: nothing that
-        # an old program writes meanwhile is lost.
+        # Everything, ships' values too, is read again under WATCH and compared: no write of an old program is lost.
         reads, seen = raw_read.commands, raw_read.raw
         removal: list[Command] = []
         if not self.session.transport.sharded:
@@ -304,7 +289,7 @@ class _Converter:
         await self._writer.in_turn(send, *encoded)
 
     async def _remove(self, gone: list[str]) -> None:
-        """Remove what is old and was not removed with the write; where it is on one server, it is one command."""
+        """Remove old keys that were not removed with the write; in a cluster one by one."""
         if not self.session.transport.sharded:
             await self._replies([("UNLINK", *gone)])
             return

@@ -1,4 +1,4 @@
-"""Which keys of a server are old: one look through all keys."""
+"""Find the old keys of a server, by SCAN."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _SECOND = METADATA.encode()
 
 @dataclass
 class OldKey:
-    """One top-level key of which something old was found.
+    """One old top-level key.
 
     Attributes:
         name: The key, without namespace.
-        places: Where values of ships are, and the ships' labels; None if there is no second document.
-        rooted: Its value is no dict and was stored in one.
-        stale: Redis keys of arrays that old programs have replaced, and left there.
-        lost: Redis keys of arrays that may be none of these: writing `foo.image` made old programs forget `foo.image2`.
+        places: The places of ships' values, and the ships' labels; None if there is no second document.
+        rooted: Whether its value is no dict and was stored in one.
+        stale: Redis keys of arrays that old programs have replaced, and left behind.
+        lost: Redis keys of other arrays that are in no document; see `Migrated`.
     """
 
     name: str
@@ -38,22 +38,20 @@ class OldKey:
 
     @property
     def misread(self) -> bool:
-        """Whether programs of today would read something else than what was written."""
+        """Whether new programs would read another value than was written."""
         return self.rooted or bool(self.places)
 
 
 async def find(session: Session, *, stale: bool = True) -> list[OldKey]:
-    """Return the old keys of a session's namespace, sorted.
-
-    Two round trips for about 1000 keys of the server.
+    """Return the old keys of a session's namespace, sorted; two round trips for about 1000 keys of the server.
 
     Args:
         session: The server.
-        stale: Look for what was left behind too, which takes another look through the keys.
+        stale: Find arrays that were left behind too, by another SCAN.
 
     Raises:
         ClusterNode: The server is one node of several.
-        NotAllowed: This user may not look for what was left behind.
+        NotAllowed: This user may not search for arrays that were left behind.
     """
     found: dict[str, OldKey] = {}
     async for names in _pages(session, DOCUMENT):
@@ -66,7 +64,7 @@ async def find(session: Session, *, stale: bool = True) -> list[OldKey]:
 
 
 async def _pages(session: Session, kind: str) -> AsyncIterator[list[str]]:
-    # SCAN may name a key several times, and there is a question about each.
+    # SCAN may name a key several times.
     seen: set[bytes] = set()
     async for page in scanned(session.transport, escaped(session.namespace) + "*", kind):
         fresh = [key for key in dict.fromkeys(map(bytes, page)) if key not in seen]
@@ -89,13 +87,11 @@ async def _asked(session: Session, commands: Sequence[tuple[Any, ...]]) -> Seque
 
 
 def _question(document: str) -> tuple[Any, ...]:
-    # Second documents say themselves where ships have values; of others only one entry matters, which costs less to
-    # ask.
+    # Second documents are read whole; of others only one entry matters.
     return ("JSON.GET", document, "$") if document.endswith(METADATA) else root_command(document)
 
 
 def _note(session: Session, found: dict[str, OldKey], document: str, reply: Reply) -> None:
-    """Take note of one document, by the reply to the question about it."""
     second = document.endswith(METADATA)
     places = special_paths(reply) if second else None
     if places is None and (second or not is_rooted(reply)):
@@ -109,11 +105,11 @@ def _note(session: Session, found: dict[str, OldKey], document: str, reply: Repl
 
 
 async def _add_stale(session: Session, found: dict[str, OldKey], names: Sequence[str]) -> None:
-    """Add the hashes that are arrays of old keys, but nowhere in their documents."""
+    """Add the hashes that are arrays of old keys, but not in their documents."""
     owned = [(name, owner) for name in names if (owner := _owner(session, found, name)) is not None]
     replies = await _asked(session, [("HKEYS", name) for name, _ in owned])
     for (name, owner), fields in zip(owned, replies, strict=True):
-        if isinstance(fields, NotAllowed):  # what is left behind would stay for ever, without a word
+        if isinstance(fields, NotAllowed):  # else the arrays would silently stay for ever
             raise fields
         if isinstance(fields, list | set) and is_array(frozenset(map(bytes, fields))):
             place = name[len(session.namespace) + len(owner.name) :]
@@ -121,18 +117,18 @@ async def _add_stale(session: Session, found: dict[str, OldKey], names: Sequence
 
 
 def _may_be_lost(place: str, places: Iterable[str]) -> bool:
-    """Return whether the name of another place begins this one, which is not inside of it."""
+    """Return whether this name begins with that of another place, but is not inside it."""
     return any(place.startswith(each) and place[len(each) :][:1] not in ("", ".", "[") for each in places)
 
 
 def _owner(session: Session, found: dict[str, OldKey], name: str) -> OldKey | None:
-    """Return the old key below whose second document a hash belongs, though that does not name it."""
+    """Return the old key that a hash belongs to, though its second document does not name the hash."""
     for top in _tops(name[len(session.namespace) :]):
         key = found.get(top)
         if key is None or key.places is None:
             continue
         place = name[len(session.namespace) + len(top) :]
-        # Named by the second document, so it is no leftover; or the second document itself.
+        # Named by the second document, so it was not left behind; or the second document itself.
         if place in key.places or place.startswith("&"):
             return None
         try:
@@ -144,7 +140,7 @@ def _owner(session: Session, found: dict[str, OldKey], name: str) -> OldKey | No
 
 
 def _tops(name: str) -> Iterator[str]:
-    """Yield what may be the top-level key in `foo.bar` or `foo[0].bar`; none has a dot in it."""
+    """Yield the possible top-level keys in `foo.bar` or `foo[0].bar`; none has a dot."""
     top = name.partition(".")[0]
     yield top
     while top.endswith("]") and "[" in top:

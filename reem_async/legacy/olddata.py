@@ -15,10 +15,10 @@ from ..plan.paths import Path, shorten
 from ..plan.shapes import ShapeCache
 
 METADATA = "&&&&metadata"
-"""What follows a key's name in the name of its second document."""
+"""The end of the name of a key's second document."""
 
 ROOT = "%%%%ROOT%%%%"
-"""The entry under which a value was stored that is no dict."""
+"""The entry of a value that is no dict."""
 
 _ROOT = ROOT.encode()
 
@@ -28,19 +28,17 @@ _INDEXED = re.compile(r"(?P<key>[^\[\]]*)(?P<indexes>(?:\[-?\d{1,9}\])+)")
 
 
 def root_command(document: str) -> Command:
-    """Return the command whose reply `is_rooted` reads."""
     return ("JSON.TYPE", document, f'$["{ROOT}"]')
 
 
 def is_rooted(reply: Reply) -> bool:
-    """Return whether a document has the entry of a value that is no dict."""
     while isinstance(reply, list):
         reply = reply[0] if reply else None
     return isinstance(reply, bytes)
 
 
 def special_paths(reply: Reply) -> dict[str, str] | None:
-    """Return the ships' labels by place, from a reply to JSON.GET of all of a second document; None if it is none."""
+    """Return the ships' labels by place, from a second document; None if it is none."""
     if not isinstance(reply, bytes | bytearray):
         return None
     try:
@@ -53,24 +51,19 @@ def special_paths(reply: Reply) -> dict[str, str] | None:
 
 
 def is_new(keys: Keys, path: Path, cache: ShapeCache) -> bool:
-    """Return whether what is at `path` was once found to be new, which counts for as long as the interface lives."""
     return keys.document in (cache.new_below if path else cache.new)
 
 
 def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
-    """Return a read of a place, with a look whether it is old in the same round trip unless it is known to be new.
+    """Return a read that also checks, in the same round trip, that the key is not old; its decode raises BadData.
 
-    In a cluster the second document may
-    be on another node, and old programs could not use a cluster, so it is not asked for there. Whether the document
-    has the entry of a value that is no dict is asked only where the reply leaves that open: another round trip.
-
-    Raises (in decode):
-        BadData: It is old.
+    Not in a cluster, which old programs could not use: the second document may be on another node. If the reply leaves
+    open whether the document has the entry of a value that is no dict, there is another round trip.
     """
-    # Once for each key and interface: a read costs the same round trip, and what was found to be new stays so.
+    # Once for each key and interface.
     if is_new(keys, path, cache):
         return plan
-    # In a transaction a look that is not allowed would cost the read; later reads are none.
+    # In a transaction a missing right to the second document would refuse the read; later reads are no transactions.
     if plan.atomic:
         return plan
     end = len(plan.commands)
@@ -79,7 +72,6 @@ def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
     def decode(replies: Sequence[Reply]) -> Any:
         read = replies[:end]
         _check_places(replies[end:], keys)
-        # The text of most documents rules the old entry out, so the second round trip is rare.
         if _may_be_rooted(read[0]):
             return Plan([root_command(keys.document)], lambda rooted: decode_new(rooted, read))
         cache.saw_new(keys.document, path)
@@ -93,7 +85,7 @@ def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
 
 
 def look_first(plan: Plan, keys: Keys, cache: ShapeCache) -> Plan:
-    """As `first_read`, for a read that is a transaction: the look is a round trip of its own, ahead of it."""
+    """As `first_read`, for a read that is a transaction: with a round trip of its own before."""
     if is_new(keys, (), cache):
         return plan
 
@@ -110,7 +102,7 @@ def _second_document(keys: Keys) -> Command:
 
 
 def _may_be_rooted(reply: Reply) -> bool:
-    """Return whether a reply to JSON.GET names the entry, or shows nothing, as it does at a place beside the entry."""
+    """Return whether a reply to JSON.GET has the entry, or nothing, as at a place beside the entry."""
     return isinstance(reply, bytes | bytearray) and (reply == b"[]" or _ROOT in reply)
 
 
@@ -132,12 +124,9 @@ def _old(keys: Keys) -> BadData:
 
 
 def candidates(place: str) -> list[Path]:
-    """Return what an old place below a key may mean: `.a[0]` an item of the list `a`, or the entry `a[0]`.
+    """Return the possible paths of an old place: `.a[0]` is an item of the list `a`, or the entry `a[0]`.
 
-    Names with brackets were allowed, so only the document can tell.
-
-    Raises:
-        BadData: Not a place.
+    Names with brackets were allowed, so only the document can tell. Raises BadData if it is no place.
     """
     if place == ".":
         return [()]
@@ -145,7 +134,6 @@ def candidates(place: str) -> list[Path]:
         raise BadData(f"{shorten(place)} is not a place that REEM 0.1 would write")
     parts = place.removeprefix(".").split(".")
     indexed = tuple(step for part in parts for step in _steps(part))
-    # The likelier one first: names with brackets are rare.
     return [indexed] if indexed == tuple(parts) else [indexed, tuple(parts)]
 
 

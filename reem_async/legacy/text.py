@@ -1,4 +1,4 @@
-"""Documents of a server without JSON, found as text on one that has it: an RDB file, or a directory, that has moved."""
+"""Convert documents that are text on a server with JSON: an RDB file of a server without JSON has moved there."""
 
 from __future__ import annotations
 
@@ -18,14 +18,13 @@ from ..store.publish import DocumentPublisher
 from ..tools.snapshots.plans import settable
 from ..transport import scanned
 
-# As `convert.py` has it.
-_TRIES = 50
+_TRIES = 50  # as in `convert.py`
 
 
 async def texts(session: Session) -> list[str]:
-    """Return the top-level keys of a session's namespace whose documents are text that the server takes for a string.
+    """Return the top-level keys of a session's namespace whose documents are text.
 
-    Where there is no JSON, that is no key. One round trip for about 1000 keys of the server, and one for the strings.
+    On a server without JSON there are none. One round trip for about 1000 keys of the server, and one for the strings.
     """
     found: set[str] = set()
     async for page in scanned(session.transport, escaped(session.namespace) + "*", "string"):
@@ -33,7 +32,7 @@ async def texts(session: Session) -> list[str]:
         looks: list[Command] = [look for name in names for look in (("TYPE", name), ("GETRANGE", name, "0", "0"))]
         replies: Sequence[Reply] = await session.run(Plan(looks, list)) if looks else []
         for name, kind, begins in zip(names, replies[::2], replies[1::2], strict=True):
-            # On a server without JSON the transport answers for TYPE what the module would, so nothing is found there.
+            # On a server without JSON the transport translates the reply to TYPE, so nothing is found there.
             if kind == b"string" and isinstance(begins, bytes) and is_document(begins):
                 found |= _named(session, name)
     return sorted(found)
@@ -47,7 +46,7 @@ def _named(session: Session, document: bytes) -> set[str]:
 
 
 class TextConverter:
-    """Gives one document to the server's JSON: what its text says, floats to the last bit. Arrays stay."""
+    """Converts one text to a document of the server's JSON, floats to the last bit. Attachments stay."""
 
     def __init__(self, session: Session, name: str) -> None:
         self.session = session
@@ -55,11 +54,7 @@ class TextConverter:
         self.keys = self._writer.keys
 
     async def run(self, *, dry_run: bool) -> None:
-        """Convert it, in one transaction, or see whether that can be done; two round trips.
-
-        Raises:
-            BadData: It is no JSON, or the server's JSON does not take it. It is left as it is.
-        """
+        """Convert it in one transaction, two round trips; raises BadData if the server refuses the text."""
         await self._writer.in_turn(self._send, dry_run)
 
     async def _send(self, turn: Turn, dry_run: bool) -> None:
@@ -68,7 +63,7 @@ class TextConverter:
     def _look(self, announcement: Announcement, dry_run: bool, tries: int) -> Plan:
         def decode(replies: Sequence[Reply]) -> Plan:
             permitted(replies[0], self.keys.document)
-            text = replies[1] if isinstance(replies[1], bytes | bytearray) else b""  # deleted, or replaced, meanwhile
+            text = replies[1] if isinstance(replies[1], bytes | bytearray) else b""  # deleted or replaced in between
             ready = settable(bytes(text[1:])) if is_document(text) else b""
             if dry_run or not ready:
                 return Plan([("UNWATCH",)], lambda _: None, held=True)
@@ -77,12 +72,12 @@ class TextConverter:
         return Plan([("WATCH", self.keys.document), ("GET", self.keys.document)], decode, held=True)
 
     def _change(self, announcement: Announcement, text: bytes, tries: int) -> Plan:
-        # Under another name first, since JSON.SET refuses a key that holds a string, and a DEL before it could not be
-        # undone if the text turned out not to be JSON: EXEC goes on behind an error.
+        # Under another name first: JSON.SET refuses a key that holds a string, and a DEL before it could not be undone
+        # if the text is not JSON, since EXEC continues after an error.
         coming = f"{self.keys.tag}{STAGED}{secrets.token_hex(5)}"
         commands: list[Command] = [
             ("JSON.SET", coming, "$", text),
-            ("RENAME", coming, self.keys.document),  # refused if that was: then all stays as it is
+            ("RENAME", coming, self.keys.document),  # refused if JSON.SET was refused: then nothing changes
             *announcement.commands(()),
         ]
 
@@ -90,11 +85,13 @@ class TextConverter:
             if replies is not None:
                 for reply in replies[:2]:
                     if isinstance(reply, Exception):
-                        raise BadData(f"{self.keys.name}: the server does not take its text as JSON: {reply}")
+                        raise BadData(f"{self.keys.name}: the server refused its text as JSON: {reply}")
                 return None
             announcement.unsent()
             if not tries:
-                raise BadData(f"{self.keys.name}: it was changed {_TRIES} times meanwhile; end what writes to it")
+                raise BadData(
+                    f"{self.keys.name}: it changed {_TRIES} times in between; end the programs that write to it"
+                )
             return self._look(announcement, False, tries - 1)
 
         return Plan(commands, decode, atomic=True, held=True)

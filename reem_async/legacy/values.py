@@ -1,4 +1,4 @@
-"""From the parts of an old key to its value. Pure; nothing that was read is evaluated."""
+"""Make the value of an old key from its parts. Pure; nothing is evaluated."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _MORE_FIELDS = frozenset({b"strides"})
 _NAMED = re.compile(r"bool|u?int(?:8|16|32|64)|float(?:16|32|64)|complex(?:64|128)")
 _TIME = re.compile(r"(datetime64|timedelta64)(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
 _SHAPE = re.compile(r"\((?:\d{1,15}L?(?:, ?\d{1,15}L?)*,?)?\)")
-# Bytes of the text of a dtype or a shape that are looked at: more is none.
+# Bytes of the text of a dtype or a shape; longer ones are not valid.
 _LONGEST = 1 << 15
 
 
@@ -32,21 +32,18 @@ def is_array(fields: frozenset[bytes]) -> bool:
 
 
 def array_of(fields: Any) -> np.ndarray[Any, Any]:
-    """Return the array in an old hash, checked as the ship for arrays checks what it reads.
+    """Return the array in an old hash; raises BadData.
 
-    The bytes are in C order whatever the strides say, which were those in the memory of who wrote it.
-
-    Raises:
-        BadData: Not an array of plain data.
+    The bytes are in C order. The strides are those in the memory of the writer, and mean nothing.
     """
     if not isinstance(fields, Mapping) or not fields.keys() >= ARRAY_FIELDS:
         raise BadData("the array is gone from the server, or something else is in its place")
-    # Old programs stored repr() of both: texts that look like Python, and are matched, never evaluated.
+    # Old programs stored repr() of both: these are matched, never evaluated.
     dtype, shape = _text(fields[b"dtype"]), _text(fields[b"shape"])
     if not _SHAPE.fullmatch(shape):
         raise BadData(f"an array has the shape {shorten(shape)}, which is none")
     header = f"{{'descr': {_description(dtype)}, 'fortran_order': False, 'shape': {shape.replace('L', '')}, }}".encode()
-    # It is read as the .npy file that it might have been, by the reader that checks everything.
+    # Read as an .npy file, by the ship that checks everything.
     start = b"\x93NUMPY\x03\x00" + len(header).to_bytes(4, "little")
     try:
         return NumpyShip().unpack(start + header + bytes(fields[b"arr"]))
@@ -62,7 +59,7 @@ def _text(value: Any) -> str:
 
 
 def _description(dtype: str) -> str:
-    """Return the text of a dtype as it stands in the header of an .npy file, whose reader checks it."""
+    """Return the text of a dtype for the header of an .npy file."""
     if _NAMED.fullmatch(dtype):
         return repr(np.dtype(dtype).str)
     if found := _TIME.fullmatch(dtype):
@@ -71,25 +68,22 @@ def _description(dtype: str) -> str:
 
 
 class Tree:
-    """A document, while the values of its ships are put into it.
+    """A document into which the values of old ships are put.
 
     Args:
         holder: The document in a list of one, an empty list if there is none.
-        kept: Container and key of what ships of today hold there: it is newer, and stays.
+        kept: Container and key of each value of a new ship, which stays.
     """
 
     def __init__(self, holder: list[Any], kept: list[tuple[Any, Any]]) -> None:
         self._holder = holder
-        # By identity: containers are compared by value otherwise, and equal ones may stand in several places.
+        # By id: equal containers may be in several places.
         self._kept = {(id(container), key) for container, key in kept}
 
     def put(self, place: str, value: Any) -> bool:
-        """Put a ship's value at an old place, as old programs read it: in place of what JSON holds there.
+        """Put a ship's value at an old place, unless a value of a new ship is there; return whether it was put.
 
-        Returns whether it was put: not if a ship of today holds something there.
-
-        Raises:
-            BadData: The place is inside of something that has no entries.
+        Raises BadData if the place is inside of a value without entries.
         """
         found = self._slot(place)
         if (id(found[0]), found[1]) in self._kept:
@@ -102,7 +96,7 @@ class Tree:
         return True
 
     def holds(self, place: str) -> bool:
-        """Return whether a ship of today holds something at an old place; changes nothing."""
+        """Return whether a value of a new ship is at an old place."""
         for path in candidates(place):
             found = self._find(path)
             if found is not None and (id(found[0]), found[1]) in self._kept:
@@ -110,12 +104,10 @@ class Tree:
         return False
 
     def root(self, deletion: Callable[[str], str]) -> list[Any]:
-        """Return the whole value in a list of one, empty if there is none; taken out of the dict made for it.
+        """Return the whole value in a list of one, empty if there is none, taken out of the dict made for it.
 
-        `deletion` returns what deletes an entry of the old key, to be told where there is one too many.
-
-        Raises:
-            BadData: There are entries beside it, which old programs read by path only.
+        Raises BadData if the dict has other entries, which old programs read by path only; `deletion` returns the shell
+        command that deletes an entry.
         """
         if not self._holder or not isinstance(self._holder[0], dict) or ROOT not in self._holder[0]:
             return self._holder
@@ -128,7 +120,6 @@ class Tree:
         return [self._holder[0][ROOT]]
 
     def _find(self, path: Path) -> tuple[Any, Any] | None:
-        """Return container and key of a path that is there."""
         if path and path[0] == ROOT and self._holder and not isinstance(self._holder[0], dict):
             path = path[1:]  # it was taken out of its dict already
         container: Any = self._holder
@@ -142,7 +133,7 @@ class Tree:
         return container, key + len(container) if isinstance(key, int) and key < 0 else key
 
     def _slot(self, place: str) -> tuple[Any, Any]:
-        """Return the container and the key to set; makes missing dicts on the way, as old programs did in reading."""
+        """Return the container and the key to set; makes missing dicts on the path, as old programs did."""
         found = candidates(place)
         for path in found:
             slot = self._find(path)

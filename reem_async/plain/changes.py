@@ -1,4 +1,4 @@
-"""Changes below the top of a document: a look, then a transaction that stores the new text."""
+"""Changes below the top of a document: read the text under WATCH, then store the new text in a transaction."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from .batches import (
     run,
     text_told,
 )
-from .documents import Document
+from .documents import TextDocument
 
 _FRAME = frozenset(["ASKING", "MULTI", "EXEC"])
 _STORING = frozenset(["SET", "UNLINK"])
@@ -35,17 +35,17 @@ _SEEING = frozenset(["GET", "TYPE", "GETRANGE"])
 def after_look(
     commands: Sequence[Command], keys: Sequence[bytes], known: Known, error: MakeError, watched: Watched | None
 ) -> Steps:
-    """Return the translation of a batch that changes documents which have to be looked at before; see `translation`.
+    """Return the translation of a batch that changes documents which must be read before; see `translation`.
 
     Args:
         commands: The batch.
-        keys: Of the documents.
-        known: What was seen of keys.
+        keys: The keys of the documents.
+        known: The keys that hold documents.
         error: Makes error replies.
-        watched: What the connection watches besides; then somebody else decides whether to try again.
+        watched: The keys that the plan itself watches on this connection, or None.
     """
-    # States: look (WATCH and read) -> nothing sent, if the look failed -> transaction -> answers, or given up, where
-    # somebody wrote in between. Whoever steps this tries again from the look, unless the plan itself holds the watch.
+    # First WATCH and read. If that fails, nothing else is sent. Then the transaction. If another client wrote in
+    # between, the transport starts again, unless the plan itself watches keys: then the plan does.
     look = _Look(commands, keys, watched or Watched(), known, error)
     replies = (yield look.commands) if look.commands else []
     failed = look.failed(replies)
@@ -58,47 +58,46 @@ def after_look(
     outcome = (yield sent) if sent else []
     if any(isinstance(reply, ServerFull) for reply in outcome) and change.only_deletes():
         outcome = yield change.alone()
-    # EXEC has ended the watch, whatever came of it.
+    # EXEC ends the watch in any case.
     if watched is not None and sent:
         watched.clear()
-    if change.was_given_up(outcome):
+    if change.has_conflict(outcome):
         return None if watched is None or not change.is_whole else [b"QUEUED"] * (len(commands) - 1) + [None]
     return change.answers(outcome, known)
 
 
 def _not_looked(commands: Sequence[Command], failed: Exception) -> list[Reply]:
-    """Return the answers to a batch of which nothing was sent: the error is that of its JSON commands, and of EXEC."""
+    """Return the replies to a batch that was not sent: the error for its JSON commands, and for EXEC."""
     if commands[-1][0] != "EXEC":
         return [failed] * len(commands)
     return [failed if is_json(command) or command[0] == "EXEC" else b"QUEUED" for command in commands]
 
 
 class _Look:
-    """What has to be known of documents before they are changed."""
+    """The commands that watch and read documents before a change, and their replies."""
 
     def __init__(
         self, commands: Sequence[Command], keys: Sequence[bytes], watched: Watched, known: Known, error: MakeError
     ) -> None:
         self._keys, self._watched, self._known, self._error = keys, watched, known, error
-        # Texts are fetched only of documents that are changed inside: one that is replaced may be large.
+        # A text is fetched only if the document is changed inside: one that is replaced may be large.
         self._read = {key_of(each) for each in commands if is_json(each) and not is_whole(each)}
         looks: list[Command] = [("WATCH", key) for key in keys if key not in watched.keys]
         for key in keys:
             if key not in watched.texts:
-                # Of what is replaced as a whole, only whether it is a document.
                 looks += [("GET", key)] if key in self._read else [("TYPE", key), ("GETRANGE", key, "0", "0")]
         self.commands = [word for look in looks for word in (ASKING, look)] if asks(commands) else looks
 
     def failed(self, replies: Sequence[Reply]) -> Exception | None:
-        """Return the error that keeps it from knowing, None if there is none."""
+        """Return the error of a read, except that of a key of another type."""
         for reply in replies:
             if isinstance(reply, Exception) and not str(reply).startswith(OTHER_TYPE):
                 return reply
         return None
 
-    def documents(self, replies: Sequence[Reply]) -> dict[bytes, Document | Exception]:
-        """Return the document under each key, or the error of the module about what is there."""
-        found: dict[bytes, Document | Exception] = {}
+    def documents(self, replies: Sequence[Reply]) -> dict[bytes, TextDocument | Exception]:
+        """Return the document under each key, or the module's error."""
+        found: dict[bytes, TextDocument | Exception] = {}
         answers = iter([reply for reply, look in zip(replies, self.commands, strict=True) if look[0] in _SEEING])
         for key in self._keys:
             if key in self._watched.texts:
@@ -109,19 +108,19 @@ class _Look:
                     begins = next(answers)
                     text = None if text == b"none" else begins
             text = text_told(text, key, self._known, self._error)
-            found[key] = text if isinstance(text, Exception) else Document(text)
+            found[key] = text if isinstance(text, Exception) else TextDocument(text)
         return found
 
 
 class _Change:
-    """A batch that was carried out on the texts of its documents, and what makes the server's the same.
+    """A batch, executed on the texts of its documents, and the commands that store the new texts.
 
     Attributes:
-        is_whole: The batch is a transaction.
+        is_whole: Whether the batch is a transaction.
     """
 
     def __init__(
-        self, commands: Sequence[Command], documents: dict[bytes, Document | Exception], error: MakeError
+        self, commands: Sequence[Command], documents: dict[bytes, TextDocument | Exception], error: MakeError
     ) -> None:
         self._commands, self._documents = commands, documents
         self._answers: list[Reply] = [b"OK"] * len(commands)
@@ -134,15 +133,15 @@ class _Change:
                 self._answers[place] = document if isinstance(document, Exception) else run(document, command, error)
             elif command[0] not in _FRAME:
                 self._others.append(place)
-        # Several changes of one document become one SET of its last text, in the place of the last of them.
+        # Several changes of one document become one SET, in the place of the last of them.
         self._last = {place: key for key, place in last.items() if _is_changed(documents[key])}
         self._places: dict[int, int] = {}
         self._sent: list[Command] = []
-        self._end = 0  # where EXEC is sent
+        self._end = 0  # the position of EXEC
         self.is_whole = bool(commands[-1][0] == "EXEC")
 
     def commands(self, held: bool) -> list[Command]:
-        """Return what to send: a transaction, and behind it what was not to be in one."""
+        """Return the commands: a transaction, and behind it those that were not in one."""
         inside = sorted([*self._last, *self._others]) if self.is_whole else list(self._last)
         asking = [ASKING] if asks(self._commands) else []
         if inside:
@@ -151,7 +150,7 @@ class _Change:
                 self._add(place)
             self._end = len(self._sent)
             self._sent.append(EXEC)
-        # Nothing is changed after all (NX, or nothing to delete), but the look has watched.
+        # Nothing is changed after all (NX, or nothing to delete), but keys are watched.
         elif not held or self.is_whole:
             self._sent = [UNWATCH]
         if not self.is_whole:
@@ -161,7 +160,7 @@ class _Change:
         return self._sent
 
     def only_deletes(self) -> bool:
-        """Return whether it deletes documents, and else only looks, and is no transaction."""
+        """Return whether it is no transaction and only deletes documents."""
         return (
             self._end > 0
             and not self.is_whole
@@ -170,7 +169,7 @@ class _Change:
         )
 
     def alone(self) -> list[Command]:
-        """Return what to send without a transaction: Redis without memory queues nothing, but does what makes room."""
+        """Return the commands without a transaction: a Redis that is out of memory accepts only single deletions."""
         self._sent, self._end = [], 0
         asking = [ASKING] if asks(self._commands) else []
         for place in sorted(self._places):
@@ -183,18 +182,17 @@ class _Change:
         key = self._last.get(place)
         self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
 
-    def was_given_up(self, replies: Sequence[Reply]) -> bool:
-        """Return whether somebody else was first."""
+    def has_conflict(self, replies: Sequence[Reply]) -> bool:
+        """Return whether another client was first."""
         return self._end > 0 and replies[self._end] is None
 
     def answers(self, replies: Sequence[Reply], known: Known) -> list[Reply]:
-        """Return the answers to all commands of the batch."""
         replies, answers = list(replies), self._answers
         if self._end:
             outcome = replies[self._end]
             if not isinstance(outcome, list):
                 return self._refused(replies, outcome)
-            # Now each reply stands where its command was sent, as without a transaction.
+            # Put each reply at the position of its command, as without a transaction.
             replies[body_of(self._sent).start : self._end] = outcome
         for place, at in self._places.items():
             key = self._last.get(place)
@@ -205,38 +203,34 @@ class _Change:
         return framed(self._commands, answers)
 
     def _refused(self, replies: list[Reply], outcome: Reply) -> list[Reply]:
-        """Return the answers if the server did not take the transaction: errors where they were, and at its end."""
+        """Return the replies if the server refused the transaction."""
         answers: list[Reply] = [b"QUEUED"] * len(self._commands)
         for place, at in self._places.items():
             answers[place] = replies[at]
         if self.is_whole:
             answers[0], answers[-1] = replies[0], outcome
             return answers
-        # The batch was no transaction, the plan knows of none: what kept ours from being taken is the answer to its
-        # commands.
+        # The plan knows of no transaction: the reason for the refusal is the reply to its commands.
         reason = next((reply for reply in replies if isinstance(reply, Exception)), outcome)
         stored = [
             reply for place, reply in enumerate(replies) if place < self._end and self._sent[place][0] in _STORING
         ]
         if reason is replies[self._sent.index(MULTI)] and not any(isinstance(reply, Exception) for reply in stored):
-            reason = PartialWrite(
-                f"{reason}; so it was done apart from the look before it: what others did may be lost"
-            )
+            reason = PartialWrite(f"{reason}; MULTI was refused, so a change by another client in between may be lost")
         for place, command in enumerate(self._commands):
             if is_json(command):
                 answers[place] = reason
         return answers
 
 
-def _is_changed(document: Document | Exception) -> bool:
-    return isinstance(document, Document) and document.changed
+def _is_changed(document: TextDocument | Exception) -> bool:
+    return isinstance(document, TextDocument) and document.changed
 
 
-def _is_there(document: Document | Exception) -> bool:
-    return isinstance(document, Document) and document.exists
+def _is_there(document: TextDocument | Exception) -> bool:
+    return isinstance(document, TextDocument) and document.exists
 
 
-def _storing(key: bytes, document: Document | Exception) -> Command:
-    """Return what makes the string under a key that of a document."""
-    assert isinstance(document, Document)
+def _storing(key: bytes, document: TextDocument | Exception) -> Command:
+    assert isinstance(document, TextDocument)
     return ("SET", key, document.string(), "KEEPTTL") if document.exists else ("UNLINK", key)

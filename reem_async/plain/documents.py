@@ -1,8 +1,8 @@
-"""What the JSON module does to a document, done to its text: the same replies, the same refusals.
+"""The JSON module's commands on a document, executed on its text: the same replies, the same errors.
 
-Numbers stay what they are: integers of 64 bits, signed or not, and floats to the last bit, since both ways between
-text and number round correctly. Integers are added and multiplied as the module does it, wrapped around at 64 bits;
-whoever calls for it checks the result (`plan.arithmetic`).
+Numbers stay the same: integers of 64 bits, signed or not, and floats to the last bit, since text and number are
+converted with correct rounding. Integers are added and multiplied as in the module, wrapped around at 64 bits; the plan
+checks the result (`plan.arithmetic`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from ..plan.documents import nested_over
 from .paths import Place, Refusal, places, steps_of
 
 MARK = b" "
-"""The first byte of the string that is a document, before its JSON text. To JSON it means nothing, and programs of
-others do not begin a string with it: so a document is told from their strings by its first byte alone."""
+"""The first byte of a document's string, before its JSON text. JSON ignores it, and other programs do not begin a
+string
+with it, so it identifies a document."""
 
 _ABSENT = "ERR could not perform this operation on a key that doesn't exist"
 _NUMBERS = (int, float)
@@ -26,41 +27,36 @@ _LOWEST, _HIGHEST, _WHOLE = -(2**63), 2**63 - 1, 2**64
 
 
 def stored(text: str | bytes | bytearray) -> bytes:
-    """Return the string that is a document of JSON text; a ship of a user's may have given a str."""
+    """Return the string of a document; a user's ship may have given a str."""
     return MARK + (text.encode() if isinstance(text, str) else bytes(text))
 
 
 def is_document(text: bytes | bytearray) -> bool:
-    """Return whether what a string begins with says that it is a document."""
     return text[:1] == MARK
 
 
 _DEEPEST = 128
-"""Levels of a document that the module takes."""
+"""Levels of a document that the module accepts."""
 
 
-class Document:
-    """One document while commands are carried out on it, one after the other.
+class TextDocument:
+    """One document on which commands are executed.
 
     Args:
-        text: What the key's string holds, None if there is no key. It is a document's.
+        text: The key's string; None if there is no key.
 
     Attributes:
-        changed: It is not any more as it was given.
+        changed: Whether a command has changed it.
     """
 
     def __init__(self, text: bytes | bytearray | None) -> None:
-        # Either may be None: the text while the tree has changes that are not written yet, the tree until it is needed.
+        # The text is None while the tree has newer changes, the tree until it is needed.
         self._text = text
         self._holder: list[Any] | None = None
         self.changed = False
 
     def run(self, command: Sequence[Any]) -> Any:
-        """Carry out a JSON command; return its reply.
-
-        Raises:
-            Refusal: With the text that the module refuses it with.
-        """
+        """Execute a JSON command and return its reply; raises Refusal with the module's message."""
         name, _, *words = command
         path = _text_of(words[0]) if words else "$"
         if name in _WRITES:
@@ -69,11 +65,10 @@ class Document:
 
     @property
     def exists(self) -> bool:
-        """Whether there is a document."""
         return self._text is not None or bool(self._holder)
 
     def string(self) -> bytes:
-        """Return what the key's string is to hold."""
+        """Return the new string of the key."""
         if self._text is None:
             assert self._holder
             self._text = MARK + orjson.dumps(self._holder[0])
@@ -88,7 +83,7 @@ class Document:
                 self._holder = [] if self._text is None else [orjson.loads(memoryview(self._text))]
             except orjson.JSONDecodeError:
                 raise Refusal("ERR the string under this key is no document: it is not JSON") from None
-            # Deeper ones are not REEM's, and orjson writes no more than 254 levels.
+            # orjson writes no more than 254 levels.
             if self._text is not None and nested_over(bytes(self._text), self._holder[0], _DEEPEST):
                 self._holder = None
                 raise Refusal(f"ERR the document under this key is nested over {_DEEPEST} levels")
@@ -103,48 +98,42 @@ class Document:
         return [measure(place.value) for place in self._at(path)]
 
     def get(self, path: str, bare: bool) -> bytes | None:
-        """Return the JSON text of what is at a path, in a list; of the root alone if `bare`."""
+        """Return the JSON text of the values at a path, in a list; of the root alone if `bare`."""
         if not self.exists:
             return None
-        # The whole document is copied as text, without parsing: what programs read most.
+        # The usual read, of the whole document, copies the text without parsing.
         if not steps_of(path):
             text = memoryview(self.string())[1:]
             return bytes(text) if bare or path == "." else b"".join((b"[", text, b"]"))
         return orjson.dumps([place.value for place in self._at(path)])
 
     def type(self, path: str, bare: bool) -> list[Any]:
-        """Return the name of the type of each value at a path."""
         if not self.exists:
             return [None]
         names = [_type(place.value) for place in self._at(path)]
         return names if bare else [names]
 
     def keys(self, path: str, bare: bool) -> Any:
-        """Return the keys of each dict at a path."""
         return self._each(path, lambda value: [key.encode() for key in value] if type(value) is dict else None)
 
     def entries(self, path: str, bare: bool) -> Any:
-        """Return how many entries each dict at a path has."""
         absent = f"ERR Path '{path}' does not exist or not an object"
         return self._each(path, lambda value: len(value) if type(value) is dict else None, absent)
 
     def items(self, path: str, bare: bool) -> Any:
-        """Return how many items each list at a path has."""
         return self._each(path, lambda value: len(value) if type(value) is list else None)
 
     def length(self, path: str, bare: bool) -> Any:
-        """Return how many bytes each text at a path has."""
         return self._each(path, lambda value: len(value.encode()) if type(value) is str else None)
 
     # Writing.
 
     def set(self, path: str, words: Sequence[Any]) -> bytes | None:
-        """Put a value at a path, if that is there (XX), or if it is not (NX)."""
         text, only = words[0], {_text_of(word) for word in words[1:]}
         if not steps_of(path):
             if ("NX" in only and self.exists) or ("XX" in only and not self.exists):
                 return None
-            # Not parsed: it comes from orjson, or from a ship that vouches for it.
+            # Not parsed: it comes from orjson or from a ship.
             self._holder, self._text, self.changed = None, stored(text), True
             return b"OK"
         value = _loaded(text)
@@ -161,7 +150,7 @@ class Document:
         return self._noted(self._added(path, value))
 
     def _added(self, path: str, value: Any) -> bool:
-        """Put a new key into a dict; return whether there was one without it."""
+        """Put a new key into a dict; return whether there is such a dict."""
         steps = steps_of(path)
         _check_static(steps)
         if isinstance(steps[-1], int):
@@ -178,21 +167,19 @@ class Document:
         return b"OK" if changed else None
 
     def delete(self, path: str, words: Sequence[Any]) -> int:
-        """Remove what is at a path; return how many values that were."""
         if not self.exists:
             return 0
         if not steps_of(path):
             self._holder, self._text, self.changed = [], None, True
             return 1
         found = self._at(path)
-        # From the end, so that removing an item does not move those that are still to be removed.
+        # From the end, since removing an item moves those behind it.
         for place in reversed(found):
             _remove(place)
         self._noted(bool(found))
         return len(found)
 
     def append(self, path: str, words: Sequence[Any]) -> Any:
-        """Append values to each list at a path; return how long they are then."""
         if not self.exists:
             raise Refusal(_ABSENT)
         values = [_loaded(word) for word in words]
@@ -206,11 +193,9 @@ class Document:
         return lengths
 
     def add(self, path: str, words: Sequence[Any]) -> Any:
-        """Add a number to each number at a path; return the sums."""
         return self._calculated(path, words[0], lambda a, b: a + b)
 
     def multiply(self, path: str, words: Sequence[Any]) -> Any:
-        """Multiply each number at a path by a number; return the products."""
         return self._calculated(path, words[0], lambda a, b: a * b)
 
     def _calculated(self, path: str, word: Any, operation: Callable[[Any, Any], Any]) -> Any:
@@ -222,7 +207,7 @@ class Document:
             if type(old) not in _NUMBERS:
                 results.append(None)
                 continue
-            # Parsed as JSON, so an integer stays one: adding 1 and adding 1.0 give results of different types.
+            # Parsed as JSON, since adding 1 and adding 1.0 give results of different types.
             operand = _loaded(word)
             if type(operand) not in _NUMBERS:
                 raise Refusal("ERR bad input number")
@@ -233,7 +218,6 @@ class Document:
 
 
 def _check_static(steps: Sequence[Any]) -> None:
-    """Refuse a path that may lead to several places where it must not."""
     if any(isinstance(step, slice) for step in steps):
         raise Refusal("ERR Err wrong static path")
 
@@ -248,7 +232,7 @@ def _arithmetic(one: Any, other: Any, operation: Callable[[Any, Any], Any]) -> A
 
 
 def _remove(place: Place) -> None:
-    """Remove what is there. Of a dict, the last entry takes its place in the order, as in the module."""
+    # In a dict, the last entry takes the place of the removed one in the order, as in the module.
     if type(place.container) is list:
         del place.container[place.key]
         return
@@ -286,20 +270,20 @@ _TYPES: dict[type, bytes] = {
     type(None): b"null",
 }
 
-_READS: dict[str, Callable[[Document, str, bool], Any]] = {
-    "JSON.GET": Document.get,
-    "JSON.TYPE": Document.type,
-    "JSON.OBJKEYS": Document.keys,
-    "JSON.OBJLEN": Document.entries,
-    "JSON.ARRLEN": Document.items,
-    "JSON.STRLEN": Document.length,
+_READS: dict[str, Callable[[TextDocument, str, bool], Any]] = {
+    "JSON.GET": TextDocument.get,
+    "JSON.TYPE": TextDocument.type,
+    "JSON.OBJKEYS": TextDocument.keys,
+    "JSON.OBJLEN": TextDocument.entries,
+    "JSON.ARRLEN": TextDocument.items,
+    "JSON.STRLEN": TextDocument.length,
 }
-_WRITES: dict[str, Callable[[Document, str, Sequence[Any]], Any]] = {
-    "JSON.SET": Document.set,
-    "JSON.DEL": Document.delete,
-    "JSON.ARRAPPEND": Document.append,
-    "JSON.NUMINCRBY": Document.add,
-    "JSON.NUMMULTBY": Document.multiply,
+_WRITES: dict[str, Callable[[TextDocument, str, Sequence[Any]], Any]] = {
+    "JSON.SET": TextDocument.set,
+    "JSON.DEL": TextDocument.delete,
+    "JSON.ARRAPPEND": TextDocument.append,
+    "JSON.NUMINCRBY": TextDocument.add,
+    "JSON.NUMMULTBY": TextDocument.multiply,
 }
 READS, WRITES = frozenset(_READS), frozenset(_WRITES)
-"""The names of the commands that look at a document, and of those that change it."""
+"""The names of the commands that read a document, and of those that change it."""

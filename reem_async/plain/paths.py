@@ -1,4 +1,4 @@
-"""The places that JSON commands name, as far as REEM names any: `$["a"][0]`, `$['b']`, `$[-3:-2]`, `$["a"][*]`."""
+"""JSONPaths, as far as REEM sends any: `$["a"][0]`, `$['b']`, `$[-3:-2]`, `$["a"][*]`."""
 
 from __future__ import annotations
 
@@ -16,29 +16,23 @@ _STEP = re.compile(r"""\["(?P<double>[^"]*)"\]|\['(?P<single>[^']*)'\]|\[(?P<fro
 
 
 class Refusal(Exception):
-    """A command is refused; its text is that of the server's error."""
+    """A command is refused, with the message of the server's error."""
 
 
 class Place(NamedTuple):
-    """Where a path leads in a tree.
-
-    Attributes:
-        container: What holds it; for the root, a list of it alone.
-        key: Where in there.
-    """
+    """A place in a tree: `container[key]`; for the root, the only item of a list."""
 
     container: Any
     key: Any
 
     @property
     def value(self) -> Any:
-        """What is there."""
         return self.container[self.key]
 
 
 @lru_cache(maxsize=4096)
 def steps_of(path: str) -> Steps:
-    """Return the steps from the root that a path stands for; raises Refusal for what REEM never sends."""
+    """Return the steps of a path from the root; raises Refusal for paths that REEM never sends."""
     # The root, as commands of RedisJSON 1 name it; `bare` replies belong to it.
     if path == ".":
         return ()
@@ -61,7 +55,7 @@ def _step(found: re.Match[str]) -> Step:
 
 
 def places(holder: list[Any], steps: Steps) -> list[Place]:
-    """Return where `steps` lead, from the only item of `holder` on; none if nothing is there."""
+    """Return the places that `steps` lead to from the only item of `holder`."""
     found = [Place(holder, 0)]
     for step in steps:
         found = [inner for place in found for inner in _inside(place.value, step)]
@@ -75,9 +69,8 @@ def _inside(value: Any, step: Step) -> list[Place]:
         return [Place(value, key) for key in value] if step is ALL else []
     if type(value) is not list:
         return []
-    # RedisJSON takes slices as Python does: what is beyond the ends is left out.
     if isinstance(step, slice):
         return [Place(value, index) for index in range(*step.indices(len(value)))]
-    # Strictly: no item before the first one, where the module would take the first.
+    # Strictly: no item for an index that is too negative; the module would name the first.
     index = step if step >= 0 else len(value) + step
     return [Place(value, index)] if 0 <= index < len(value) else []

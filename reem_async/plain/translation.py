@@ -1,17 +1,16 @@
-"""A batch of commands -> what a server without the JSON module takes, and its replies -> those of the module.
+"""Translate batches of JSON commands for servers without the JSON module, and the replies back.
 
-A translation is a generator: it yields what to send, is given the replies, and returns what the module would have
-answered. Whoever owns a connection steps it. There are two ways:
+A translation is a generator: it yields commands, is sent the replies, and returns the replies of the module. A
+transport runs it. There are two kinds:
 
-    directly     one round trip: a read is a GET, a whole document is a SET. More than one read of a key is one GET.
-    after a look two round trips, on a connection of the caller's own. What is below the top changes with its document:
+    directly     one round trip: a read is a GET, a whole document is a SET. Several reads of a key are one GET.
+    after a look two round trips, on a connection of the call's own, for changes below the top of a document:
 
         WATCH foo; GET foo         ->  the text
-        MULTI; SET foo ...; EXEC   the new text, and whatever else was in the batch; nil if somebody else was first
+        MULTI; SET foo ...; EXEC   the new text, and the rest of the batch; nil if another client was first
 
-A whole document is written directly only where it was seen, a moment ago, that a document is under the key: a SET would
-replace anything else, which the module refuses. That is the only thing here that is remembered; see `Known`. Before one
-is deleted, which is rare, there is always a look.
+A whole document is written directly only if its key held a document a moment ago (see `Known`): a SET would replace
+anything else, which the module refuses. A document is always looked at before it is deleted, which is rare.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ from .batches import (
     text_told,
 )
 from .changes import after_look
-from .documents import MARK, READS, WRITES, Document, is_document, stored
+from .documents import MARK, READS, WRITES, TextDocument, is_document, stored
 
 
 def shortcut(commands: Sequence[Command], known: Known) -> list[Command] | None:
-    """Return what to send for what programs do most, a small read or a whole small document; None for all else.
+    """Return the commands for the most frequent batches, a small read or a whole small document; None for others.
 
-    It is what `translated` would send; `finished` makes the answers of the replies.
+    `translated` would send the same, but takes longer; `finished` converts the replies.
     """
     first = commands[0]
     if first[0] == "JSON.GET":
@@ -58,7 +57,6 @@ def shortcut(commands: Sequence[Command], known: Known) -> list[Command] | None:
 
 
 def finished(commands: Sequence[Command], replies: list[Reply], known: Known, error: MakeError) -> list[Reply]:
-    """Return the answers to commands for which there was a shortcut."""
     first = commands[0]
     if first[0] == "JSON.SET":
         return replies
@@ -67,12 +65,11 @@ def finished(commands: Sequence[Command], replies: list[Reply], known: Known, er
         known.saw(key_of(first), True)
         return [b"".join((b"[", memoryview(text)[1:], b"]"))]
     text = text_told(text, key_of(first), known, error)
-    return [text if isinstance(text, Exception) else run(Document(text), first, error)]
+    return [text if isinstance(text, Exception) else run(TextDocument(text), first, error)]
 
 
 def looked_at(commands: Sequence[Command], known: Known) -> list[bytes]:
-    """Return the keys of documents that have to be looked at before commands are sent; none if they go directly."""
-    # A change inside of a document needs its text, and a whole one needs to know what is under the key.
+    """Return the keys of documents to look at before; none if the batch goes directly."""
     for command in commands:
         if command[0] in WRITES and not (replaces(command) and key_of(command) in known):
             return list({key_of(each): None for each in commands if is_json(each)})
@@ -83,10 +80,10 @@ def translated(commands: Sequence[Command], known: Known, error: MakeError, watc
     """Return the translation of a batch.
 
     Args:
-        commands: What a plan sends, MULTI and EXEC included.
-        known: What was seen of keys.
+        commands: The batch of a plan, MULTI and EXEC included.
+        known: The keys that hold documents.
         error: Makes error replies.
-        watched: What the connection watches, if it is one caller's own for longer than this batch.
+        watched: The keys that the plan watches, if it keeps the connection for longer than this batch.
     """
     keys = looked_at(commands, known)
     if keys:
@@ -94,15 +91,8 @@ def translated(commands: Sequence[Command], known: Known, error: MakeError, watc
     return directly(commands, known, error, watched)
 
 
-# Directly.
-
-
 class _Sending:
-    """What is sent for a batch, and which of the replies answers which command.
-
-    Args:
-        asking: Before each command goes ASKING: then all that is asked is sent.
-    """
+    """The commands for a batch, and the position of each one's reply; `asking` if ASKING precedes each command."""
 
     def __init__(self, *, asking: bool) -> None:
         self.commands: list[Command] = []
@@ -111,12 +101,10 @@ class _Sending:
         self._read: dict[bytes, int] = {}
 
     def add(self, *commands: Command) -> None:
-        """Send commands, of which the first answers."""
         self.places.append(len(self.commands))
         self.commands += commands
 
     def read(self, key: bytes) -> None:
-        """Send a GET, unless one before tells the same."""
         if key in self._read and not self._asking:
             self.places.append(self._read[key])
         else:
@@ -124,22 +112,17 @@ class _Sending:
             self.add(("GET", key))
 
     def write(self, command: Command) -> None:
-        """Send what sets a whole document."""
-        # A read behind it sees what it has written, so it cannot share the GET from before.
+        # A later read must see the new text, so it cannot share an earlier GET.
         self._read.pop(key_of(command), None)
         self.add(_whole(command))
 
     def look(self, command: Command) -> None:
-        """Send TYPE, and what tells a document from another string."""
         between = [ASKING] if self._asking else []
         self.add(command, *between, ("GETRANGE", key_of(command), "0", "0"))
 
 
 def directly(commands: Sequence[Command], known: Known, error: MakeError, watched: Watched | None = None) -> Steps:
-    """Return the translation of a batch for which there is nothing that has to be `looked_at`.
-
-    That is asked once for a batch: what is `known` of a key is known for a while only, so it may not be any more.
-    """
+    """Return the translation of a batch whose documents need not be `looked_at`."""
     sending = _Sending(asking=asks(commands))
     for command in commands:
         if is_json(command):
@@ -152,11 +135,10 @@ def directly(commands: Sequence[Command], known: Known, error: MakeError, watche
         elif command[0] == "TYPE":
             sending.look(command)
         else:
-            # SCAN ... TYPE ReJSON-RL, which this server does not know: of the strings it finds, `_only_documents` keeps
-            # some.
+            # SCAN ... TYPE ReJSON-RL: the server finds strings, of which `_only_documents` keeps the documents.
             sending.add((*command[:-1], "string"))
     replies = yield sending.commands
-    if commands[-1][0] == "EXEC" and not isinstance(replies[-1], list):  # it was given up, or refused
+    if commands[-1][0] == "EXEC" and not isinstance(replies[-1], list):  # a watched key has changed, or refused
         if watched is not None:
             watched.clear()
         return [replies[place] for place in sending.places]
@@ -169,26 +151,25 @@ def directly(commands: Sequence[Command], known: Known, error: MakeError, watche
 
 
 def _whole(command: Command) -> Command:
-    """Return what sets the string of a document."""
     text = command[3]
-    # A large text is not copied only to put one byte before it: the transport sends pieces as they are.
+    # A large text is not copied to put one byte before it: the transport sends pieces as they are.
     marked = stored(text) if len(text) < LARGE or isinstance(text, str) else (MARK, text)
     return ("SET", key_of(command), marked, "KEEPTTL", *command[4:])
 
 
 class _Answers:
-    """What the module would have answered, from the replies to what was sent in its place."""
+    """Converts the replies to those of the module."""
 
     def __init__(self, sent: Sequence[Command], replies: Sequence[Reply], known: Known, error: MakeError) -> None:
         self._sent, self._known, self._error = sent, known, error
-        self._documents: dict[int, Document | Exception] = {}
+        self._documents: dict[int, TextDocument | Exception] = {}
         self._asking = asks(sent)
         self._replies = list(replies)
         if sent[-1][0] == "EXEC":
             self._replies[body_of(sent)] = replies[-1]
 
     def of(self, command: Command, place: int) -> Reply:
-        """Return the answer to a command, the reply at `place` being for it."""
+        """Return the module's reply to a command, whose reply is at `place`."""
         reply = self._replies[place]
         if command[0] in READS and len(command) > 1:
             document = self._document(place)
@@ -198,18 +179,18 @@ class _Answers:
         return reply
 
     def text(self, place: int) -> Reply:
-        """Return the text of the document that the GET at `place` has read, or the error that says why not."""
+        """Return the text in the reply to the GET at `place`, or an error."""
         return text_told(self._replies[place], key_of(self._sent[place]), self._known, self._error)
 
-    def _document(self, place: int) -> Document | Exception:
+    def _document(self, place: int) -> TextDocument | Exception:
         if place not in self._documents:
             text = self.text(place)
-            self._documents[place] = text if isinstance(text, Exception) else Document(text)
+            self._documents[place] = text if isinstance(text, Exception) else TextDocument(text)
         return self._documents[place]
 
 
 def _follow(watched: Watched, commands: Sequence[Command], places: Sequence[int], answers: _Answers) -> None:
-    """Note what a connection watches from now on, and what was read of that."""
+    """Note the keys that a connection watches from now on, and their texts that were read."""
     for command, place in zip(commands, places, strict=True):
         if command[0] == "WATCH" and not isinstance(answers.of(command, place), Exception):
             watched.keys.update(word if type(word) is bytes else str(word).encode() for word in command[1:])
@@ -222,12 +203,12 @@ def _follow(watched: Watched, commands: Sequence[Command], places: Sequence[int]
 
 
 def _only_documents(commands: Sequence[Command], found: list[Reply]) -> Generator[list[Command], list[Reply], None]:
-    """Look what strings a SCAN has found, and leave out of its answer what is no document."""
+    """Leave the strings that are no documents out of the reply to a SCAN."""
     for place, command in enumerate(commands):
         if command[0] != "SCAN" or not is_look(command) or isinstance(found[place], Exception):
             continue
         cursor, names = found[place]
-        # Those of ships are left out before they are asked about: there may be many.
+        # Attachments first, without asking: there may be many.
         names = [name for name in names if b"{" not in name]
         if names:
             begins = yield [("GETRANGE", name, "0", "0") for name in names]

@@ -1,10 +1,10 @@
-"""Snapshots: what a server holds, in a file, and back.
+"""Snapshots: save the data of a server to a file, and restore it.
 
     saved = await save(interface, "before.zip")
     await restore(interface, "before.zip", replace=True)
 
-A portable snapshot holds the keys of REEM and is written to any server, old or new, by any user who may
-write there; see `archive` for what is in the file. An RDB file is the server's own and holds all of it.
+A portable snapshot holds the keys of REEM. It can be restored to any server, with the right to write there; `archive`
+describes the file. An RDB file is the server's own format and holds the whole server.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 
 
 async def describe(path: str | os.PathLike[str], *, check: bool = False) -> Snapshot:
-    """Return what a snapshot of either kind holds, without a server.
+    """Return a summary of a snapshot of either kind, without a server.
 
     Reads the index of a portable snapshot, or the first bytes of an RDB file.
 
@@ -43,7 +43,7 @@ async def describe(path: str | os.PathLike[str], *, check: bool = False) -> Snap
         check: Read all of a portable snapshot and compare its digest.
 
     Raises:
-        BadData: Neither kind, or damaged where it was looked at.
+        BadData: Neither kind, or damaged in the part that was read.
         OSError: It cannot be read.
     """
     return await anyio.to_thread.run_sync(lambda: described(path, check=check))

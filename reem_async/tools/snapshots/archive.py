@@ -1,16 +1,15 @@
-"""The portable snapshot: a zip file that any unzip opens, whose end vouches for every byte before it.
+"""The portable snapshot: a zip file that any unzip opens, with a digest at its end.
 
-    reem-snapshot.json        what this is, and when and where it was taken
+    reem-snapshot.json        format, version, and when and where it was taken
     keys/1/document.json      a document, as the server sent it
-    keys/1/values/1.npy       what a ship holds: an array, for numpy.load
+    keys/1/values/1.npy       a ship's value: an array, for numpy.load
     keys/1/values/2.bin       other bytes
     keys/1/values/3.hash      the parts of another Redis type, each after its length and a colon
     keys/2/...
     index.json                the names that belong to these
 
-The comment of the zip file ends in the SHA-256 of the whole file (with zeros in the place of that
-digest), so that a file that was cut or changed is recognised before anything is done with it. It is
-written and read one top-level key at a time. Nothing here talks to a server.
+The comment of the zip file ends in the SHA-256 of the whole file (with zeros in the place of that digest), so a file
+that was cut or changed is refused. It is written and read one top-level key at a time. No I/O with a server.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of snapshots: what one says of itself, names by time, and writing that is all or nothing."""
+"""Files of snapshots: their summary, names by time, and writing that is all or nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ...errors import BadData
 from ..partfile import PartFile, there_already
 
 SUFFIXES = {"portable": ".zip", "rdb": ".rdb"}
-"""How the names of both kinds of files end. What a file is, its content says."""
+"""The ends of names of both kinds of files. The content tells the kind, not the name."""
 
 FIRST_MEMBER = b"reem-snapshot.json"
 """The name of the first member of a portable snapshot."""
@@ -28,7 +28,7 @@ FIRST_MEMBER = b"reem-snapshot.json"
 # reem-20260801T120000Z.zip, reem-auto-20260801T120000Z-2.rdb: only "auto" ones, of --keep, are ever deleted.
 _NAME = re.compile(r"reem-(?P<auto>auto-)?(?P<time>\d{8}T\d{6}Z)(?:-\d+)?\.(?:zip|rdb)")
 _TIME = "%Y%m%dT%H%M%SZ"
-# Bytes of the first member that are read: the rest of a header that somebody made up is not needed.
+# Bytes of the first member that are read; a made-up header may have any size.
 _LONGEST_HEADER = 1 << 16
 
 
@@ -52,22 +52,22 @@ class SavedKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What a file holds.
+    """The summary of a file.
 
     Attributes:
         path: The file.
         kind: "portable" or "rdb".
-        time: When it was taken, in seconds since 1970.
+        time: Seconds since 1970 when it was taken.
         size: Bytes of the file.
         count: Top-level keys in a portable one; Redis keys of the first database in an RDB file, and None
             where it does not say.
         keys: The top-level keys of a portable one, in order of their names.
         server: Where it was taken, or which program wrote the RDB file.
         namespace: The namespace it was taken of.
-        foreign: How many Redis keys were left out since they are not REEM's.
+        foreign: The number of Redis keys that were left out since they are not REEM's.
         foreign_names: The first of them, with their types.
-        unsaved: What could not be saved, top-level keys and arrays, and why; all else is in the file.
-        doubt: Of one that was just saved, why keys may be missing; empty if all that the server counts were found.
+        unsaved: The top-level keys and arrays that could not be saved, and why.
+        doubt: Of one that was just saved, why keys may be missing; empty if as many were found as the server counts.
     """
 
     path: Path
@@ -186,7 +186,7 @@ def _origin(path: Path) -> tuple[object, ...]:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Raise what would only show after the work: FileExistsError, NotADirectoryError, IsADirectoryError."""
+    """Raise errors before the work: FileExistsError, NotADirectoryError, IsADirectoryError."""
     if path.is_dir():
         raise IsADirectoryError(
             f"{path} is a directory; name a file in it, or use --directory, which names one by time"

@@ -301,7 +301,7 @@ class Survey:
 
     Attributes:
         names: The top-level keys, sorted.
-        seen: All keys that the servers named, whoever they belong to.
+        seen: All keys that the servers named, foreign ones too.
         unsaved: The top-level keys, and arrays, that could not be saved, and why.
         doubt: Why keys may be missing, for people; empty if the servers hold no more keys than they named.
     """
