@@ -56,34 +56,9 @@ def calculate(
         # transaction reads the number before and after.
         if known is None or counts_from_end(path) or not -_FAR < operation(known, operand) < _FAR:
             return computed()
-        return _on_server(keys, path, command, operation, operand, text, announcement, cache, computed)
-
-    def computed() -> Plan:
-        # If another client wrote in between, the number that was read is such a guess for the next attempt.
-        return compute(keys, path, lambda number: operation(number, operand), announcement, cache, attempt)
-
-    return attempt(cache.number(keys.document, path))
-
-
-def _on_server(
-    keys: Keys,
-    path: Path,
-    command: str,
-    operation: Operation,
-    operand: float,
-    text: bytes,
-    announcement: Announcement,
-    cache: ShapeCache,
-    computed: Callable[[], Plan],
-) -> Plan:
-    """Plan to let the server calculate; a result that differs from Python's is `computed` again, or corrected."""
-    place = to_jsonpath(path)
-    commands = [
-        get_command(keys, path),
-        (command, keys.document, place, text),
-        get_command(keys, path),
-        *announcement.commands(path),
-    ]
+        server_command = (command, keys.document, to_jsonpath(path), text)
+        read = get_command(keys, path)
+        return Plan([read, server_command, read, *announcement.commands(path)], decode, atomic=True)
 
     def decode(replies: Sequence[Reply]) -> Any:
         old = _number(present(replies[0], keys, path), keys, path)
@@ -93,14 +68,18 @@ def _on_server(
         if isinstance(replies[1], Exception) and "not a number" in str(replies[1]):
             raise _overflow(keys, path, old)
         checked(replies[1], keys, path)
-        text = present(replies[2], keys, path)
-        new, due = loads(text, keys)[0], operation(old, operand)
+        result = present(replies[2], keys, path)
+        new, due = loads(result, keys)[0], operation(old, operand)
         if type(new) is type(due) and new == due:
             cache.saw_number(keys.document, path, new)
             return new
-        return _corrected(keys, path, text, old, due, announcement)
+        return _corrected(keys, path, result, old, due, announcement)
 
-    return Plan(commands, decode, atomic=True)
+    def computed() -> Plan:
+        # If another client wrote in between, the number that was read is such a guess for the next attempt.
+        return compute(keys, path, lambda number: operation(number, operand), announcement, cache, attempt)
+
+    return attempt(cache.number(keys.document, path))
 
 
 def compute(

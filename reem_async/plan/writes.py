@@ -10,6 +10,8 @@ WATCH, after a look at the document.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from ..errors import BadType, Conflict, MissingKey, PathRefused, RedisError, ReemError, WrongType
@@ -112,7 +114,7 @@ def change(it: DocumentChange, cache: ShapeCache) -> Plan:
 
     Two in lists of arrays, and where the path counts from the end of a list.
     """
-    return _change_watched(it, cache) if is_watched(it, cache) else _change(it, cache)
+    return _WatchedChange(it, cache).plan() if is_watched(it, cache) else _change(it, cache)
 
 
 def is_watched(it: DocumentChange, cache: ShapeCache) -> bool:
@@ -176,54 +178,64 @@ def _moves(it: DocumentChange, cache: ShapeCache) -> bool:
     return it.replaces and any(may_hold(it.path, place_of(member)) for member in known)
 
 
-def _change_watched(it: DocumentChange, cache: ShapeCache, coming: Sequence[Staged] = ()) -> Plan:
-    """Plan to look first which items the path names, and which attachments are replaced with them."""
-    surveyed = survey(it.keys, it.path) if _moves(it, cache) else ()
-    start, end = 1 + len(surveyed), 1 + len(surveyed) + len(looks_at(coming))
+@dataclass(slots=True)
+class _WatchedChange:
+    """A change under WATCH: in lists, or of a value that must be unchanged since it was read."""
 
-    def look(replies: Sequence[Reply]) -> Plan:
+    it: DocumentChange
+    cache: ShapeCache
+    reads: Sequence[Command] | None = None  # their replies must be `before`
+    before: tuple[Any, ...] = ()
+    coming: list[Staged] = field(default_factory=list)
+
+    def plan(self) -> Plan:
         # First WATCH and look. If staged values have expired, send them again and look again. Then the transaction. If
         # a watched key has changed, stage the large values, once, and look again.
+        it = self.it
+        surveyed = survey(it.keys, it.path) if self.reads is not None or _moves(it, self.cache) else ()
+        looks = [*surveyed, *(self.reads or ()), *looks_at(self.coming), *lengths(it.keys, it.path)]
+        return Plan([watch(it.keys, self.coming), *looks], partial(self._looked, 1 + len(surveyed)), held=True)
+
+    def _looked(self, start: int, replies: Sequence[Reply]) -> Plan:
+        it = self.it
         permitted(replies[0], it.keys.document, it.keys.registry)
-        if are_missing(replies[start:end]):
-            return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
-        gone = unreferred(replies[1:start], it.keys) if surveyed else None
-        exact = _from_front(it, replies[end:])._replace(gone=gone)
-        return _change(exact, cache, held=True, given_up=lambda: _again(it, coming, attempt))
+        staged = start + len(self.reads or ())
+        counts = staged + len(looks_at(self.coming))
+        # Bytes are compared, not values: 1 and 1.0, or another order of keys, count as a change.
+        if tuple(replies[start:staged]) != self.before:
+            unlink = ("UNLINK", *(each.name for each in self.coming))
+            return Plan([unlink], self._refuse, held=True) if self.coming else self._refuse()
+        if are_missing(replies[staged:counts]):
+            return Plan([("UNWATCH",)], lambda _: self._send(), held=True)
+        gone = unreferred(replies[1:start], it.keys) if start > 1 else None
+        place = from_front(replies[counts:], it.keys, it.path, it.absent)
+        command = (*it.command[:2], to_jsonpath(place), *it.command[3:])
+        exact = it._replace(path=place, command=command, gone=gone)
+        return _change(exact, self.cache, held=True, given_up=self._again)
 
-    def attempt(it: DocumentChange, coming: Sequence[Staged]) -> Plan:
-        return _change_watched(it, cache, coming)
+    def _refuse(self, _: Sequence[Reply] = ()) -> Plan:
+        where = show(full(self.it.keys, self.it.path))
+        raise Conflict(f"{where} was changed by another client while it was edited; nothing was written: edit it again")
 
-    commands = [watch(it.keys, coming), *surveyed, *looks_at(coming), *lengths(it.keys, it.path)]
-    return Plan(commands, look, held=True)
+    def _again(self) -> Plan:
+        """Plan the next attempt after another client's write; large values are staged before it, once."""
+        if self.coming:
+            return self.plan()
+        attachments = []
+        for each in self.it.attachments:
+            commands, staged = stage(each.commands, self.it.keys.tag, each.suffix)
+            self.coming += staged
+            attachments.append(each._replace(commands=tuple(commands)))
+        self.it = self.it._replace(attachments=tuple(attachments))
+        return self._send() if self.coming else self.plan()
 
+    def _send(self) -> Plan:
+        def decode(replies: Sequence[Reply]) -> Plan:
+            for reply in replies:
+                checked(reply, self.it.keys, self.it.path)
+            return self.plan()
 
-def _unwatched(then: Callable[[], Plan]) -> Plan:
-    return Plan([("UNWATCH",)], lambda _: then(), held=True)
-
-
-def _again(
-    it: DocumentChange, coming: Sequence[Staged], attempt: Callable[[DocumentChange, Sequence[Staged]], Plan]
-) -> Plan:
-    """Plan the next attempt after another client's write; large values are staged before it, once."""
-    if coming:
-        return attempt(it, coming)
-    attachments = []
-    for each in it.attachments:
-        commands, sent = stage(each.commands, it.keys.tag, each.suffix)
-        coming = [*coming, *sent]
-        attachments.append(each._replace(commands=tuple(commands)))
-    moved = it._replace(attachments=tuple(attachments))
-    return _send(moved, coming, lambda: attempt(moved, coming)) if coming else attempt(it, ())
-
-
-def _send(it: DocumentChange, coming: Sequence[Staged], then: Callable[[], Plan]) -> Plan:
-    def decode(replies: Sequence[Reply]) -> Plan:
-        for reply in replies:
-            checked(reply, it.keys, it.path)
-        return then()
-
-    return Plan([each.upload for each in coming], decode)
+        return Plan([each.upload for each in self.coming], decode)
 
 
 def _stale(it: DocumentChange, known: frozenset[bytes]) -> list[bytes]:
@@ -268,43 +280,9 @@ def make_parents(keys: Keys, path: Path) -> Plan:
     return Plan(commands, decode)
 
 
-def _from_front(it: DocumentChange, counts: Sequence[Reply]) -> DocumentChange:
-    """Return the change with indexes counted from the front, given the replies to `lengths`."""
-    place = from_front(counts, it.keys, it.path, it.absent)
-    return it._replace(path=place, command=(*it.command[:2], to_jsonpath(place), *it.command[3:]))
-
-
-def exchange(
-    it: DocumentChange,
-    reads: Sequence[Command],
-    before: tuple[Any, ...],
-    cache: ShapeCache,
-    coming: Sequence[Staged] = (),
-) -> Plan:
+def exchange(it: DocumentChange, reads: Sequence[Command], before: tuple[Any, ...], cache: ShapeCache) -> Plan:
     """Plan a change that is made only if the replies to `reads` are still `before`; else its decode raises Conflict."""
-    where = show(full(it.keys, it.path))
-    end = 4 + len(reads)
-    counts = end + len(looks_at(coming))
-
-    def refuse(_: Sequence[Reply]) -> Plan:
-        raise Conflict(f"{where} was changed by another client while it was edited; nothing was written: edit it again")
-
-    def compare(replies: Sequence[Reply]) -> Plan:
-        permitted(replies[0], it.keys.document, it.keys.registry)
-        # Bytes are compared, not values: 1 and 1.0, or another order of keys, count as a change.
-        if tuple(replies[4:end]) != before:
-            return Plan([("UNLINK", *(each.name for each in coming))], refuse, held=True) if coming else refuse(())
-        if are_missing(replies[end:counts]):
-            return _unwatched(lambda: _send(it, coming, lambda: attempt(it, coming)))
-        exact = _from_front(it, replies[counts:])._replace(gone=unreferred(replies[1:4], it.keys))
-        return _change(exact, cache, held=True, given_up=lambda: _again(it, coming, attempt))
-
-    def attempt(it: DocumentChange, coming: Sequence[Staged]) -> Plan:
-        return exchange(it, reads, before, cache, coming)
-
-    looks = [*survey(it.keys, it.path), *reads, *looks_at(coming), *lengths(it.keys, it.path)]
-    commands = [watch(it.keys, coming), *looks]
-    return Plan(commands, compare, held=True)
+    return _WatchedChange(it, cache, reads, before).plan()
 
 
 def expiry(keys: Keys, milliseconds: int | None) -> Plan:
