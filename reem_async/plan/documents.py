@@ -94,7 +94,14 @@ def plain(value: Any, above: int) -> bytes | None:
         text = orjson.dumps(value, option=_OPTIONS)
     except TypeError:
         return None
-    return None if _may_be_changed(text, value, above) else text
+    # Each search begins with one byte, which is found at memory speed: most documents lack it.
+    may_differ = (
+        (b"$" in text and placeholders.marked(text))
+        or ((b"." in text or b"-" in text or b"+" in text) and may_lose(text))
+        or nested_over(text, value, DEEPEST - above)
+        or _may_be_converted(text, value)
+    )
+    return None if may_differ else text
 
 
 def number_text(value: float, place: Path) -> bytes:
@@ -114,17 +121,6 @@ def number_text(value: float, place: Path) -> bytes:
     if text is None:
         raise BadValue(f"{show(place)}: {value!r} cannot be sent exactly as an operand; write the result instead")
     return text
-
-
-def _may_be_changed(text: bytes, value: Any, above: int) -> bool:
-    """Return whether the text may differ from the value in meaning; False is certain."""
-    # Each search begins with one byte, which is found at memory speed: most documents lack it.
-    return (
-        (b"$" in text and placeholders.marked(text))
-        or ((b"." in text or b"-" in text or b"+" in text) and may_lose(text))
-        or nested_over(text, value, DEEPEST - above)
-        or _may_be_converted(text, value)
-    )
 
 
 def nested_over(text: bytes, value: Any, limit: int) -> bool:

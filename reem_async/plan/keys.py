@@ -72,16 +72,15 @@ def first_page(glob: str = "", kind: str = "") -> Plan:
     def decode(replies: Sequence[Reply]) -> Any:
         standing, found = replies
         if isinstance(standing, bytes) and b"cluster_enabled:1" in standing:
-            return Plan([("CLUSTER", "INFO")], lambda said: _alone(said[0], found))
+            return Plan([("CLUSTER", "INFO")], lambda replies: decode_cluster(replies[0], found))
+        return _raised(found)
+
+    def decode_cluster(standing: Reply, found: Reply) -> Reply:
+        if not isinstance(standing, bytes) or b"cluster_size:1\r" not in standing:
+            raise ClusterNode("the server is one node of a Redis Cluster and holds a part of the keys", ALL_NODES)
         return _raised(found)
 
     return Plan([("INFO", "cluster"), _scan(glob, kind, b"0")], decode)
-
-
-def _alone(standing: Reply, found: Reply) -> Reply:
-    if not isinstance(standing, bytes) or b"cluster_size:1\r" not in standing:
-        raise ClusterNode("the server is one node of a Redis Cluster and holds a part of the keys", ALL_NODES)
-    return _raised(found)
 
 
 def _scan(glob: str, kind: str, cursor: Any) -> Command:

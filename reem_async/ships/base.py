@@ -1,10 +1,12 @@
-"""The base classes of ships, which carry one type of value to the server and back."""
+"""The base classes of ships, which carry one type of value to the server and back, and the ship for bytes."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable
 from typing import Any
+
+from ..errors import BadData
 
 
 class SpecialDatatypeShip(ABC):
@@ -83,3 +85,26 @@ class BlobShip(SpecialDatatypeShip):
 
     def interpret_read(self, responses: list[Any]) -> Any:
         return self.unpack(responses[0])
+
+
+class BytesShip(BlobShip):
+    """Carries bytes; a bytearray comes back as bytes."""
+
+    carries = bytes
+
+    def get_label(self) -> str:
+        return "bytes"
+
+    def check_fit(self, value: Any) -> bool:
+        return isinstance(value, bytes | bytearray)
+
+    def describe(self, value: bytes) -> tuple[int, str]:
+        return len(value), "bytes"
+
+    def pack(self, value: bytes) -> tuple[bytes, ...]:
+        return (bytes(value),)
+
+    def unpack(self, blob: Any) -> bytes:
+        if blob is None:
+            raise BadData("the bytes are gone from the server (evicted, or removed by a program without REEM)")
+        return bytes(blob)

@@ -10,8 +10,7 @@ from typing import Any
 from ..errors import BadData, BadType
 from ..plan import Command
 from ..plan.placeholders import INLINE_LABELS
-from .base import BlobShip, SpecialDatatypeShip
-from .bytes import BytesShip
+from .base import BlobShip, BytesShip, SpecialDatatypeShip
 from .numpy import NumpyShip
 
 # In the place of the key in the command that a ship records; no real key begins with a zero byte.

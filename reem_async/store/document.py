@@ -165,18 +165,15 @@ class DocumentWriter:
         # The hot path: plain JSON needs no ships and no sizes.
         text = self.encoder.plain(path, value)
         if text is None:
-            await self._set_shipped(path, value)
+            text, attachments = await self.encoder.walked(path, value)
+            if attachments and await self._let_pass(attachments):
+                # Another task may have changed an array in between; all parts must be of one instant.
+                text, attachments = await self.encoder.walked(path, value)
+            await self._set(path, text, attachments)
             return
         if len(text) > HUGE:
             await self.encoder.check_sizes(path, [text])
         await self._set(path, text, ())
-
-    async def _set_shipped(self, path: Path, value: Any) -> None:
-        text, attachments = await self.encoder.walked(path, value)
-        if attachments and await self._let_pass(attachments):
-            # Another task may have changed an array in between; all parts must be of one instant.
-            text, attachments = await self.encoder.walked(path, value)
-        await self._set(path, text, attachments)
 
     def _store(self, assignments: Sequence[Assignment]) -> Awaitable[None]:
         return self.in_turn(self.send, assignments) if self._outages is None else self._outages.put(self, assignments)

@@ -216,7 +216,8 @@ class Outage:
             self._drop(writer.keys, len(assignments))
             return
         for it in assignments:
-            own = _owned(it)
+            # With bytes of its own: the caller may change the arrays.
+            own = it._replace(attachments=tuple([_copied(each) for each in it.attachments]))
             self._drop(writer.keys, out.put(_Kept(own, _size(own), called)))
         while out.kept and sum([each.size for each in list(self._out.values())]) > _MOST:
             out.pop(next(iter(out.kept)))
@@ -344,11 +345,6 @@ def _forget_all() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_all)
-
-
-def _owned(it: Assignment) -> Assignment:
-    # The caller may change the arrays.
-    return it._replace(attachments=tuple([_copied(each) for each in it.attachments]))
 
 
 def _copied(it: EncodedAttachment) -> EncodedAttachment:
