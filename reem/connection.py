@@ -197,13 +197,13 @@ class RedisInterface:
             `NumpyShip` and `BytesShip`. A number in its place is the port.
         namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
             separator, any character but a letter or digit: "robot1:", "robots/r1:".
-        timeout: Seconds without a byte moving after which a call is given up; `reem.timeout` sets another
+        timeout: Seconds without a byte moving after which a call times out; `reem.timeout` sets another
             limit for some calls.
         local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
-            through shared memory, where that can be had; the server has every update all the same, and whatever goes
-            wrong on the way, the subscriber fetches it there. "off": always from the server. "early": what this
-            interface publishes is delivered on this host before the server has it (`update.early`); if the
-            server never gets it, subscribers get what is there, with `gap`. See docs/guarantees.md.
+            through shared memory, if available; the server stores every update too, and a subscriber that cannot read
+            the memory fetches it there. "off": always from the server. "early": updates of this interface reach
+            subscribers on this host before the server has stored them (`update.early`); if the server never gets an
+            update, they get the server's value, with `gap`. See docs/guarantees.md.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
@@ -252,7 +252,7 @@ class RedisInterface:
 
     @property
     def state(self) -> State:
-        """What is known of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed"."""
+        """The state of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed"."""
         return self._direct.state
 
     def states(self) -> StateIterator:
@@ -265,7 +265,7 @@ class RedisInterface:
 
     @property
     def unreadable(self) -> int:
-        """How many messages on the channels that are followed, and values in what is followed, could not be read."""
+        """How many messages and values could not be read by subscribers."""
         return self._direct.unreadable
 
     @property

@@ -54,7 +54,7 @@ class Writer:
 
 
 class Publisher(Writer):
-    """Writes one top-level key and tells its subscribers, in the same transaction.
+    """Writes one top-level key and notifies its subscribers, in the same transaction.
 
     Args:
         top_key_name: The key.

@@ -213,6 +213,7 @@ class PublishAccessor(Accessor):
 
     @property
     def reader(self) -> NoReturn:
+        """Raise WriteOnly."""
         self._refuse()
 
     @property
@@ -221,24 +222,31 @@ class PublishAccessor(Accessor):
         return Publisher(self._reader.name, self._reader.session.interface)
 
     async def read(self) -> Any:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def get(self, *default: Any, default_value: Any = _NOTHING) -> Any:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def length(self) -> int:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def type(self) -> builtins.type:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def contains(self, key: str) -> bool:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def keys(self) -> list[str]:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def outline(self) -> NoReturn:
+        """Raise WriteOnly."""
         self._refuse()
 
     async def _take(self, *default: Any) -> Any:
@@ -248,12 +256,15 @@ class PublishAccessor(Accessor):
         self._refuse()
 
     def edit(self) -> NoReturn:
+        """Raise WriteOnly."""
         self._refuse()
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> NoReturn:
+        """Raise WriteOnly."""
         self._refuse()
 
     def watch(self, policy: Any = None, *, stored: bool = True) -> NoReturn:
+        """Raise WriteOnly."""
         self._refuse()
 
 
@@ -314,9 +325,11 @@ class PublishSpace(KeyValueStore):
         return 0 if self._outages is None else self._outages.waiting
 
     async def get(self, path: str, default: Any = None) -> Any:
+        """Raise WriteOnly."""
         await self.at(path).read()
 
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> NoReturn:
+        """Raise WriteOnly."""
         raise WriteOnly(_cannot_read(patterns or ("*",)))
 
     def __reduce__(self) -> tuple[Any, ...]:

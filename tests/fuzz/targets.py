@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import orjson
-from reem_async.ships.base import BytesShip
 
 from reem_async.errors import BadData, BadKey
 from reem_async.plan import notices, paths, placeholders
 from reem_async.plan.keys import keys_of
 from reem_async.plan.replies import loads, refusal
+from reem_async.ships.base import BytesShip
 from reem_async.ships.numpy import NumpyShip
 from reem_async.ships.registry import Ships
 from reem_async.transport.packing import CommandRecorder
