@@ -131,11 +131,11 @@ class Accessor(Handle):
         self._interface._run(self._core.write(value))
 
     def delete(self) -> None:
-        """Remove what is here."""
+        """Remove the value here."""
         self._interface._run(self._core.delete())
 
     def length(self) -> int:
-        """Return the length of what is here."""
+        """Return the length of the value here."""
         return self._interface._run(self._core.length())
 
     def contains(self, key: str) -> bool:
@@ -147,7 +147,7 @@ class Accessor(Handle):
         return self._interface._run(self._core.keys())
 
     def outline(self) -> Outline:
-        """Return what is here without fetching arrays."""
+        """Return the value here without fetching arrays."""
         return self._interface._run(self._core.outline())
 
     def pop(self, key: str | int = -1, *default: Any) -> Any:
@@ -163,7 +163,7 @@ class Accessor(Handle):
         return self._interface._run(self._core.setdefault(key, default))
 
     def type(self) -> builtins.type:
-        """Return the Python type of what is here."""
+        """Return the Python type of the value here."""
         return self._interface._run(self._core.type())
 
     def increment(self, number: float = 1) -> Any:
@@ -214,7 +214,7 @@ class Accessor(Handle):
         return Watch(self._interface, followed.watch(policy, stored=stored))
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
-        """Return a local copy of what is here that follows every change: `with kvs["arm"].mirror() as arm:`."""
+        """Return a local copy of the value here that follows every change: `with kvs["arm"].mirror() as arm:`."""
         return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest)
 
     def __enter__(self) -> Any:

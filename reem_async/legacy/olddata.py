@@ -1,4 +1,4 @@
-"""Data of REEM 0.0 and 0.1 told from new data: its names, and a look for it with the first read of a key."""
+"""Detect data of REEM 0.0 and 0.1, with the first read of a key."""
 
 from __future__ import annotations
 

@@ -144,26 +144,26 @@ class Accessor(Handle):
             return default[-1] if default else None
 
     async def write(self, value: Any) -> None:
-        """Store `value` here, in place of what was here. One round trip.
+        """Store `value` here, replacing the old value. One round trip.
 
-        Two where this interface puts arrays for the first time (unless it is a whole top-level key), two or
-        three where a list on the way holds arrays, and more if another client changed the shape meanwhile.
+        Two where this interface stores arrays for the first time (unless it is a whole top-level key), two or three if
+        a list on the path holds arrays, and more if another client changed the shape in between.
 
-        An array of 64 KB or more lets calls of this interface that are under way in the same event loop be answered
-        first, since encoding and sending it keep the loop; it is stored as it is then. (Publishing keeps the order of
-        calls instead.)
+        With an array of 64 KB or more, calls of this interface in progress in the same event loop are answered first,
+        since encoding and sending the array block the loop; the array is stored as it is then. Publishing keeps the
+        order of calls instead.
 
         Raises:
             BadValue, BadType, BadKey, TooDeep: It cannot be stored; nothing was sent.
-            PathRefused: The parent is missing or cannot hold this element; nothing was stored. (One array, or other
-                value that goes by ship, just below a top-level key that is not there makes a dict for it.)
-            Conflict: Others kept writing to the same top-level key for as long as the time limit; nothing was stored.
-                Only where it has to be looked first what is there: guarantee 6 in docs/guarantees.md says where.
+            PathRefused: The parent is missing or cannot hold this element; nothing was stored. (A single array, or
+                other value of a ship, just below a missing top-level key makes a dict for it.)
+            Conflict: Other clients kept writing to the same top-level key until the call timed out; nothing was
+                stored. Only where the old value must be read first: guarantee 6 in docs/guarantees.md says where.
         """
         await self._writer.set(self._path, value)
 
     async def delete(self) -> None:
-        """Remove what is here. One round trip; more if there were arrays that this interface did not know.
+        """Remove the value here. One round trip; more if there were arrays that this interface did not know.
 
         Raises:
             MissingKey: Nothing was here.
@@ -199,13 +199,13 @@ class Accessor(Handle):
         return await self._reader.keys_at(self._path)
 
     async def outline(self) -> Outline:
-        """Return what is here without fetching arrays: types, sizes, plain values. One round trip.
+        """Return the value here without fetching arrays: types, sizes, plain values. One round trip.
 
         Printed, or shown by a notebook, it is a line for each value; an array is its dtype, shape and bytes.
 
         Raises:
             MissingKey: Nothing is here.
-            BadData: What is here was not written by REEM.
+            BadData: The value here was not written by REEM.
         """
         return await outline_at(self._reader.session, self.full_path)
 
@@ -222,7 +222,7 @@ class Accessor(Handle):
         return await self[key]._take(*default)
 
     async def _take(self, *default: Any) -> Any:
-        """Do what `pop` does, with what is here."""
+        """Do what `pop` does, with the value here."""
         if len(default) > 1:
             raise BadType(f"pop() takes one default, not {len(default)}")
         for last in _TRIES:
@@ -268,7 +268,7 @@ class Accessor(Handle):
         return await self[check_name(key, self.full_path)]._read_or_put(default)
 
     async def _read_or_put(self, default: Any) -> Any:
-        """Do what `setdefault` does, with what is here."""
+        """Do what `setdefault` does, with the value here."""
         for last in _TRIES:
             try:
                 return await self._reader.read(self._path)
@@ -284,7 +284,7 @@ class Accessor(Handle):
         raise AssertionError  # the last try returns or raises
 
     async def type(self) -> builtins.type:
-        """Return the Python type of what is here: dict, list, int, float, bool, str, numpy.ndarray, ...
+        """Return the Python type of the value here: dict, list, int, float, bool, str, numpy.ndarray, ...
 
         One round trip, two for strings and arrays.
 
@@ -425,7 +425,7 @@ class Accessor(Handle):
         return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
 
     def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
-        """Return a local copy of what is here that follows every change: `async with kvs["arm"].mirror() as arm:`.
+        """Return a local copy of the value here that follows every change: `async with kvs["arm"].mirror() as arm:`.
 
         `arm.value()` and `arm["joint"].read()` answer from memory, `arm.age` says how old that may be, and
         `await arm.wait_until(predicate, timeout)` waits for a change.

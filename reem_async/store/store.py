@@ -66,7 +66,7 @@ class KeyValueStore:
         writer = self._writer(session, name)
         if len(self._tops) >= _MOST_TOPS:
             self._tops.clear()
-        # Another thread may have made one meanwhile: all use the same.
+        # Another thread may have made one in between: all use the same.
         return self._tops.setdefault(name, self._accessor(DocumentReader(session, name), writer, ()))
 
     def __setitem__(self, key: str, value: Any) -> None:
@@ -116,8 +116,8 @@ class KeyValueStore:
     async def keys(self, pattern: str = "*") -> list[str]:
         """Return the top-level keys, sorted; with a pattern, those it names (`*` and `?` stand for others).
 
-        One round trip for about 1000 keys of the server. Not atomic: a key that is written or deleted
-        meanwhile may or may not be among them.
+        One round trip for about 1000 keys of the server. Not atomic: a key that is written or deleted in between may or
+        may not be among them.
         """
         return sorted([name async for name in names(self.interface, pattern)])
 
