@@ -15,7 +15,7 @@ from reem_async.errors import Conflict, NotAllowed
 from reem_async.plan.keys import keys_of as keys_of_name
 from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.sizes import STAGED, are_missing, looks_at, stage
-from reem_async.plan.writes import exchange, set_change
+from reem_async.plan.writes import _WatchedChange, set_change
 
 SHAPE = (1000, 1000)
 TIMES = 5
@@ -198,7 +198,7 @@ def test_an_edit_that_meets_a_conflict_leaves_nothing_on_the_server():
     keys, memory = keys_of_name("a"), ShapeCache()
     _, coming = stage([("SET", "{a}[0]", bytes(70_000))], "{a}", "u")
     it = set_change(keys, (0,), b"1", ())
-    plan = exchange(it, [("JSON.GET", "a", "$[0]")], (b"[1]",), memory, coming)
+    plan = _WatchedChange(it, memory, [("JSON.GET", "a", "$[0]")], (b"[1]",), coming).plan()
     after = plan.decode([b"OK", b"[[1]]", b"[1]", [], b"[2]", b"string"])
     assert after.commands == [("UNLINK", coming[0].name)]
     with pytest.raises(Conflict):

@@ -62,7 +62,10 @@ def _check_url(url: str) -> None:
     Raises:
         BadValue: There is one. The message never quotes user and password.
     """
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # half an IPv6 address; the text may hold a part of the password
+        raise BadValue("the URL of the server is wrong; write it like redis://user:password@host:6379/0") from None
     login, _, place = parts.netloc.rpartition("@")
     problem, form = "", f"{parts.scheme}://{'user:password@' if login else ''}host:6379/0"
     if parts.scheme == "unix":
