@@ -14,8 +14,9 @@ from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same
 
 import reem_async
 from reem_async.plan.trees import MISSING
+from reem_async.pubsub import finder
 from reem_async.server.embedded import EmbeddedServer
-from reem_async.tools.browser import LiveSource, follower
+from reem_async.tools.browser import LiveSource
 from reem_async.tools.browser.source import NotKept
 from reem_async.tools.browser.trees import thawed
 
@@ -64,7 +65,7 @@ def alike(one, other):
 @pytest.fixture
 def nobody_looks(monkeypatch):
     """The keys are listed at the beginning only: what is seen is what the server has told."""
-    monkeypatch.setattr(follower, "_FIND_SECONDS", 600.0)
+    monkeypatch.setattr(finder, "_PERIOD", 600.0)
 
 
 @pytest.mark.long

@@ -49,7 +49,7 @@ async def recording(interface, patterns, file, **options):
 def is_followed(recorder, name):
     """Whether a key was read, and the server tells of the next change."""
     reading = recorder._key_recorder(name)
-    return reading._reader.told and not reading.busy
+    return reading._reader.feed.tracked and not reading.busy
 
 
 async def test_what_is_stored_is_recorded_a_moment_later_between_what_is_published(
@@ -369,7 +369,7 @@ async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_n
         url = f"redis://robot:pw@127.0.0.1:{server.port}"
         async with reem_async.RedisInterface(url) as other, recording(other, ["*"], file) as recorder:
             await aeventually(lambda: not recorder._key_recorder("a").busy)
-            assert recorder._key_recorder("a")._reader._attachments._raw is None
+            assert recorder._key_recorder("a")._reader.feed.attachments._raw is None
             await kvs["a"]["n"].write(2)
     with open_log(file) as log:
         assert_same(log["a"].at(log.end), {"n": 2, "large": large})

@@ -267,7 +267,7 @@ async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_follow
         await space[name].write(0)
     losses, manager = [], manager_of(other.session)
     async with Monitor(other, names if spelled_out else [key("*")]) as monitor:
-        monitor.begun_anew = lambda: losses.append(1)
+        monitor.resynchronised = lambda: losses.append(1)
         for node in cluster.nodes:
             before, count = {*manager._wires.values()}, len(losses)
             with raw_of(node) as raw:

@@ -129,7 +129,7 @@ class Caller:
         error, trace = sys.exc_info()[1:]
         while trace is not None and trace.tb_next is not None:
             trace = trace.tb_next
-        # The innermost place: two mistakes in one callback are told apart, and each has its first traceback in the log.
+        # The innermost place, so that each of two mistakes in one callback has its first traceback in the log.
         kind = type(error), trace and (trace.tb_frame.f_code, trace.tb_lineno)
         count = self._raised[kind] = self._raised.get(kind, 0) + 1
         if count == 1:
@@ -170,7 +170,7 @@ class Calls:
         self._context = copy_context()
         self._context.run(forget)  # a time limit given for listen() is not meant for what callbacks do
         kept.add(self)
-        # What was put into the queue before this has woken nobody.
+        # What was put into the queue before this has woken no reader.
         updates.queue.wake = self._go_on
         self._go_on()
 

@@ -1,7 +1,7 @@
 """Which of the updates that were heard of are in what was read: a state machine without I/O, clock or tasks.
 
-Whoever keeps a copy of something hears of updates, and now and then reads what they do not say. Updates go on coming
-meanwhile. Those that are in what was read are `covered`; the others come `later` and have to be applied to it.
+A copy is kept by updates, and by reads of what the updates do not contain. Updates go on coming during a read. Those
+that are in what was read are `covered`; the others come `later` and have to be applied to it.
 
         IDLE --- asked(in_order=True) ----> IN_ORDER ------------------------+
          |                                                                   |
@@ -28,7 +28,7 @@ to be written (`tools/recording/order.py`), the browser a history.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from enum import Enum, auto
 from typing import Generic, NamedTuple, TypeVar
 
@@ -37,12 +37,12 @@ from ..plan import Reply
 from ..plan.notices import parsed_note
 from .gaps import GapDetector, Numbered
 
-__all__ = ["Division", "Heard", "Phase", "divided_read"]
+__all__ = ["Division", "Heard", "Phase", "divided_read", "divided_reads"]
 
 U = TypeVar("U", bound=Numbered)
 T = TypeVar("T")
 _TRIES = 10
-"""Reads until one gives up: somebody publishes all the time of whom nothing is heard."""
+"""Maximum attempts; exceeded only if an unseen publisher keeps writing."""
 
 
 class Phase(Enum):
@@ -64,7 +64,7 @@ class Heard(NamedTuple, Generic[U]):
 
     Attributes:
         update: The update; None if something was published, or lost, of which nothing else is known.
-        missed: How many updates were lost before it, None if nobody knows.
+        missed: How many updates were lost before it, None if unknown.
         follows: Its number is not lower than what was heard of its publisher before.
     """
 
@@ -77,7 +77,7 @@ class Division(Generic[U]):
     """The updates of one top-level key, divided by what is read of it.
 
     Attributes:
-        gaps: Which updates were heard of; whoever owns this counts there what it hears.
+        gaps: Which updates were heard of; its owner counts there what it hears.
         phase: Where the read is.
         begins: Nothing was heard of or read yet: an update that was never heard of is one from before.
         covered: What is in what is being read, oldest first. What is to be covered by the next read may be added.
@@ -92,7 +92,6 @@ class Division(Generic[U]):
         self._later: list[Heard[U]] = []  # heard after what was divided
 
     def begin(self, *, initial: bool) -> None:
-        """Start anew on a connection that is subscribed: the first one, or one after a loss."""
         self.gaps.begin()
         self.phase, self.begins = _IDLE, initial
         self.covered, self._doubtful, self._later = [], [], []
@@ -111,7 +110,7 @@ class Division(Generic[U]):
             self.begins = False
 
     def asked(self, *, in_order: bool) -> None:
-        """Something is being read from now on: it has all that was heard."""
+        """A read begins: it contains all updates that were heard."""
         # What is asked for now is read by the server after it has sent all of these.
         self.covered += [*self._doubtful, *self._later]
         self._doubtful, self._later = [], []
@@ -167,32 +166,51 @@ class Division(Generic[U]):
         return divided
 
 
+async def divided_reads(
+    divisions: Sequence[Division[U]],
+    read: Callable[[], Awaitable[Sequence[tuple[T, Reply] | None]]],
+    fence: Callable[[], Awaitable[None]],
+) -> list[tuple[T, Reply] | None]:
+    """Read several keys at once, with one fence for all if the last update in any of them was not received yet.
+
+    Returns what `read` has returned. It is None where it is not known which updates are in it. Else `take` of the
+    division has them. If this raises or is cancelled, the divisions are as if nothing had been asked for.
+
+    Args:
+        divisions: One for each key; each hears the updates of its key meanwhile.
+        read: Returns for each key a value and the note of the last update, read in one transaction, or None for no
+            answer. It calls `asked` of each division before. It may ask a division itself whether a fence has to
+            pass, and wait for it.
+        fence: Returns when all that was published before has been heard of.
+    """
+    try:
+        found = await read()
+        answers = [(each, it) for each, it in zip(divisions, found, strict=True) if it is not None]
+        waiting = [each for each, it in answers if each.phase is not Phase.FENCING and not each.answered(it[1])]
+        if waiting:
+            await fence()
+        known = {id(each) for each, it in answers if each.divide(it[1])}
+        return [it if id(each) in known else None for each, it in zip(divisions, found, strict=True)]
+    except BaseException:
+        for each in divisions:
+            each.give_up()
+        raise
+
+
 async def divided_read(
     division: Division[U], read: Callable[[], Awaitable[tuple[T, Reply]]], fence: Callable[[], Awaitable[None]]
 ) -> T:
-    """Return what was read once it is known which updates are in it: `division.take()` has them then.
-
-    One read, a fence if the last update that is in it has not been heard of, and both again in the rare case that
-    nobody can know. If it raises or is cancelled, the division is as if nothing had been asked for.
-
-    Args:
-        division: Who is told of the updates meanwhile.
-        read: Reads a value and, in the same transaction, the note of the last update; calls `division.asked` before.
-            It may ask the division itself whether a fence has to pass, and wait for it.
-        fence: Returns when all that was published before has been heard of.
+    """Read one key like `divided_reads`, and again in the rare case that the updates in it are not known.
 
     Raises:
-        Conflict: Updates came all the time that were never heard of.
+        Conflict: A publisher wrote all the time whose notices never arrived.
     """
-    try:
-        for _ in range(_TRIES):
-            found, note = await read()
-            has_fenced = division.phase is Phase.FENCING
-            if not has_fenced and not division.answered(note):
-                await fence()
-            if division.divide(note):
-                return found
-        raise Conflict("updates came all the time that were never heard of")
-    except BaseException:
-        division.give_up()
-        raise
+
+    async def read_one() -> Sequence[tuple[T, Reply]]:
+        return [await read()]
+
+    for _ in range(_TRIES):
+        (found,) = await divided_reads([division], read_one, fence)
+        if found is not None:
+            return found[0]
+    raise Conflict("updates came all the time that were never heard of")

@@ -7,64 +7,29 @@ from collections.abc import Sequence
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
-from ..plan import Plan
 from ..plan.copies import applied, concerns, is_own, is_whole
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path
-from ..plan.reads import RawRead
 from ..plan.trees import MISSING, CannotApply, difference, get, replaced
 from .division import Heard
+from .feed import Step
 
 __all__ = [
-    "Arm",
+    "EventMaker",
     "Failed",
-    "Fence",
     "Look",
-    "Open",
     "Output",
-    "Read",
     "Ready",
+    "Report",
     "Skipped",
     "Snapshot",
     "Stored",
-    "Teller",
-    "Told",
     "Updated",
 ]
 
 
-class Read(NamedTuple):
-    """Command: send the commands of a plan and bring the replies to `replies`.
-
-    Over the connection of the notices, or if the plan is `bulk` over another one.
-    """
-
-    number: int
-    plan: Plan
-
-
-class Arm(NamedTuple):
-    """Command: touch keys over the connection of the notices, for the server to tell of changes; then call `armed`."""
-
-    number: int
-    keys: tuple[str, ...]
-
-
 class Look(NamedTuple):
     """Command: something was changed; call `look` soon, but not more often than is good for the server."""
-
-
-class Fence(NamedTuple):
-    """Command: send a PING over the connection of the notices and bring word of its answer to `fenced`."""
-
-    number: int
-
-
-class Open(NamedTuple):
-    """Command: have the ships make values of their replies, and bring the tree to `opened` or the error to `failed`."""
-
-    number: int
-    raw_read: RawRead
 
 
 class Updated(NamedTuple):
@@ -74,7 +39,7 @@ class Updated(NamedTuple):
         notice: What was heard of it.
         data: All that is at the followed path; MISSING if nothing is. Not to be changed.
         value: What was written; the same object as `data` if that is all of it.
-        missed: How many updates were lost since the last event that told of losses, None if nobody knows.
+        missed: How many updates were lost since the last event that reported losses, None if unknown.
     """
 
     notice: Notice
@@ -84,12 +49,12 @@ class Updated(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """Event: what a large update wrote cannot be told, since it was changed before it was read.
+    """Event: what a large update wrote cannot be reported, since it was changed before it was read.
 
     Attributes:
         notice: What was heard of it.
         data: All that is at the followed path.
-        newest: No later update of this path is told of in its place.
+        newest: No later update of this path is reported in its place.
     """
 
     notice: Notice
@@ -117,7 +82,7 @@ class Snapshot(NamedTuple):
     Attributes:
         data: All that is at the followed path.
         initial: It was there when following began.
-        missed: How many updates were lost, None if nobody knows.
+        missed: How many updates were lost, None if unknown.
     """
 
     data: Any
@@ -135,15 +100,15 @@ class Failed(NamedTuple):
     error: Exception
 
 
-Output = Read | Arm | Look | Fence | Open | Updated | Stored | Skipped | Snapshot | Ready | Failed
+Output = Step | Look | Updated | Stored | Skipped | Snapshot | Ready | Failed
 
 
 _UNKNOWN: Any = object()
 """A copy of which it is not known what it was."""
 
 
-class Told(Enum):
-    """As what the next snapshot is told."""
+class Report(Enum):
+    """How the next snapshot is reported."""
 
     INITIAL = auto()
     """As the value that was there when following began."""
@@ -152,10 +117,10 @@ class Told(Enum):
     """As what is there after updates were lost, those in it included."""
 
     UPDATES = auto()
-    """Not at all: each update in it is told of."""
+    """Not at all: each update in it is reported."""
 
 
-class Teller:
+class EventMaker:
     """Makes events of what changes a copy.
 
     Args:
@@ -164,35 +129,35 @@ class Teller:
         outputs: Where the events go.
 
     Attributes:
-        told: As what the next snapshot is told.
-        missed: How many updates were lost and not told of yet, None if nobody knows.
+        report: How the next snapshot is reported.
+        missed: How many updates were lost and not reported yet, None if unknown.
     """
 
     def __init__(self, path: Path, rest: Path, outputs: collections.deque[Output]) -> None:
         self._path = path
         self._rest = rest
         self._outputs = outputs
-        self.told = Told.INITIAL
+        self.report = Report.INITIAL
         self.missed: int | None = 0
 
-    def begin(self, told: Told) -> None:
-        """Tell the next snapshot so; after a loss nobody knows how many updates that has."""
-        self.told, self.missed = told, None if told is Told.GAP else 0
+    def begin(self, report: Report) -> None:
+        """Report the next snapshot like this. After a loss it is not known how many updates the snapshot has."""
+        self.report, self.missed = report, None if report is Report.GAP else 0
 
     def miss(self, heard: Sequence[Heard[Notice]]) -> None:
-        """Count what was lost before these updates as lost before what is told of next."""
+        """Carry these losses over to the next event."""
         lost = [each.missed for each in heard]
         self.missed = None if self.missed is None or None in lost else self.missed + sum(filter(None, lost))
 
     def update(self, notice: Notice, tree: Any, written: Any = MISSING) -> None:
-        """Tell of an update; its value is what was `written` if that is given, else what the copy has."""
+        """Report an update. Its value is `written` if that is given, else what the copy has."""
         data = value = get(tree, self._rest) if self._rest else tree
         inner = () if self._rest else notice.path[len(self._path) :]
         if written is not MISSING:
             value = written
         elif inner:  # of what was deleted, the next item has the place
             value = None if notice.deleted else get(data, inner)
-        # Losses are told with the next event, whatever that is.
+        # The next event reports losses, whatever it is.
         missed, self.missed = self.missed, 0
         self._outputs.append(Updated(notice, data, value, missed))
 
@@ -205,24 +170,24 @@ class Teller:
             covered: The updates that it has.
             stored: It is known to differ from what was published only in what is stored.
         """
-        told, self.told = self.told, Told.UPDATES
-        if told is Told.UPDATES:
+        report, self.report = self.report, Report.UPDATES
+        if report is Report.UPDATES:
             # Where only what is published is followed, the copy may lack what is stored.
             self._updates(before if stored else _UNKNOWN, covered, tree)
-            if stored and self.missed == 0:  # else the snapshot is told of
+            if stored and self.missed == 0:  # else the snapshot is reported
                 self._stored(self._expected(before, tree, covered), tree)
-        elif told is Told.GAP:
+        elif report is Report.GAP:
             self.miss(covered)
         data = get(tree, self._rest)
-        if told is Told.INITIAL:
+        if report is Report.INITIAL:
             if data is not MISSING:
                 self._outputs.append(Snapshot(data, True, 0))
-        elif told is Told.GAP or self.missed != 0:
+        elif report is Report.GAP or self.missed != 0:
             missed, self.missed = self.missed, 0
             self._outputs.append(Snapshot(data, False, missed))
 
     def lose(self, tree: Any) -> None:
-        """Tell that what is there cannot be read: `tree` stands for it."""
+        """Report that what is there cannot be read; `tree` takes its place."""
         missed, self.missed = self.missed, 0
         self._outputs.append(Snapshot(tree, False, missed))
 
@@ -230,33 +195,33 @@ class Teller:
         """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
 
         `plan/copies.py` says which. What came with its value has that, whatever came later. What was lost may
-        have changed any of those announced before. Each is told with the copy that it led to, as long as that is known;
-        from the first one on of which it is not, with the snapshot: no copy is told after a newer one.
+        have changed any of those announced before. Each is reported with the copy that it led to while that is known,
+        and then with the snapshot: no copy is reported after a newer one.
         """
         notices = [each.update if each.update and concerns(each.update, self._path) else None for each in covered]
         newest = {notice.path: notice for notice in notices if notice is not None}
         # The place of the last loss: an update that was announced before it may have been changed by what was lost.
         loss = max([place for place, each in enumerate(covered) if each.missed != 0], default=-1)
-        copy, snapshot_told = before, False
+        copy, snapshot_reported = before, False
         for place, (heard, notice) in enumerate(zip(covered, notices, strict=True)):
             self.miss([heard])
             last, copy = copy, self._led_to(copy, heard)
             if notice is None:
                 continue
-            if copy is not _UNKNOWN and not snapshot_told:
+            if copy is not _UNKNOWN and not snapshot_reported:
                 if not self._rest or last is _UNKNOWN or get(copy, self._rest) is not get(last, self._rest):
                     self.update(notice, copy)
             elif notice.deleted or notice.value is not ANNOUNCED:
-                snapshot_told = True
+                snapshot_reported = True
                 self.update(notice, tree, self._written(notice))
             elif place >= loss and is_own(notice.path, [later for later in notices[place + 1 :] if later is not None]):
-                snapshot_told = True
+                snapshot_reported = True
                 self.update(notice, tree)
             else:
                 self._outputs.append(Skipped(notice, get(tree, self._rest), newest[notice.path] is notice))
 
     def _led_to(self, copy: Any, heard: Heard[Notice]) -> Any:
-        """Return the copy after an update, given the one before; _UNKNOWN if only what was read can tell."""
+        """Return the copy after an update, given the one before; _UNKNOWN if only what was read shows it."""
         notice = heard.update
         if notice is None or not heard.follows:
             return _UNKNOWN
@@ -286,7 +251,7 @@ class Teller:
     def _expected(self, before: Any, tree: Any, covered: Sequence[Heard[Notice]]) -> Any:
         """Return what the copy would be now if nothing but the updates that a snapshot has had changed it.
 
-        Where that is not known, it is what is there: the updates are told with it.
+        Where that is not known, it is what is there: the updates are reported with it.
         """
         expected = before
         for heard in covered:
@@ -306,7 +271,6 @@ class Teller:
         return expected
 
     def _stored(self, expected: Any, tree: Any) -> None:
-        """Tell of what is there if it differs from what was expected."""
         data = get(tree, self._rest)
         inner = difference(get(expected, self._rest), data)
         if inner is not None:

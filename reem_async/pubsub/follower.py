@@ -1,4 +1,4 @@
-"""Who follows a path: listens to the manager, drives a `Replica`, and hands what it tells to bounded queues.
+"""A listener that follows a path: drives a `Replica`, and puts its events into bounded queues.
 
 Notices and replies share the subscription connection (RESP3), so all a replica learns is in one order.
 """
@@ -14,7 +14,6 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any
 
-from ..concurrency.queues import BoundedQueue
 from ..concurrency.tasks import is_being_cancelled
 from ..errors import BadData, ClusterNode, NotAllowed, Stale, is_of_command
 from ..plan import Reply, wire_commands
@@ -29,9 +28,9 @@ from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
 from ..transport.route import is_unapplied
 from ..transport.wire import Wire
-from .listeners import Beginning, contained, give_error
-from .manager import SubscriptionManager, Topic
-from .refresh import RefreshTimer
+from .listeners import Beginning, Listener, Topic, contained
+from .manager import SubscriptionManager
+from .refresh import LIVE, RefreshTimer
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
 from .updates import Origin, Update
 
@@ -41,29 +40,19 @@ logger = logging.getLogger("reem.subscribe")
 
 _PROBE_PERIOD = 1.0
 """Seconds between probes of a document for a listener that needs no more of them."""
-_QUICKEST, _SLOWEST = 0.001, 0.02
-"""Seconds between looks at what was changed: a key that is stored at any rate is read 1,000 times a second at most."""
 
 
-class Follower:
+class Follower(Listener):
     """Keeps a local copy of one path equal to the server's, and hands out each update.
 
     All methods but `value` and `at` are called on the event loop.
 
     Attributes:
         keys: The top-level key's names.
-        topic: What it subscribes to.
-        note: Where the server keeps a note of the last update.
-        queues: Where each update goes.
-        ready: Done when the first snapshot is there.
-        max_batch_delay: Seconds that updates may wait for each other: none.
-        stored: It is told of what is only stored, too.
-        local: It takes large values from the memory of publishers of the same host.
-        heartbeat: Seconds between probes of the document, if it needs more of them than others.
         born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
         failure: The exception that has ended it, None while it follows.
         down: There is no connection, or it is new and what is there was not read yet.
-        told: Called with each state of the copy in order, and with the present one after each step, if `stored`.
+        on_state: Called with each state of the copy in order, and with the present one after each step, if `stored`.
     """
 
     def __init__(
@@ -78,12 +67,9 @@ class Follower:
         largest: float = math.inf,
         heartbeat: float = math.inf,
     ) -> None:
+        super().__init__(Topic(keys.channel.encode()))
         self.keys = keys
-        self.topic = Topic(keys.channel.encode())
-        self.note: str | None = keys.last
-        self.queues: list[BoundedQueue] = []
-        self.ready: asyncio.Future[None] | None = None
-        self.max_batch_delay = 0.0
+        self.note = keys.last
         self.stored = stored
         self.local = largest == math.inf  # else it wants no large values
         self.heartbeat = heartbeat
@@ -92,7 +78,7 @@ class Follower:
         self._replica = Replica(keys, path, ships, cache, largest)
         self._wire: Wire | None = None
         self._loop = asyncio.get_running_loop()
-        self._looks = RefreshTimer(self, Follower._look, _QUICKEST, _SLOWEST)
+        self._looks = RefreshTimer(self, Follower._look, LIVE)
         self._asked = 0.0  # when a read was sent last
         self._valid_at = -math.inf  # the server had what is in the copy then, or later
         self._probe_due = 0.0
@@ -102,11 +88,10 @@ class Follower:
         self.born: list[Notice] | None = None
         self.failure: Exception | None = None
         self.down = True
-        self.told: Callable[[Any], None] = unnoticed
+        self.on_state: Callable[[Any], None] = unnoticed
 
     @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
-        """Take a snapshot over `wire`."""
         self._wire = wire
         born, first, tracked = self.born, beginning is Beginning.FIRST, self.stored and bool(wire.tracked)
         self.born = None
@@ -124,22 +109,19 @@ class Follower:
 
     @contained
     def lost(self, reason: Exception) -> None:
-        """Stop applying: the connection is gone. Whoever waits for the first snapshot gets `reason`."""
         self._wire, self.down = None, True
         self._replica.lost()
         self._looks.cancel()
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(reason)
-        self.told(self._replica.at())
+        self.on_state(self._replica.at())
 
     @contained
     def invalidate(self, channel: bytes) -> None:
-        """Take a snapshot: something was published that could not be read."""
         self._replica.unreadable()
         self._perform()
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Take one update."""
         self._looks.heard += 1
         self._replica.on_notice(notice)
         if self._replica.outputs:
@@ -147,25 +129,21 @@ class Follower:
 
     @contained
     def on_early(self, notice: Notice) -> None:
-        """Take one update that the server may not have yet."""
-        if not self.stored:  # who follows the store is never ahead of it, whether or not its server tells of changes
+        if not self.stored:  # a copy of the store is never ahead of it, whether or not its server reports changes
             self._replica.on_early(notice)
             self._perform()
 
     @contained
     def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed."""
         self._replica.changed(key)
         self._perform()
 
     @contained
     def on_note(self, note: bytes | None) -> None:
-        """Compare with the server's note of the last update, asked for in order with notices."""
         self._replica.on_note(note)
         self._perform()
 
     def probe(self, now: float) -> str | None:
-        """Return the document, if its type is to be asked for now."""
         if self._wire is None or not self.stored or not self._wire.tracked or now < self._probe_due:
             return None
         self._probe_due = now + min(self.heartbeat, _PROBE_PERIOD)
@@ -173,7 +151,6 @@ class Follower:
 
     @contained
     def on_probe(self, kind: Reply, sent: float) -> None:
-        """Compare with the document's type, asked for at `sent` and answered in order with notices."""
         self._probe_refusal = kind if isinstance(kind, Exception) else None
         if self._probe_refusal is not None or not self._replica.is_current:
             return
@@ -188,10 +165,9 @@ class Follower:
             self._valid_at = max(self._valid_at, sent)
 
     def fail(self, error: Exception) -> None:
-        """End for an exception in this follower: those who take updates from it, or read its copy, get the error."""
         if self.failure is None:
             self.failure = error
-            give_error(self, error)
+            super().fail(error)
             self._tasks.start(self._manager.unfollow_here(self), f"reem unfollow {self.keys.name}")
 
     def value(self) -> Any:
@@ -230,13 +206,15 @@ class Follower:
         """
         if self.failure is not None:
             where = show((self.keys.name, *self._replica.path))
-            raise Stale(f"{where}: following has ended over an error: {self.failure!r}; begin anew") from self.failure
+            raise Stale(
+                f"{where}: following has ended over an error: {self.failure!r}; follow it again"
+            ) from self.failure
         return self._replica.at(inner)
 
     # --- what the replica asks for
 
     def _perform(self) -> None:
-        """Do and tell what the replica has put out; what is brought to it meanwhile may add to that."""
+        """Execute the replica's outputs; more may be added meanwhile."""
         outputs = self._replica.outputs
         while outputs:
             output = outputs.popleft()
@@ -245,14 +223,14 @@ class Follower:
             else:
                 self._do(output)
             if self.stored and isinstance(output, Updated | Stored | Snapshot):
-                self.told(output.data)
+                self.on_state(output.data)
         if self.stored:
             self._note_age()
 
     def _note_age(self) -> None:
         if self._replica.is_current:
             self._valid_at = max(self._valid_at, self._asked)  # it is from the last read, or newer
-        self.told(self._replica.at())
+        self.on_state(self._replica.at())
 
     def _do(self, output: Output) -> None:
         if isinstance(output, Read):
@@ -291,7 +269,7 @@ class Follower:
     @contained
     def _armed(self, number: int, outcome: list[Reply] | Exception) -> None:
         refusals = [outcome] if isinstance(outcome, Exception) else [it for it in outcome if isinstance(it, Exception)]
-        # Of a slot that moves, its new node is asked: what is followed begins anew there.
+        # Of a slot that moves, its new node is asked: the listener resynchronises there.
         refusal = next((it for it in refusals if not is_unapplied(it)), None)
         if isinstance(refusal, NotAllowed) and not is_of_command(refusal):
             refusal = None  # the read finds out which of the keys the user may not read
@@ -315,7 +293,6 @@ class Follower:
             wire.send(wire_commands(command.plan), partial(self._bring, command.number))
 
     async def _read_large(self, command: Read) -> None:
-        """Read over the connection for large values."""
         outcome: list[Reply] | Exception
         try:
             outcome = await self._transport.roundtrip(wire_commands(command.plan), bulk=True)
@@ -326,7 +303,7 @@ class Follower:
     @contained
     def _bring(self, number: int, outcome: list[Reply] | Exception) -> None:
         now = self._loop.time()
-        self._looks.earliest = now + max(_QUICKEST, now - self._asked)  # large values leave time for others
+        self._looks.earliest = now + max(LIVE.quickest, now - self._asked)  # large values leave time for others
         self._replica.replies(number, outcome)
         self._perform()
 
@@ -370,7 +347,6 @@ class Follower:
         self._perform()
 
     def _opened(self, command: Open) -> None:
-        """Take the tree that the ships have made."""
         self._manager.report(command.raw_read.unreadable)
         self._replica.opened(command.number, command.raw_read.holder[0])
 
@@ -422,7 +398,6 @@ class Follower:
             queue.overtaken(Update(path, own(event.data), None, False, *stamp) if event.newest else None)
 
     def _report(self, event: Failed) -> None:
-        """Say that a snapshot could not be taken."""
         error = event.error
         if self.ready is not None and not self.ready.done():
             self.ready.set_exception(error)
@@ -445,5 +420,5 @@ def unnoticed(tree: Any) -> None:
 
 
 def own(tree: Any) -> Any:
-    """Return a tree for a user to keep: its containers are his, and None stands for what is not there."""
+    """Return a tree for a user to keep: it has its own containers, and None if nothing is there."""
     return None if tree is MISSING else copied(tree)

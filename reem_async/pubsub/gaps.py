@@ -25,7 +25,7 @@ class Numbered(Protocol):
 
     @property
     def publisher(self) -> str:
-        """Who made it."""
+        """The id of the interface that published it."""
 
     @property
     def sequence(self) -> int:
@@ -33,7 +33,7 @@ class Numbered(Protocol):
 
     @property
     def time(self) -> float:
-        """When, on the publisher's clock."""
+        """When it was published, on the publisher's clock."""
 
 
 class Numbers:
@@ -69,13 +69,11 @@ class Numbers:
         return 0 < number <= last
 
     def put(self, sender: Hashable, number: int) -> None:
-        """Note the last number of a sender."""
         if len(self.last) >= _MOST_PUBLISHERS and sender not in self.last:
             self.clear()
         self.last[sender] = number
 
     def clear(self) -> None:
-        """Forget all: what is heard next of each sender is taken as it comes."""
         self.last.clear()
         self._other.clear()
 
@@ -86,7 +84,7 @@ class GapDetector:
     The server keeps a note of the last update of each top-level key, `publisher number`. Asked for on
     the connection that notices come on, it must have been heard of when the answer is here.
 
-    A number of lost updates is 0 if none were, and None if nobody knows how many.
+    A number of lost updates is 0 if none were, and None if unknown.
 
     What no numbers show: a loss before the first update that is heard of a publisher. It might as well have been
     published before following began.
@@ -103,7 +101,7 @@ class GapDetector:
         self._compares = False  # the note at the beginning is known: a later one can be told from it
 
     def begin(self) -> None:
-        """Start anew on another connection: what is heard next follows the snapshot that is taken now."""
+        """Start again on another connection: what is heard next follows the snapshot that is taken now."""
         self._compares, self._newest = False, None
         self._heard.clear()
 
@@ -157,7 +155,7 @@ class GapDetector:
     def compare(self, note: Reply) -> int | None:
         """Return how many updates were lost, by a note that was asked for in order with notices.
 
-        Either the last update was lost, or what was heard last is no update: somebody has published a notice alone.
+        Either the last update was lost, or what was heard last is no update: a client has published a bare notice.
         """
         newest, self._newest = self._newest, None
         known, self._known_note = self._known_note, note

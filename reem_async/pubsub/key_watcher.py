@@ -2,8 +2,8 @@
 
 A key that is found a moment after it was made would have been published to already. So publishers
 tell all nodes what they publish in their first seconds with a key, by a channel of the old kind, for
-which there are patterns; whoever hears of a key this way follows it from then on. A `ReorderBuffer` for each key
-puts in one order what is heard in both ways.
+which there are patterns; a listener that hears of a key this way follows it from then on. A `ReorderBuffer` for each
+key puts in one order what is heard in both ways.
 """
 
 from __future__ import annotations
@@ -23,21 +23,20 @@ from ..plan.notices import Notice
 from ..session import QUIET
 from ..transport import Transport, scanned
 from ..transport.wire import Wire
-from .listeners import Beginning, ForwardingListener, Listener, Topic
+from .finder import find_regularly
+from .listeners import Beginning, Listener, Topic
 from .reorder import ReorderBuffer
 
 __all__ = ["KeyWatcher"]
 
 logger = logging.getLogger("reem.subscribe")
 
-_PAUSE = 1.0
-"""Seconds between looks for new keys."""
 # Seconds between looks whether something still waits, and how often: a second in all, twice what a buffer waits.
 _MOMENT, _MOMENTS = 0.005, 200
 
 _GONE = QUIET + 30.0
-"""Seconds without a key and without a word of it until it is let go of: nobody who publishes it takes it for known by
-then, however late his last word was."""
+"""Seconds without a key and without an update of it until it is dropped: by then no publisher still assumes that this
+process follows the key."""
 
 _MOST = 10_000
 """Keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes."""
@@ -47,29 +46,25 @@ _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
 
 
 class Subscriptions(Protocol):
-    """Who follows what the servers themselves know as a topic: the subscription manager."""
+    """What is needed of the subscription manager, which imports this module."""
 
     transport: Transport
     tasks: Tasks
 
-    async def follow_here(self, listener: Listener) -> None:
-        """Follow one topic."""
+    async def follow_here(self, listener: Listener) -> None: ...
 
-    async def follow_all(self, listeners: Sequence[Listener]) -> None:
-        """Follow many topics."""
+    async def follow_all(self, listeners: Sequence[Listener]) -> None: ...
 
-    async def unfollow(self, listener: Listener) -> None:
-        """Stop following a topic, or what was found for a pattern."""
+    async def unfollow(self, listener: Listener) -> None: ...
 
-    async def unfollow_here(self, listener: Listener) -> None:
-        """Stop following one topic."""
+    async def unfollow_here(self, listener: Listener) -> None: ...
 
 
 class KeyWatcher:
     """Follows, for each listener to a pattern, all keys that there are, and those that come to be.
 
     Args:
-        manager: Who follows a key.
+        manager: Where keys are followed.
     """
 
     def __init__(self, manager: Subscriptions) -> None:
@@ -95,14 +90,13 @@ class KeyWatcher:
             await self.unfollow(listener)
             raise
         if self._looking is None or self._looking.done():
-            self._looking = self._manager.tasks.start(self._go_on_looking(), "reem discovery")
+            self._looking = self._manager.tasks.start(find_regularly(self._look_for_all), "reem discovery")
 
     def listeners(self) -> list[Listener]:
-        """Return who listens to patterns: the manager itself only knows of their keys. Any thread may ask."""
+        """Return the listeners to patterns: the manager itself only has their keys. Any thread may ask."""
         return [listener for each in self._followed.keyrefs() if (listener := each()) is not None]
 
     async def unfollow(self, listener: Listener) -> None:
-        """Stop following. Idempotent."""
         for key_listener in self._followed.pop(listener, {}).values():
             await self._manager.unfollow(key_listener)
         new_keys = self._new_keys.pop(listener, None)
@@ -110,7 +104,6 @@ class KeyWatcher:
             await self._manager.unfollow_here(new_keys)
 
     def heard(self, listener: Listener, document: bytes) -> None:
-        """Follow a key that was just heard of."""
         new_keys = self._new_keys.get(listener)
         if new_keys is None or document in self._followed.get(listener, {document: None}):
             return
@@ -121,7 +114,6 @@ class KeyWatcher:
             self._manager.tasks.start(self._follow_fresh(listener, new_keys), "reem discovery of new keys")
 
     async def _follow_fresh(self, listener: Listener, new_keys: _NewKeysListener) -> None:
-        """Follow what was heard of, and all that is heard of meanwhile at once."""
         try:
             while new_keys.fresh:
                 found, new_keys.fresh = list(new_keys.fresh), {}
@@ -132,26 +124,20 @@ class KeyWatcher:
             new_keys.following = False
 
     async def settled(self) -> None:
-        """Return when nothing that has arrived waits for something older, or after a second."""
+        """Return when no update that has arrived waits for an older one, or after a second."""
         for _ in range(_MOMENTS):
             if not any(new_keys.waits for new_keys in list(self._new_keys.values())):
                 return
             await asyncio.sleep(_MOMENT)
 
-    async def _go_on_looking(self) -> None:
-        while True:
-            await asyncio.sleep(_PAUSE)
-            await self._look_for_all()
-            # Nobody listens to a pattern any more; the next one starts this anew.
-            if not self._followed:
-                return
-
-    async def _look_for_all(self) -> None:
+    async def _look_for_all(self) -> bool:
+        """Search for each listener; return whether any is left. The next one starts this again."""
         for listener in list(self._new_keys):
             try:
                 await self._look(listener, late=True)
             except (RedisError, OSError) as error:
                 logger.debug("new keys could not be looked for: %s", error)
+        return bool(self._followed)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:
         """Follow the keys that are not followed yet, and let go of those that are gone."""
@@ -168,7 +154,6 @@ class KeyWatcher:
                 await self._manager.unfollow_here(key_listener)
 
     async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
-        """Follow those that are not followed yet."""
         followed, new_keys = self._followed.get(listener), self._new_keys.get(listener)
         if followed is None:
             return
@@ -206,11 +191,11 @@ def literal(glob: str) -> str | None:
     return None if any(sign in plain for sign in "*?[") else _ESCAPED.sub(r"\1", glob)
 
 
-class _Part(ForwardingListener):
-    """A part of what somebody follows who listens to a pattern: a listener of the subscription manager.
+class _Part(Listener):
+    """A part of what the listener to a pattern follows: a listener of the subscription manager.
 
     Args:
-        listener: Who listens to the pattern; held weakly, so that who is dropped is not followed for any more.
+        listener: The listener to the pattern; held weakly, so that a dropped one is not followed for any more.
         topic: What it subscribes to.
     """
 
@@ -219,18 +204,16 @@ class _Part(ForwardingListener):
         self._listener: Callable[[], Listener | None] = weakref.ref(listener)
 
     def let_go(self) -> None:
-        """Tell nobody any more."""
+        """Notify the listener no more."""
         self._listener = _nobody
 
     def lost(self, reason: Exception) -> None:
-        """Hand it on, if this had begun."""
         if self.ready is not None:
             super().lost(reason)
         elif (listener := self._listener()) is not None:
             listener.lost(reason)
 
     def invalidate(self, channel: bytes) -> None:
-        """Hand it on."""
         if (listener := self._listener()) is not None:
             listener.invalidate(channel)
 
@@ -255,7 +238,6 @@ class _KeyListener(_Part):
         self.seen = time.monotonic()
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
-        """Begin, and let the listener begin."""
         self.begun = True
         self.seen = time.monotonic()
         if self._new_keys is not None:
@@ -265,7 +247,6 @@ class _KeyListener(_Part):
         super().start(wire, beginning)
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Hand it on, behind what all nodes were told before."""
         self.seen = time.monotonic()
         if self._new_keys is not None:
             self._new_keys.buffer(channel).told_here(notice)
@@ -273,7 +254,6 @@ class _KeyListener(_Part):
             listener.on_notice(notice, channel)
 
     def invalidate(self, channel: bytes) -> None:
-        """Hand it on."""
         self.seen = time.monotonic()
         super().invalidate(channel)
 
@@ -296,11 +276,10 @@ class _NewKeysListener(_Part):
 
     @property
     def waits(self) -> bool:
-        """Whether something has come and is not handed on yet."""
+        """Whether an update has come and is not handed on yet."""
         return any(each.waits for each in self._buffers.values())
 
     def buffer(self, channel: bytes) -> ReorderBuffer:
-        """Return what puts in order what is heard of a key."""
         found = self._buffers.get(channel)
         if found is None:
             if len(self._buffers) >= _MOST:  # of a key that is forgotten, all is taken as it comes
@@ -309,7 +288,7 @@ class _NewKeysListener(_Part):
         return found
 
     def forget(self, channel: bytes) -> bool:
-        """Forget what was heard of a key; return False if some of it waits to be handed on."""
+        """Forget a key; return False if an update of it waits to be handed on."""
         found = self._buffers.get(channel)
         if found is not None and found.waits:
             return False
@@ -317,12 +296,11 @@ class _NewKeysListener(_Part):
         return True
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
-        """Begin, and let the listener begin."""
         self.begin(wire, beginning)
         super().start(wire, beginning)
 
     def begin(self, wire: Wire, beginning: Beginning) -> None:
-        """Let the listener begin. One broken connection is one gap, however many keys begin anew over the next."""
+        """Let the listener begin. One broken connection is one gap, however many keys resynchronise after it."""
         if beginning is Beginning.AFTER_LOSS:
             if self._telling:
                 beginning = Beginning.FIRST
@@ -336,7 +314,6 @@ class _NewKeysListener(_Part):
         self._telling = False
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Hand it on, and see to it that the key is followed."""
         if (listener := self._listener()) is None:
             return
         self.buffer(channel).told_to_all(notice)

@@ -9,7 +9,7 @@ import math
 import weakref
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum, auto
-from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol
+from typing import Any, Concatenate, NamedTuple, ParamSpec
 
 from ..concurrency.queues import BoundedQueue
 from ..errors import BadData
@@ -22,15 +22,13 @@ from ..transport import Transport
 from ..transport.wire import Wire
 
 __all__ = [
-    "NOBODY",
+    "NO_LISTENERS",
     "Beginning",
-    "ForwardingListener",
     "Inbox",
     "Listener",
     "ListenerGroup",
     "Topic",
     "contained",
-    "give_error",
     "is_invalidation",
     "is_message",
 ]
@@ -39,7 +37,7 @@ logger = logging.getLogger("reem.subscribe")
 
 Arguments = ParamSpec("Arguments")
 _MOST_WARNINGS = 100
-"""Channels of whose unreadable messages is told: anybody may publish on any number of them."""
+"""Channels of whose unreadable messages a warning is logged: any client may publish on any number of them."""
 
 
 class Topic(NamedTuple):
@@ -61,11 +59,11 @@ class Beginning(Enum):
     """For the first time: it has missed nothing."""
 
     AFTER_LOSS = auto()
-    """After a connection was lost, or a slot moved: nobody knows what was published meanwhile."""
+    """After a connection was lost, or a slot moved: what was published meanwhile is unknown."""
 
 
 def contained(method: Callable[Concatenate[Any, Arguments], None]) -> Callable[Concatenate[Any, Arguments], None]:
-    """Have an exception in a listener's method end that listener: others share the connection that it came over."""
+    """Have an exception in a listener's method end only that listener: others share the connection."""
 
     @functools.wraps(method)
     def call(listener: Any, /, *args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
@@ -77,37 +75,44 @@ def contained(method: Callable[Concatenate[Any, Arguments], None]) -> Callable[C
     return call
 
 
-class Listener(Protocol):
-    """Who is told of updates.
+class Listener:
+    """What is notified of updates. Its methods do nothing unless a listener needs them.
+
+    Args:
+        topic: What it subscribes to.
+        max_batch_delay: Seconds that updates may wait for each other before it is notified.
+        queues: What is closed when it is followed no more.
 
     Attributes:
-        topic: What it subscribes to.
-        note: The key where the server keeps a note of the last update, None if there are many.
+        note: The key where the server keeps a note of the last update; None if there are many, or others compare it.
         ready: Done when it has begun to follow.
-        queues: Where each update goes.
-        max_batch_delay: Seconds that updates may wait for each other before it is told.
-        stored: It wants to know of keys that were changed, not only of what is published.
+        stored: It is notified of keys that were changed, not only of what is published.
         heartbeat: Seconds between probes that it needs; infinite if those that all get will do.
         local: It takes large values from the memory of publishers of the same host.
     """
 
-    topic: Topic
-    note: str | None
-    ready: asyncio.Future[None] | None
-    queues: list[BoundedQueue]
-    max_batch_delay: float
-    stored: bool
-    heartbeat: float
-    local: bool
+    def __init__(self, topic: Topic, max_batch_delay: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
+        self.topic = topic
+        self.max_batch_delay = max_batch_delay
+        self.queues: list[BoundedQueue] = [*queues]
+        self.note: str | None = None
+        self.ready: asyncio.Future[None] | None = None
+        self.stored = False
+        self.heartbeat = math.inf
+        self.local = False
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Begin over `wire`, which is subscribed."""
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_result(None)
 
     def lost(self, reason: Exception) -> None:
-        """Note that the connection is gone."""
+        """The connection is gone. A call that waits for the beginning gets `reason`."""
+        if self.ready is not None and not self.ready.done():
+            self.ready.set_exception(reason)
 
     def invalidate(self, channel: bytes) -> None:
-        """Note that something was published on `channel` that could not be read."""
+        """A message on `channel` could not be read."""
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Take one update."""
@@ -116,81 +121,29 @@ class Listener(Protocol):
         """Take an update that the server may not have yet, and may yet refuse."""
 
     def changed(self, key: str | None) -> None:
-        """Note that a key of what is followed was changed, the document's or an attachment's; None for every key."""
+        """A key of what is followed was changed, the document's or an attachment's; None for every key."""
 
     def on_note(self, note: bytes | None) -> None:
         """Compare with the server's note of the last update; all before it has been handed over."""
 
     def probe(self, now: float) -> str | None:
         """Return the document whose type the server is to be asked for now, None if it is not."""
+        return None
 
     def on_probe(self, kind: Reply, sent: float) -> None:
         """Compare with the type of the document, asked for at `sent`; all before it has been handed over."""
 
     def fail(self, error: Exception) -> None:
-        """End for an exception in this listener: those who take updates from it get the error."""
-
-
-def give_error(listener: Listener | ForwardingListener, error: Exception) -> None:
-    """Report the exception that has ended a listener, and give it to those who wait for its updates."""
-    logger.error("a subscription of %s has ended over an error of its own", listener.topic.name, exc_info=error)
-    if listener.ready is not None and not listener.ready.done():
-        listener.ready.set_exception(error)
-    for queue in listener.queues:
-        queue.close(error)
-
-
-class ForwardingListener:
-    """What listeners have in common that keep no copy of a key and only hand on what they hear.
-
-    Args:
-        topic: What it subscribes to.
-        max_batch_delay: Seconds that updates may wait for each other before it is told.
-        queues: What ends when it is followed no more.
-    """
-
-    def __init__(self, topic: Topic, max_batch_delay: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
-        self.topic = topic
-        self.max_batch_delay = max_batch_delay
-        self.queues: list[BoundedQueue] = [*queues]
-        self.note: str | None = None  # there are many, or others compare it
-        self.ready: asyncio.Future[None] | None = None
-        self.stored = False
-        self.heartbeat = math.inf
-        self.local = False
-
-    def fail(self, error: Exception) -> None:
-        """End for an exception in this listener: those who take updates from it get the error."""
-        give_error(self, error)
-
-    def start(self, wire: Wire, beginning: Beginning) -> None:
-        """Begin: there is nothing to fetch."""
+        """End for an exception in this listener: readers of its queues get the error."""
+        logger.error("a subscription of %s has ended over an error of its own", self.topic.name, exc_info=error)
         if self.ready is not None and not self.ready.done():
-            self.ready.set_result(None)
-
-    def lost(self, reason: Exception) -> None:
-        """Tell whoever waits for the beginning."""
-        if self.ready is not None and not self.ready.done():
-            self.ready.set_exception(reason)
-
-    def on_early(self, notice: Notice) -> None:
-        """It comes again when the server has it."""
-
-    def changed(self, key: str | None) -> None:
-        """Nothing is asked for."""
-
-    def on_note(self, note: bytes | None) -> None:
-        """Nothing to compare."""
-
-    def probe(self, now: float) -> str | None:
-        """No document is followed."""
-
-    def on_probe(self, kind: Reply, sent: float) -> None:
-        """Nothing to compare."""
+            self.ready.set_exception(error)
+        for queue in self.queues:
+            queue.close(error)
 
 
 class ListenerGroup:
-    """Who listens to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
+    """The listeners to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
 
     __slots__ = ("_references",)
 
@@ -198,36 +151,34 @@ class ListenerGroup:
         self._references: list[weakref.ref[Listener]] = []
 
     def add(self, listener: Listener) -> None:
-        """Take somebody in; once is enough."""
         if listener not in self.present():
             self._references.append(weakref.ref(listener, self._references.remove))
 
     def discard(self, listener: Listener) -> None:
-        """Let somebody go who may be there."""
         for reference in tuple(self._references):
             if reference() is listener:
                 self._references.remove(reference)
 
     def present(self) -> list[Listener]:
-        """Return all who are still there, in the order in which they came."""
+        """Return all that were not dropped, in the order in which they came."""
         # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
         return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
 
 
-NOBODY = ListenerGroup()
+NO_LISTENERS = ListenerGroup()
 
 _LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
 
 
 def is_invalidation(message: list[Any]) -> bool:
-    """Return whether what was pushed names keys that were changed, or says that all were (None)."""
+    """Return whether a push names keys that were changed, or says that all were (None)."""
     if len(message) != 2 or message[0] != b"invalidate":
         return False
     return message[1] is None or (type(message[1]) is list and all(type(name) is bytes for name in message[1]))
 
 
 def is_message(message: list[Any]) -> bool:
-    """Return whether what was pushed is what a manager is told: its kind, the pattern if any, channel, and payload."""
+    """Return whether a push is a message for subscribers: its kind, the pattern if any, channel, and payload."""
     length = _LENGTHS.get(message[0]) if message and type(message[0]) is bytes else None
     return len(message) == length and type(message[1]) is bytes and type(message[-2]) is bytes
 
@@ -238,13 +189,13 @@ class Inbox:
     Args:
         transport: Whose server it is.
         ships: What carries values that are not JSON.
-        topics: Who listens to what.
+        topics: The listeners to each topic.
         local: How values in the memory of publishers of the same host are looked at.
         moved: Called with topics that their server does not have any more, and why.
-        empty: Called with a topic that nobody listens to any more.
+        empty: Called with a topic that has no listener any more.
 
     Attributes:
-        watchers: Who is told of every key that the server says was changed, whoever read it.
+        watchers: Notified of every key that the server says was changed, whichever listener read it.
     """
 
     def __init__(
@@ -269,7 +220,6 @@ class Inbox:
         self._tail = b"}:notices" + (f"@{database}".encode() if database else b"")
 
     def take(self, message: list[Any]) -> None:
-        """Take one message."""
         if not is_message(message):
             if is_invalidation(message):
                 self._changed(message[1])
@@ -284,7 +234,7 @@ class Inbox:
         if self._early is not None and channel.endswith(self._early) and not topic[1]:
             self._take_early(channel.removesuffix(self._early), payload)
             return
-        listeners = self._topics.get(topic, NOBODY).present()
+        listeners = self._topics.get(topic, NO_LISTENERS).present()
         if not listeners:  # all were dropped without closing
             self._empty(Topic(*topic))
             return
@@ -308,20 +258,20 @@ class Inbox:
                 listener.invalidate(channel)
 
     def _take_early(self, channel: bytes, payload: bytes) -> None:
-        """Take what a publisher near by says before the server has it; an empty message only asks who listens."""
+        """Take an update that a publisher on this host sent ahead of the server; an empty message is only a probe."""
         topic: Any = (channel, False)
-        listeners = [listener for listener in self._topics.get(topic, NOBODY).present() if listener.local]
+        listeners = [listener for listener in self._topics.get(topic, NO_LISTENERS).present() if listener.local]
         if not payload or not listeners:
             return
         try:
             notice = decode(payload, self._ships, self._view)._replace(early=True)
             for listener in listeners:
                 listener.on_early(notice)
-        except Exception as error:  # as above; what the server has then is told as ever
+        except Exception as error:  # as above; what the server has then is delivered in any case
             self._unreadable(channel, error)
 
     def _changed(self, names: Any) -> None:
-        """Tell who follows a document that the server says was changed; names of keys, or None for all."""
+        """Notify the listeners of keys that the server says were changed; names of keys, or None for all."""
         if names is None:
             for group in (*self._topics.values(), self.watchers):
                 for listener in group.present():
@@ -331,11 +281,11 @@ class Inbox:
             document = name[1:].partition(b"}")[0] if name[:1] == b"{" else name
             topic: Any = (b"{" + document + self._tail, False)
             text = name.decode(errors="replace")
-            for listener in (*self._topics.get(topic, NOBODY).present(), *self.watchers.present()):
+            for listener in (*self._topics.get(topic, NO_LISTENERS).present(), *self.watchers.present()):
                 listener.changed(text)
 
     def _unreadable(self, channel: bytes, error: Exception) -> None:
-        """Count a message, and tell of the first of each channel."""
+        """Count a message, and warn of the first of each channel."""
         self._transport.states.unreadable += 1
         if channel not in self._warned and len(self._warned) < _MOST_WARNINGS:
             self._warned.add(channel)
@@ -348,5 +298,5 @@ class Inbox:
 
 
 def _unseen(notice: Notice) -> Notice:
-    """Return a notice for who does not look into the memory of others."""
+    """Return a notice for listeners that do not read the publisher's memory."""
     return notice._replace(value=ANNOUNCED)

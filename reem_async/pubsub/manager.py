@@ -1,8 +1,7 @@
 """The subscription manager: the subscription connections of an interface, kept alive for all that follow.
 
 One server needs one. In a cluster a channel belongs to a node, as its key does, so there is one for
-each node where somebody listens; when a slot moves, what is followed there begins anew on its new
-node, with a gap.
+each node with listeners; when a slot moves, its listeners resynchronise on its new node, with a gap.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from ..transport import Transport
 from ..transport.route import is_moved, is_unapplied
 from ..transport.wire import Wire, close_all
 from .key_watcher import KeyWatcher
-from .listeners import NOBODY, Beginning, Inbox, Listener, ListenerGroup, Topic
+from .listeners import NO_LISTENERS, Beginning, Inbox, Listener, ListenerGroup, Topic
 from .subscription_commands import Heartbeats, Invalidations, Subscribing
 
 if TYPE_CHECKING:
@@ -56,11 +55,11 @@ def manager_of(session: Session) -> SubscriptionManager:
 
 
 class SubscriptionManager:
-    """The subscription connections of an interface in one event loop, and who listens, by topic.
+    """The subscription connections of an interface in one event loop, and the listeners, by topic.
 
     Attributes:
         place: The process and the event loop it belongs to.
-        callers: What makes calls for updates, kept here although nobody else may hold on to it.
+        callers: What makes calls for updates, kept here although the program may not hold it.
         tasks: All that runs in the background for what is followed; ended by `close`.
         invalidations: What has servers say which keys were changed.
     """
@@ -116,11 +115,10 @@ class SubscriptionManager:
                 await self.invalidations.turn_on(wire)
 
     def unwatch(self, watcher: Listener) -> None:
-        """Tell a listener no more. Idempotent."""
         self._inbox.watchers.discard(watcher)
 
     def report(self, unreadable: Iterable[Unreadable] | None) -> None:
-        """Count places that cannot be read, and warn of them, of each once."""
+        """Count places that cannot be read, and warn of each once."""
         for it in unreadable or ():
             if it.place not in self._reported and len(self._reported) < _MOST_REPORTED:
                 self._reported.add(it.place)
@@ -164,7 +162,7 @@ class SubscriptionManager:
 
     @contextlib.contextmanager
     def _beginning(self, listeners: Sequence[Listener]) -> Iterator[None]:
-        """Have these begin by themselves, for the first time, when their topics are subscribed."""
+        """Have these listeners begin by themselves when their topics are subscribed."""
         self._beginners = listeners
         try:
             yield
@@ -172,7 +170,7 @@ class SubscriptionManager:
             self._beginners = ()
 
     async def follow_here(self, listener: Listener) -> None:
-        """Follow what the servers themselves know as a topic."""
+        """Follow a topic that the servers themselves know."""
         deadline = time.monotonic() + self.transport.timeout
         anew = False
         while True:
@@ -217,7 +215,7 @@ class SubscriptionManager:
                 ready.exception()  # it was raised, or is overtaken by a cancellation
 
     def _enter(self, listener: Listener) -> None:
-        """Note who listens, before the server confirms: a notice right behind that must find somebody."""
+        """Add a listener before the server confirms: a notice right behind that must find it."""
         if not self._topics:
             self._pace = listener.max_batch_delay
         self.limit_batch_delay(listener.max_batch_delay)
@@ -238,13 +236,12 @@ class SubscriptionManager:
         return self._key_watcher
 
     async def _connected(self, node: Transport) -> Wire:
-        """Return a live connection to `node`."""
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
         wire = self._wires.get(node)
         if wire is None or not wire.alive:
             wire = await cast("AsyncTransport", node).listen(self._inbox.take, self._on_lost)
-            if self._closed:  # meanwhile: nobody else would close it
+            if self._closed:  # meanwhile: nothing else would close it
                 await wire.close()
                 raise InterfaceClosed("this RedisInterface was closed during the call")
             self._wires[node], wire.pace = wire, self._pace
@@ -252,7 +249,7 @@ class SubscriptionManager:
         return wire
 
     def _confirmed(self, topic: Topic, wire: Wire) -> None:
-        """Note a subscription, and have who listens begin anew, but for beginners; whoever asked for it may be gone."""
+        """Note a subscription. Its listeners resynchronise, except those that are just beginning."""
         if self._subscribed.get(topic) is wire:
             return
         self._subscribed[topic] = wire
@@ -268,7 +265,7 @@ class SubscriptionManager:
 
     def _listeners(self, topics: Iterable[Topic] | None = None) -> list[Listener]:
         wanted = list(self._topics if topics is None else topics)
-        return [listener for topic in wanted for listener in self._topics.get(topic, NOBODY).present()]
+        return [listener for topic in wanted for listener in self._topics.get(topic, NO_LISTENERS).present()]
 
     async def fence(self) -> None:
         """Return when all that was published before now to what is followed has been told; one round trip.
@@ -281,33 +278,31 @@ class SubscriptionManager:
             await self._key_watcher.settled()
 
     async def unfollow(self, listener: Listener) -> None:
-        """Stop following. Idempotent."""
         if self._key_watcher is not None and listener.topic.pattern:
             await self._key_watcher.unfollow(listener)
         await self.unfollow_here(listener)
 
     async def unfollow_here(self, listener: Listener) -> None:
-        """Stop following what the servers themselves know as a topic."""
         self._drop(listener)
         for queue in listener.queues:
             queue.close()
 
     def _drop(self, listener: Listener) -> None:
         listener.lost(InterfaceClosed("this subscription was closed before it began"))
-        group = self._topics.get(listener.topic, NOBODY)
+        group = self._topics.get(listener.topic, NO_LISTENERS)
         if listener in group.present():
             group.discard(listener)
             self._forget_if_empty(listener.topic)
 
     def _forget_if_empty(self, topic: Topic) -> None:
-        if self._topics.get(topic, NOBODY).present():
+        if self._topics.get(topic, NO_LISTENERS).present():
             return
         self._topics.pop(topic, None)
         self._unsure.discard(topic)
         self._subscribing.leave(self._subscribed.pop(topic, None), topic)
 
     def _forget_empty(self) -> list[Listener]:
-        """Forget what nobody listens to any more; return who is left."""
+        """Forget topics without listeners; return the listeners that are left."""
         if self._local.host:
             self._local.reader.let_go()
         for topic in [topic for topic, group in self._topics.items() if not group.present()]:
@@ -334,7 +329,7 @@ class SubscriptionManager:
             listener.on_note(note)
 
     def _moved(self, topics: list[Topic], reason: str) -> None:
-        """Have what is followed on these topics begin anew where they are now."""
+        """Resynchronise these topics where they are now."""
         for topic in topics:
             wire = self._subscribed.pop(topic, None)
             self._unsure.discard(topic)
@@ -365,12 +360,12 @@ class SubscriptionManager:
         self._repair()
 
     def _repair(self) -> None:
-        """See to it that all that is followed is subscribed, in the background."""
+        """Subscribe what is missing, in the background."""
         if not self._closed and self._reconnecting is None and self._missing():
             self._reconnecting = self.tasks.start(self._reconnect(), "reem reconnect")
 
     def _missing(self) -> list[Topic]:
-        """Return what is followed and not subscribed."""
+        """Return the topics that are followed and not subscribed."""
         if self._closed:
             return []
         return [
@@ -380,7 +375,7 @@ class SubscriptionManager:
         ]
 
     async def _reconnect(self) -> None:
-        """Connect, subscribe, and have every listener begin anew; tries until it works."""
+        """Connect and subscribe, with retries, until nothing is missing."""
         pause = 0.05
         try:
             while self._missing():
@@ -413,7 +408,7 @@ class SubscriptionManager:
             raise failure
 
     async def _subscribe_at(self, node: Transport, topics: list[Topic]) -> Wire:
-        """Subscribe topics at `node`, which has who listens begin anew, but for beginners."""
+        """Subscribe to topics at `node`. Existing listeners resynchronise; new ones start by themselves."""
         wire = await self._connected(node)
         if self._inbox.watchers.present() or any(listener.stored for listener in self._listeners(topics)):
             await self.invalidations.turn_on(wire)
@@ -434,14 +429,14 @@ class SubscriptionManager:
             await close_all(list(self._wires.values()))
 
     def end_loops(self) -> None:
-        """End the loops of threads over what is followed, though the event loop may be busy. Any thread may."""
+        """End the loops of threads over updates, though the event loop may be busy. Any thread may."""
         for listener in self._everybody():
             for queue in listener.queues:
                 if queue.wake is noop:  # else it wakes something in the event loop, which no other thread may
                     queue.close()
 
     def _everybody(self) -> list[Listener]:
-        """Return all who listen, also to patterns in a cluster. Any thread may ask."""
+        """Return all listeners, also those to patterns in a cluster. Any thread may ask."""
         beyond = self._key_watcher.listeners() if self._key_watcher is not None else []
         return [*beyond, *self._listeners()]
 

@@ -104,14 +104,14 @@ class Mirror(Following):
             largest=checked_largest(largest),
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
         )
-        self._link.told = _waking(self)
+        self._link.on_state = _waking(self)
         self._waiting: set[Wait] = set()
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, the copy is there. Idempotent; two or three round trips.
 
         Raises:
-            NotConnected: Nobody listens there.
+            NotConnected: No server listens there.
             InterfaceClosed: It was closed before.
         """
         await self._link.follow()
@@ -125,7 +125,7 @@ class Mirror(Following):
         """Seconds since the server was last asked whether it has what is in the copy, and has answered that it has.
 
         An upper bound on how long the server may have had something else. It measures the link to the server, not when
-        the value was written: a value that nobody changes for an hour has a small age. Probes are sent each second, or
+        the value was written: a value that does not change for an hour has a small age. Probes are sent each second, or
         three times in `max_age`, so the age goes up to the time between two of them and two round trips. Without
         the right to CLIENT TRACKING the server does not report what is only stored, and the age is the time since the
         last read. Infinite before `listen`, in a forked child, and after its event loop was closed.
@@ -144,7 +144,7 @@ class Mirror(Following):
         return None if follower is None else follower.value()
 
     def _check_begun(self) -> Follower:
-        """Return who follows; raise Stale if nobody does."""
+        """Return the follower; raise Stale if there is none."""
         follower = self._link.follower
         if follower is None:
             raise Stale(f"{self.channel}: this mirror does not follow yet; use it in a `with`, or call listen() first")
@@ -282,11 +282,11 @@ def _waking(mirror: Mirror) -> Callable[[Any], None]:
     """Return what hands states to a mirror; a reference back would keep a mirror that was dropped."""
     reference = weakref.ref(mirror)
 
-    def told(tree: Any) -> None:
+    def on_state(tree: Any) -> None:
         if (there := reference()) is not None and there._waiting:
             there._take(tree)
 
-    return told
+    return on_state
 
 
 class MirrorAccessor(LocalAccessor):

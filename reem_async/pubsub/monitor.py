@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..concurrency.queues import Every, Policy, chosen, noop
-from ..concurrency.streams import Stream
 from ..connection import RedisInterface
-from ..errors import BadType, InterfaceClosed
+from ..errors import BadType
 from ..plan.arguments import check_number
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, Pattern, channel_pattern, fits, is_namespace, name_of, parse_patterns, show
 from ..transport.wire import Wire
 from .gaps import Numbers
-from .listeners import Beginning, ForwardingListener, contained
-from .manager import SubscriptionManager, Topic, manager_of
+from .listeners import Beginning, Listener, Topic, contained
+from .patterns import PatternStream
 
 __all__ = ["ANNOUNCED", "Event", "Monitor"]
 
@@ -44,7 +43,7 @@ class Event:
         missed: How many updates of this publisher and key were lost directly before.
         gap: Something was lost before: `missed` are known, or the connection broke, or a message was unreadable.
         namespace: Where the top-level key is: the interface's namespace, or the one of many that it was found in.
-        stored: Nobody published it: it was found to be stored, at `time`, which is that of `received`. A `Monitor`
+        stored: It was not published: it was found to be stored, at `time`, which is that of `received`. A `Monitor`
             tells of no such changes; commands that also follow the store do.
         local: Programs of the publisher's user and host can take the value from its memory.
     """
@@ -74,7 +73,7 @@ class Event:
         return show(self.path)
 
 
-class Monitor(Stream[Event]):
+class Monitor(PatternStream[Event]):
     """Yields an `Event` for every update published under some patterns of paths: an async iterator.
 
     Sees what is published with a PublishSpace, not what a KeyValueStore writes. Nothing is fetched:
@@ -92,9 +91,9 @@ class Monitor(Stream[Event]):
             he is woken less often.
 
     Attributes:
-        doubted: Called with a top-level key of which a message could not be read.
+        invalidated: Called with a top-level key of which a message could not be read.
         broken: Called when updates of any key may be lost: a connection broke.
-        begun_anew: Called when it is followed again after a loss, once for each connection, whatever that concerned.
+        resynchronised: Called when it is followed again after a loss, once for each connection.
         changed: Called with each key that the server says was changed, None for all, after `watch_changes`.
 
     A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
@@ -115,81 +114,51 @@ class Monitor(Stream[Event]):
         namespaces: str | None = None,
         patience: float = 0.0,
     ) -> None:
-        super().__init__(chosen(policy, Every(10_000)))
-        self._session = interface.session
         if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
             raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
+        super().__init__(interface.session, parse_patterns(patterns), chosen(policy, Every(10_000)))
         self._namespaces = None if namespaces is None else Pattern(namespaces)
         check_number("patience", patience, "use seconds, 0 or more")
         self.patience = patience
-        self.patterns = parse_patterns(patterns) or [Pattern("*")]
-        self._listeners: list[_PatternListener] = []
-        self._manager: SubscriptionManager | None = None
         self._numbers = Numbers()
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
         self._owed: dict[str, int] = {}  # keys with a gap to be told, and how many updates are known to be lost there
-        self.doubted: Callable[[str], None] = lambda name: None
+        self.invalidated: Callable[[str], None] = lambda name: None
         self.broken: Callable[[], None] = noop
-        self.begun_anew: Callable[[], None] = noop
+        self.resynchronised: Callable[[], None] = noop
         self.changed: Callable[[str | None], None] = lambda key: None
-        self._telling = False  # that it begins anew, in this turn of the event loop
-
-    @property
-    def _begun(self) -> bool:
-        """Whether it has begun, in this process and in an event loop that is not closed."""
-        return self._manager is not None and self._manager.is_here
-
-    @property
-    def _following(self) -> bool:
-        return self._begun or self._closed
+        self._resynchronising = False  # that it resynchronises, in this turn of the event loop
 
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; one round trip a pattern."""
-        if self._closed:
-            raise InterfaceClosed("this monitor is closed; make a new one")
-        if self._begun:
-            return
-        self._listeners = []  # none but of elsewhere
-        manager = self._manager = manager_of(self._session)
-        try:
-            for top in dict.fromkeys(pattern.top for pattern in self.patterns):
-                topic = self._topic(Pattern(top))
-                listener = _PatternListener(self, Topic(topic, pattern=True))
-                self._listeners.append(listener)
-                await manager.follow(listener)
-        except BaseException:
-            self._manager, self._listeners = None, []
-            raise
+        await super().listen()
+
+    def _listener(self, topic: Topic) -> Listener:
+        return _PatternListener(self, topic)
 
     async def watch_changes(self) -> None:
         """Be told by `changed` of keys that were read over a connection of notices and then changed."""
         assert self._manager is not None
         await self._manager.watch(self._listeners[0])
 
-    async def close(self) -> None:
-        """Stop following and end the loop. Idempotent."""
-        await super().close()
-        for listener in self._listeners:
-            if self._manager is not None and self._begun:
-                self._manager.unwatch(listener)
-                await self._manager.unfollow(listener)
-
     @property
     def connected(self) -> bool:
         """Whether all that it follows is subscribed to, as far as is known."""
-        return all(listener.wire is not None for listener in self._listeners)
+        return all(wire is not None for wire in self._wires)
 
     @property
     def batches_messages(self) -> bool:
-        """Whether nobody waits for the notices."""
-        return any(listener.wire is not None and listener.wire.batches_messages for listener in self._listeners)
+        """Whether no listener waits for the notices."""
+        return any(wire is not None and wire.batches_messages for wire in self._wires)
 
-    def _topic(self, pattern: Pattern) -> bytes:
-        """Return the pattern of the channels of the keys that `pattern` names."""
-        namespace, database = self._session.namespace, self._session.options.database
+    @property
+    def _wires(self) -> list[Wire | None]:
+        return [listener.wire for listener in self._listeners if isinstance(listener, _PatternListener)]
+
+    def _channels(self, pattern: Pattern) -> bytes:
         if self._namespaces is None:
-            return channel_pattern(pattern, namespace, database)
-        return channel_pattern(Pattern(self._namespaces.top + pattern.top), "", database)
+            return super()._channels(pattern)
+        return channel_pattern(Pattern(self._namespaces.top + pattern.top), "", self._session.options.database)
 
     def _split(self, channel: bytes) -> tuple[str, str] | None:
         """Return the namespace and the top-level key that a channel belongs to, None if it is not meant."""
@@ -211,21 +180,21 @@ class Monitor(Stream[Event]):
         self._gaps = set()
         self.broken()
 
-    def _begun_anew(self) -> None:
-        if not self._telling:  # all patterns of one connection begin in the same turn
-            self._telling = True
-            asyncio.get_running_loop().call_soon(self._told)
-            self.begun_anew()
+    def _resynchronised(self) -> None:
+        if not self._resynchronising:  # all patterns of one connection begin in the same turn
+            self._resynchronising = True
+            asyncio.get_running_loop().call_soon(self._end_turn)
+            self.resynchronised()
 
-    def _told(self) -> None:
-        self._telling = False
+    def _end_turn(self) -> None:
+        self._resynchronising = False
 
     def _doubt(self, channel: bytes) -> None:
         place = self._split(channel)
         if place is None:
             return
         self._owe("".join(place), 0)
-        self.doubted(place[1])
+        self.invalidated(place[1])
 
     def _owe(self, whole: str, missed: int) -> None:
         """Have the next event of a key say that updates were lost."""
@@ -270,7 +239,7 @@ class Monitor(Stream[Event]):
         )
 
 
-class _PatternListener(ForwardingListener):
+class _PatternListener(Listener):
     """One subscription of a monitor: a listener of the subscription manager, which holds it weakly.
 
     Attributes:
@@ -287,12 +256,12 @@ class _PatternListener(ForwardingListener):
         """Take the connection; after a broken one, say so."""
         self.wire = wire
         if beginning is Beginning.AFTER_LOSS:
-            self._monitor._begun_anew()
+            self._monitor._resynchronised()
         super().start(wire, beginning)
 
     @contained
     def lost(self, reason: Exception) -> None:
-        """Remember that updates may be lost. Whoever waits for the beginning gets `reason`."""
+        """Remember that updates may be lost. A call that waits for the beginning gets `reason`."""
         self.wire = None
         self._monitor._lost()
         super().lost(reason)

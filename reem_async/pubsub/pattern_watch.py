@@ -1,6 +1,6 @@
 """Following every change of all keys that some patterns name: those there are, and those that come to be.
 
-Each key has a `Follower`. Publishers are heard through the patterns too: of a key that nobody follows yet that is the
+Each key has a `Follower`. Publishers are heard through the patterns too: of a key that is not followed yet that is the
 first word, and what is heard until it is followed is handed on. Keys that are only stored are looked for every second.
 """
 
@@ -9,33 +9,32 @@ from __future__ import annotations
 import asyncio
 import logging
 import weakref
-from collections.abc import Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import replace
 
 from ..concurrency.queues import BoundedQueue, Last, Policy, chosen
-from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan.notices import Notice
-from ..plan.paths import Path, Pattern, channel_pattern, name_of, parse_pattern, parse_shown, show, spelled_out
+from ..plan.paths import Path, name_of, parse_patterns, parse_shown, show, spelled_out
 from ..session import Session
+from .finder import find_regularly, present_keys
 from .follower import Follower, checked_largest
-from .listeners import ForwardingListener, Listener
-from .manager import SubscriptionManager, Topic, manager_of
+from .listeners import Listener, Topic
+from .manager import SubscriptionManager
+from .patterns import PatternStream
 from .updates import Update
 
 __all__ = ["PatternWatch"]
 
 logger = logging.getLogger("reem.subscribe")
 
-_PAUSE = 1.0
-"""Seconds between looks for keys that somebody has stored."""
 _MOST_WAITING = 1000
 """Updates that wait for a loop that is slower, if no policy is given."""
 _MOST_BORN = 1000
 """Notices of a key that is about to be followed; more are read with it."""
 
 
-class PatternWatch(Stream[Update]):
+class PatternWatch(PatternStream[Update]):
     """Follows all keys that some patterns name and yields their changes: an async iterator.
 
     What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
@@ -59,75 +58,37 @@ class PatternWatch(Stream[Update]):
     def __init__(
         self, session: Session, patterns: Sequence[str], policy: Policy | None = None, *, largest: int | None = None
     ) -> None:
-        super().__init__(chosen(policy, Last(_MOST_WAITING)))
-        self.patterns = [parse_pattern(text) for text in patterns] or [Pattern("*")]
-        self._session = session
+        super().__init__(session, parse_patterns(patterns), chosen(policy, Last(_MOST_WAITING)))
         self._largest = checked_largest(largest)
-        self._listeners: list[_Publishers] = []
-        self._manager: SubscriptionManager | None = None
         self._followed: dict[str, list[Follower]] = {}
         self._born: dict[str, list[Notice]] = {}  # about to be followed
         self._failed: set[str] = set()  # could not be followed: what is there later was not made just then
         self._unreadable: dict[str, tuple[Path, ...]] = {}  # places in keys, because of what is there, or of rights
         self._warned: set[tuple[str, Path]] = set()
 
-    @property
-    def _begun(self) -> bool:
-        """Whether it has begun, in this process and in an event loop that is not closed."""
-        return self._manager is not None and self._manager.is_here
-
-    @property
-    def _following(self) -> bool:
-        return self._begun or self._closed
-
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later change is missed. Idempotent; a few round trips for each key."""
-        if self._closed:
-            raise InterfaceClosed("this watch is closed; make a new one")
-        if self._begun:
-            return
-        await self._leave()  # what was begun elsewhere
-        manager = self._manager = manager_of(self._session)
-        try:
-            for top in dict.fromkeys(pattern.top for pattern in self.patterns):
-                session = self._session
-                topic = channel_pattern(Pattern(top), session.namespace, session.options.database)
-                listener = _Publishers(self, Topic(topic, pattern=True))
-                self._listeners.append(listener)
-                await manager.follow(listener)
-            # The patterns are subscribed to by now: a key that is made during the look is heard of.
-            await self._follow(self._new(await self._there()), late=False)
-        except BaseException:
-            await self._leave()
-            self._manager = None
-            raise
-        manager.tasks.start(_go_on_looking(weakref.ref(self)), "reem discovery")
+        await super().listen()
 
-    async def close(self) -> None:
-        """Stop following and end the loop. Idempotent."""
-        await super().close()
-        await self._leave()
+    def _listener(self, topic: Topic) -> Listener:
+        return _Publishers(self, topic)
 
-    async def _leave(self) -> None:
-        leaving: list[Listener] = [*self._listeners, *(each for there in self._followed.values() for each in there)]
-        self._listeners, self._followed = [], {}
+    async def _begin(self, manager: SubscriptionManager) -> None:
+        # The patterns are subscribed to by now: a key that is made during the search is heard of.
+        await self._follow(self._new(await present_keys(self._session, self.tops)), late=False)
+        manager.tasks.start(find_regularly(_searching(weakref.ref(self))), "reem discovery")
+
+    def _leaving(self) -> list[Listener]:
+        leaving = [*self._listeners, *(each for there in self._followed.values() for each in there)]
+        self._followed = {}
         self._born.clear()
         self._failed.clear()
         self._unreadable.clear()
         self._warned.clear()
-        for listener in leaving:
-            if self._manager is not None and self._begun:
-                await self._manager.unfollow(listener)
-
-    async def _there(self) -> set[str]:
-        """Return the keys that there are now and that the patterns may name."""
-        found: set[str] = set()
-        for top in dict.fromkeys(pattern.top for pattern in self.patterns):
-            found |= {name async for name in self._session.names(Pattern(top))}
-        return found
+        return leaving
 
     def _new(self, found: set[str]) -> list[str]:
-        """Return those that are to be followed and are not."""
+        """Return the keys that are to be followed and are not."""
         lacking = (found - self._followed.keys()) | (found & self._unreadable.keys())
         return sorted(name for name in lacking if self._paths(name))
 
@@ -137,7 +98,7 @@ class PatternWatch(Stream[Update]):
         return [path for path in paths if not any(path[: len(other)] == other for other in paths - {path})]
 
     async def _follow(self, names: Iterable[str], *, late: bool) -> None:
-        """Follow some keys; what cannot be read is told in a warning, and tried again at each look."""
+        """Follow some keys. A warning names what cannot be read; each search tries it again."""
         manager = self._manager
         if manager is None or self._closed:  # meanwhile
             return
@@ -154,7 +115,7 @@ class PatternWatch(Stream[Update]):
         try:
             await manager.subscribe_all(followers)
             for name in list(coming):
-                await self._begin(name, coming[name], manager)
+                await self._begin_key(name, coming[name], manager)
                 self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
                 del coming[name]
         finally:
@@ -177,8 +138,8 @@ class PatternWatch(Stream[Update]):
         follower.born = born
         return follower
 
-    async def _begin(self, name: str, there: dict[Path, Follower], manager: SubscriptionManager) -> None:
-        """Begin to follow places in one key, and take them out; what cannot be read is put off."""
+    async def _begin_key(self, name: str, there: dict[Path, Follower], manager: SubscriptionManager) -> None:
+        """Begin to follow places in one key, and take them out; those that cannot be read are put off."""
         unreadable: dict[Path, Follower] = {}
         for path, follower in list(there.items()):
             try:
@@ -198,7 +159,7 @@ class PatternWatch(Stream[Update]):
             self._unreadable[name] = tuple(unreadable)
 
     def _put_off(self, name: str, there: dict[Path, Follower]) -> None:
-        """Let go of followers that could not begin, which is tried again; those of other places in the key go on."""
+        """Drop followers that could not begin, which is tried again; those of other places in the key go on."""
         left = [each for each in self._followed.get(name, []) if each not in there.values()]
         for follower in there.values():
             self._let_go(follower)
@@ -210,7 +171,7 @@ class PatternWatch(Stream[Update]):
             self._failed.add(name)
 
     def heard(self, notice: Notice, channel: bytes) -> None:
-        """Follow the key of which somebody has published something, unless it is followed."""
+        """Follow the key of which an update was published, unless it is followed."""
         name = name_of(channel, self._session.namespace)
         born = self._born.get(name)
         if born is not None:
@@ -223,7 +184,7 @@ class PatternWatch(Stream[Update]):
             self._manager.tasks.start(self._follow_late([name]), "reem discovery of new keys")
 
     def _is_new(self, name: str) -> bool:
-        """Return whether a key that is heard of is to be followed at once; one that was unreadable waits for a look."""
+        """Return whether a key is to be followed at once; one that was unreadable waits for a search."""
         return name not in self._followed and name not in self._unreadable
 
     async def _follow_late(self, names: Iterable[str]) -> None:
@@ -250,15 +211,15 @@ class PatternWatch(Stream[Update]):
             self._let_go(follower)
 
     def _let_go(self, follower: Follower) -> None:
-        follower.queues = []  # it tells nothing more: whoever follows the place next does
+        follower.queues = []  # it reports nothing more: the next follower of the place does
         if self._manager is not None:
             self._manager.tasks.start(self._manager.unfollow_here(follower), "reem unfollow")
 
     async def look(self) -> None:
-        """Follow keys that have come to be, and let go of those that are gone."""
+        """Follow new keys, and stop following those that are gone."""
         followed = list(self._followed)
         try:
-            found = await self._there()
+            found = await present_keys(self._session, self.tops)
             self._failed &= found
             for name in self._unreadable.keys() - found:
                 del self._unreadable[name]
@@ -271,14 +232,17 @@ class PatternWatch(Stream[Update]):
             logger.debug("keys could not be listed: %s", error)
 
 
-async def _go_on_looking(reference: weakref.ref[PatternWatch]) -> None:
-    while True:
-        await asyncio.sleep(_PAUSE)
+def _searching(reference: weakref.ref[PatternWatch]) -> Callable[[], Awaitable[bool]]:
+    """Return what searches for a watch, which it does not keep from being dropped."""
+
+    async def search() -> bool:
         watch = reference()
         if watch is None or watch._closed:
-            return
+            return False
         await watch.look()
-        del watch
+        return True
+
+    return search
 
 
 class _Fitting(BoundedQueue):
@@ -293,7 +257,6 @@ class _Fitting(BoundedQueue):
         self._missed: int | None = 0  # how many; None if that is not known
 
     def put(self, update: Update) -> None:
-        """Hand an update on."""
         watch = self._watch()
         if watch is None:
             return
@@ -310,27 +273,22 @@ class _Fitting(BoundedQueue):
             watch.gone(self._name)
 
     def overtaken(self, update: Update | None) -> None:
-        """Count an update that can no more be told."""
         if (watch := self._watch()) is not None:
             watch.queue.skip()
 
     def close(self, end: Exception | None = None) -> None:
-        """End the watch for an error; else do nothing: the watch's queue goes on."""
+        """End the watch for an error. Else its queue goes on."""
         if end is not None and (watch := self._watch()) is not None:
             watch.queue.close(end)
 
 
-class _Publishers(ForwardingListener):
+class _Publishers(Listener):
     """What is published under a pattern: a listener of the subscription manager, which holds it weakly."""
 
     def __init__(self, watch: PatternWatch, topic: Topic) -> None:
         super().__init__(topic, queues=[watch.queue])
         self._watch = weakref.ref(watch)
 
-    def invalidate(self, channel: bytes) -> None:
-        """Do nothing: who follows the key has it too."""
-
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        """Take the word that there is such a key."""
         if (watch := self._watch()) is not None:
             watch.heard(notice, channel)

@@ -1,73 +1,89 @@
-"""When to look at what the server says was changed: soon, but not more often than is good for the server."""
+"""When to read what the server says was changed: soon, but not more often than is good for the server."""
 
 from __future__ import annotations
 
 import asyncio
 import weakref
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
-__all__ = ["RefreshTimer"]
+__all__ = ["BACKGROUND", "BACKGROUND_RATE", "LIVE", "Pace", "RefreshTimer"]
 
 Owner = TypeVar("Owner")
+
+
+class Pace(NamedTuple):
+    """How soon a change is read that no notice explains.
+
+    Attributes:
+        quickest: Seconds until it is read where notices come too, after a read that found something.
+        slowest: The same, at most: each read that finds nothing doubles the time.
+        notice_delay: Seconds in which the notice of a change may come behind the report of it.
+    """
+
+    quickest: float
+    slowest: float
+    notice_delay: float = 0.0
+
+
+LIVE = Pace(0.001, 0.02)
+"""Of subscribers. A key that is stored at any rate is read 1,000 times a second at most."""
+BACKGROUND = Pace(0.02, 0.5, 0.015)
+"""Of recordings and the page. Their notices wait for each other up to 10 ms, which is less than the notice delay."""
+BACKGROUND_RATE = 8 << 20
+"""Bytes a second that recordings read of each key for what is only stored, and the page of all keys."""
 
 
 class RefreshTimer(Generic[Owner]):
     """Calls for looks at one thing that changes. Belongs to an event loop.
 
-    A published update is a change too, which its notice tells of, so most looks at what is published find nothing:
+    A published update is a change too, which its notice explains. So most looks at what is published find nothing:
     where a notice has come with the change the look waits, after each look that found nothing twice as long.
 
     Args:
-        owner: Whose looks they are; held weakly, since whoever follows ends by being dropped.
+        owner: Whose looks they are; held weakly, since a follower ends by being dropped.
         look: Called with the owner when a look is due.
-        quickest: Seconds that a look waits where notices come, after one that found something.
-        slowest: The same, at most.
-        patience: Seconds in which the notice of a change may come behind the word of it.
+        pace: How soon.
 
     Attributes:
-        heard: Counts the notices; whoever hears them counts.
+        heard: Counts the notices; the owner adds them.
         earliest: When the next look may be at the earliest, on the loop's clock.
     """
 
-    def __init__(
-        self, owner: Owner, look: Callable[[Owner], None], quickest: float, slowest: float, patience: float = 0.0
-    ) -> None:
+    def __init__(self, owner: Owner, look: Callable[[Owner], None], pace: Pace) -> None:
         self.heard = 0
         self.earliest = 0.0
-        # Not a WeakMethod, which runs some Python when its owner goes: a handler of signals that raises in it would be
-        # heard of by nobody.
+        # Not a WeakMethod, which runs some Python when its owner goes: the exception of a signal handler in it would be
+        # lost.
         self._owner, self._function = weakref.ref(owner), look
-        self._quickest, self._slowest, self._patience = quickest, slowest, patience
-        self._pace = quickest
+        self._pace = pace
+        self._wait = pace.quickest
         self._loop = asyncio.get_running_loop()
         self._next: asyncio.Handle | None = None
 
     @property
     def due(self) -> bool:
-        """Whether something was changed that was not looked at."""
+        """Whether a change was reported and not looked at."""
         return self._next is not None
 
     def ask(self) -> None:
-        """Something was changed. What comes in the same turn of the loop, or in the patience, is heard first."""
+        """A change was reported. Notices in the same turn of the loop, or in the notice delay, explain it."""
         if self._next is None:
-            if self._patience:
-                self._next = self._loop.call_later(self._patience, self._look_or_wait, self.heard)
+            if self._pace.notice_delay:
+                self._next = self._loop.call_later(self._pace.notice_delay, self._look_or_wait, self.heard)
             else:
                 self._next = self._loop.call_soon(self._look_or_wait, self.heard)
 
     def found(self) -> None:
         """The last look has found something that no notice told of."""
-        self._pace = self._quickest
+        self._wait = self._pace.quickest
 
     def cancel(self) -> None:
-        """Do not look."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
 
     def now(self) -> None:
-        """Look at once, if a look is due."""
         if self._next is not None:
             self.cancel()
             self._do()
@@ -76,7 +92,7 @@ class RefreshTimer(Generic[Owner]):
         now = self._loop.time()
         due = self.earliest
         if heard != self.heard:
-            due = max(due, now + self._pace)
+            due = max(due, now + self._wait)
         if due > now:
             self._next = self._loop.call_at(due, self._look)
         else:
@@ -84,7 +100,7 @@ class RefreshTimer(Generic[Owner]):
 
     def _look(self) -> None:
         self._next = None
-        self._pace = min(2 * self._pace, self._slowest)
+        self._wait = min(2 * self._wait, self._pace.slowest)
         self._do()
 
     def _do(self) -> None:

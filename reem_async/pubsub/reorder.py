@@ -1,8 +1,8 @@
 """One order for what is heard of a key in two ways, while a pattern's listener changes from one to the other.
 
-In its first seconds with a key a publisher tells all nodes of a cluster, and whoever looks for keys hears of it
-over one connection. From then on the key is followed at its own node, over another connection. Each way brings a
-publisher's updates in their order, but either may be behind: nodes pass on what all are told up to 50 ms late. So
+In its first seconds with a key a publisher notifies all nodes of a cluster, and a listener that searches for keys hears
+of it over one connection. From then on the key is followed at its own node, over another connection. Each way brings a
+publisher's updates in their order, but either may be behind: nodes pass on what is sent to all up to 50 ms late. So
 what comes at the key's node waits until the other way has brought all that is older, and nothing that is still on
 its way is taken for lost. From then on the key's node is the only one listened to.
 """
@@ -52,14 +52,12 @@ class _Sender:
         self.timer: asyncio.TimerHandle | None = None
 
     def note(self, stamp: tuple[int, float]) -> None:
-        """Remember what all nodes were told."""
         if len(self.told) >= _MOST_WAITING:
             del self.told[next(iter(self.told))]
         self.told[stamp] = None
         self.ahead = max(self.ahead, stamp)
 
     def forget(self) -> None:
-        """Remember nothing of it any more."""
         self.told.clear()
         self.ahead = 0, 0.0
 
@@ -76,7 +74,7 @@ class ReorderBuffer:
     """What one listener hears of one key, in order.
 
     Args:
-        listener: Returns who is told, None if he is gone.
+        listener: Returns the listener, None if it was dropped.
         channel: The key's channel.
 
     Attributes:
@@ -91,11 +89,11 @@ class ReorderBuffer:
 
     @property
     def waits(self) -> bool:
-        """Whether something has come and is not handed on yet."""
+        """Whether an update has come and is not handed on yet."""
         return any(sender.waiting for sender in self._senders.values())
 
     def told_to_all(self, notice: Notice) -> None:
-        """Take what all nodes were told."""
+        """Take an update that its publisher sent to all nodes."""
         sender = self._sender(notice.publisher)
         if sender.here or (notice.sequence, notice.time) in sender.told:
             return
@@ -109,7 +107,7 @@ class ReorderBuffer:
             self._settle(sender)
 
     def told_here(self, notice: Notice) -> None:
-        """Take what was told at the key's own node."""
+        """Take an update that came at the key's own node."""
         sender = self._sender(notice.publisher)
         if sender.here:
             self._tell_once(sender, notice)  # the other way may have been ahead
@@ -132,14 +130,14 @@ class ReorderBuffer:
         return sender
 
     def _give_up(self, sender: _Sender) -> None:
-        """Wait no longer: what is older was lost."""
+        """Wait no longer: older updates were lost."""
         listener = self._listener()
-        if listener is not None and not sender.last:  # nobody can tell how much
+        if listener is not None and not sender.last:  # how much is unknown
             listener.invalidate(self._channel)
         self._settle(sender)
 
     def _settle(self, sender: _Sender) -> None:
-        """Hand on what waits, and listen to the key's node only from now on."""
+        """Hand on what waits, and listen to the key's own node only from now on."""
         if sender.timer is not None:
             sender.timer.cancel()
         sender.here = True
@@ -149,7 +147,6 @@ class ReorderBuffer:
         sender.timer = asyncio.get_running_loop().call_later(_REMEMBERED, sender.forget) if sender.told else None
 
     def _tell_once(self, sender: _Sender, notice: Notice) -> None:
-        """Hand on what came at the key's node, unless it came the other way too."""
         if not sender.is_past((notice.sequence, notice.time)):
             self._tell(sender, notice)
 

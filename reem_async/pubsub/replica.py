@@ -10,7 +10,7 @@ events that a server can bring about.
            v  |                                                               | armed()
         READING <-------------------------------------------------------------+
            |  ^
-           |  +---- nobody knows which of the updates that came meanwhile it has, or the plan goes on
+           |  +---- it is not known which of the updates that came meanwhile it has, or the plan goes on
            |
            |  the reply, all that is in it heard of             opened()
            +---------------------------------------> OPENING ------------> CURRENT
@@ -24,70 +24,71 @@ events that a server can bring about.
         any -- lost() --> OFFLINE -- begin() --> READING
 
 Large values are read over another connection than that of the notices: servers close a subscribed connection that owes
-over 32 MB, and small updates should not wait behind an image. `division.py` tells which of the updates that were heard
-meanwhile are in what was read; while this is READING or OPENING, that has states of its own.
+over 32 MB, and small updates should not wait behind an image. `feed.py` draws the steps
+of a read, `division.py` says which of the updates that were heard meanwhile are in what was read.
 
 The second source of change is the server itself (CLIENT TRACKING): of each key that was read over the connection of the
-notices it says once that somebody has modified it, in order with notices and replies. That comes in as `changed`. What
+notices it says once that a client has modified it, in order with notices and replies. That comes in as `changed`. What
 was changed, and whether a notice has told of it already, the next snapshot shows, which also has the server tell of
-the next change. What a snapshot differs in from the copy, the notices in it applied, is told as `Stored`.
+the next change. What a snapshot differs in from the copy, the notices in it applied, is reported as `Stored`.
 
-- READING in order: a change that is told of before the reply was made before it, so the reply has it.
+- READING in order: a change that is reported before the reply was made before it, so the reply has it.
 - ARMING: of what is read over another connection the server would tell that one. So the keys are touched first over the
-  connection of the notices. What is told of between that and the snapshot may or may not be in it, so there is a look.
-- Attachments whose keys were not changed since they were read are not fetched again (`attachments.py`). In a snapshot
+  connection of the notices. What is reported between that and the snapshot may or may not be in it, so there is a look.
+- Attachments whose keys were not changed since they were read are not fetched again. In a snapshot
   that was taken aside they belong together with the rest only if no change of theirs comes before its fence.
 
 An update may be told early, before the server has it (`on_early`), to a copy that is CURRENT. The update itself
-confirms it, is recognized by its slot, and is not told again. What is not confirmed, or comes in between at the same
-place, has the place read, and told with a gap. After a read that begins for another reason the update is told again.
-`early.py` draws it.
+confirms it, is recognized by its slot, and is not reported again. What is not confirmed, or comes in between at
+the same place, has the place read, and reported with a gap. After a read that begins for another reason the update is
+reported again. `EarlyUpdates` draws it.
 """
 
 from __future__ import annotations
 
 import collections
 import math
+from collections.abc import Callable
 from enum import Enum, auto
+from functools import partial
 from typing import Any
 
 from ..errors import BadData, NotAllowed, RedisError, ReemError, WrongKind
-from ..plan import Plan, Reply
+from ..plan import Reply
 from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, show
 from ..plan.placeholders import Unreadable
 from ..plan.reads import look_first, read
-from ..plan.replies import decoded
 from ..plan.shapes import ShapeCache
 from ..plan.trees import MISSING, CannotApply, get
 from ..ships.registry import Ships
-from .attachments import HeldAttachments
-from .division import Division, Heard, Phase
-from .early import EarlyUpdates, Outcome
-from .events import (
-    Arm,
-    Failed,
-    Fence,
-    Look,
-    Open,
-    Output,
-    Read,
-    Ready,
-    Skipped,
-    Snapshot,
-    Stored,
-    Teller,
-    Told,
-    Updated,
-)
-from .gaps import GapDetector
+from .division import Heard, Phase
+from .events import EventMaker, Failed, Look, Output, Ready, Report, Skipped, Snapshot, Stored, Updated
+from .feed import Arm, Fence, KeyFeed, Open, Read, Step
 
 __all__ = [
     "Arm", "Failed", "Fence", "Look", "Open", "Output", "Read", "Ready", "Replica", "Skipped", "Snapshot", "State",
     "Stored", "Updated",
 ]  # fmt: skip
+
+
+_PATIENT = 3
+"""Notes, one a second, after which what was told early should have been confirmed: at least two seconds."""
+
+
+class Outcome(Enum):
+    """What an update says of those that were told early."""
+
+    NEW = auto()
+    """Nothing: it is to be taken as any other."""
+
+    CONFIRMED = auto()
+    """It is one of them."""
+
+    WRONG = auto()
+    """One of them is not what the server has, or in another order."""
 
 
 class State(Enum):
@@ -136,17 +137,12 @@ class Replica:
         self._ships = ships
         self._cache = cache
         self._largest = largest
-        self._gaps = GapDetector()
-        self._teller = Teller(self.path, self.rest, self.outputs)
-        self._tell = self._teller.update
-        self._number = 0  # of the last read: replies to others are too late
-        self._plan: Plan | None = None  # on its way
-        self._outcome: list[Reply] | Exception = []  # of the plan, while its fence is on its way
-        self._division: Division[Notice] = Division(self._gaps)
+        self._events = EventMaker(self.path, self.rest, self.outputs)
+        self._tell = self._events.update
+        self._feed: KeyFeed[Notice] = KeyFeed(keys)
+        self._division = self._feed.division
+        self._gaps = self._division.gaps
         self._begins = True  # nothing was read over this connection yet
-        self._tracked = False  # the server tells of what is changed
-        self._dirty = False  # something was changed that no snapshot which was asked for may have
-        self._attachments = HeldAttachments(self._keys)
         self._early = EarlyUpdates()
 
     def at(self, inner: Path = ()) -> Any:
@@ -156,21 +152,19 @@ class Replica:
     @property
     def is_current(self) -> bool:
         """Whether it is what the server has, as far as is known."""
-        return self.state is _CURRENT and not self._dirty
+        return self.state is _CURRENT and not self._feed.dirty
 
     # --- what happens to the connection
 
     def begin(self, *, initial: bool, tracked: bool = False, born: bool = False) -> None:
         """A connection that is subscribed begins: the first one, or one after a loss.
 
-        The key is just `born` if nothing was there a moment ago: what is there now is told as what changed. It is
+        The key is just `born` if nothing was there a moment ago: what is there now is reported as what changed. It is
         `tracked` if `changed` will be called for what is read over it and changed afterwards.
         """
-        self._division.begin(initial=initial or born)
+        self._feed.begin(initial=initial or born, tracked=tracked)
         self._begins = True
-        self._tracked, self._dirty = tracked, False
-        self._attachments.values.clear()
-        self._teller.begin(Told.UPDATES if born else Told.INITIAL if initial else Told.GAP)
+        self._events.begin(Report.UPDATES if born else Report.INITIAL if initial else Report.GAP)
         self._read()
 
     def begin_with(self, note: Reply) -> None:
@@ -178,14 +172,12 @@ class Replica:
         self._gaps.begin_with(note)
 
     def lost(self) -> None:
-        """The connection is gone: what is published from now on is not heard."""
         self.state = State.OFFLINE
         self._early.clear()
 
     # --- what is published
 
     def on_notice(self, notice: Notice) -> None:
-        """An update was published."""
         state = self.state
         if state is _OFFLINE:
             return
@@ -203,7 +195,7 @@ class Replica:
 
         Not to a copy that also follows what is stored: that is never ahead of the server.
         """
-        if self.state is not _CURRENT or self._tracked or not self._early.fits(notice):
+        if self.state is not _CURRENT or self._feed.tracked or not self._early.fits(notice):
             return
         if notice.value is ANNOUNCED or not concerns(notice, self.path) or not self._gaps.is_next(notice):
             return
@@ -219,7 +211,7 @@ class Replica:
         return outcome is not Outcome.NEW
 
     def unreadable(self) -> None:
-        """Something was published that could not be read."""
+        """A message could not be read."""
         if self.state is not State.OFFLINE:
             self._take(Heard(None, None))
 
@@ -242,39 +234,32 @@ class Replica:
         Args:
             key: Its name on the server, the document's or an attachment's; None for every key.
         """
-        if not self._tracked or self.state is State.OFFLINE:
-            return
-        is_covered = self._division.phase is Phase.IN_ORDER
-        if not self._attachments.change(key, covered=is_covered) or is_covered or self._dirty:
-            return
-        self._dirty = True
-        self._ask_to_look()
+        feed = self._feed
+        was_dirty = feed.dirty
+        if feed.tracked and self.state is not State.OFFLINE and feed.change(key) and not was_dirty:
+            self._ask_to_look()
 
     def _ask_to_look(self) -> None:
-        if self._dirty and self.state in _AT_REST:
+        if self._feed.dirty and self.state in _AT_REST:
             self.outputs.append(Look())
 
     def look(self) -> None:
-        """See what was changed, unless a snapshot was asked for since."""
-        if self._dirty and self.state in _AT_REST:
+        if self._feed.dirty and self.state in _AT_REST:
             self._read()
 
     def armed(self, number: int, error: Exception | None = None) -> None:
-        """The keys were touched, unless there was an `error`: what is changed from now on is told of."""
-        if number != self._number or self.state is not State.ARMING:
+        """The keys were touched, unless there was an `error`: changes are reported from now on."""
+        if number != self._feed.number or self.state is not State.ARMING:
             return
         if error is not None:
             self._fail(error)
-            return
-        assert self._plan is not None
-        self._division.asked(in_order=False)
-        self.state = State.READING
-        self.outputs.append(Read(number, self._plan))
+        else:
+            self._perform(self._feed.armed())
 
     def untracked(self, number: int) -> None:
-        """The user may not touch keys: from now on only what is published is told of."""
-        if number == self._number:
-            self._tracked = False
+        """The user may not touch keys: from now on only what is published is reported."""
+        if number == self._feed.number:
+            self._feed.tracked = False
             self.armed(number)
 
     def _take(self, heard: Heard[Notice]) -> None:
@@ -291,7 +276,6 @@ class Replica:
                 self._read_after(heard)
 
     def _apply(self, notice: Notice) -> None:
-        """Change the copy as an update says, or read what it does not say."""
         if not self._changes(notice):
             self._read_after(Heard(notice, 0))
 
@@ -318,80 +302,58 @@ class Replica:
 
     def _read(self) -> None:
         """Take a snapshot: it has all that has been heard of."""
-        self._number += 1
         self._early.read()
-        noted = (("GET", self._keys.last),)
+        keys, noted, held = self._keys, (("GET", self._keys.last),), self._feed.attachments.values
         try:
-            held = self._attachments.values
-            plan = read(self._keys, self.path, self._ships, self._cache, noted, held, self._largest, tolerant=True)
+            plan = read(keys, self.path, self._ships, self._cache, noted, held, self._largest, tolerant=True)
         except ReemError as error:
             self._fail(error)
         else:
-            self._send(look_first(plan, self._keys, self._cache))
+            self._perform(self._feed.read(look_first(plan, keys, self._cache)))
 
-    def _send(self, plan: Plan) -> None:
-        arms = plan.bulk and self._tracked
-        self._division.asked(in_order=arms or not plan.bulk)
-        self._plan, self.state = plan, State.ARMING if arms else State.READING
-        if self._tracked:
-            self._dirty = False
-            self._attachments.ask(plan)
-        asked = tuple(self._attachments.asked)
-        self.outputs.append(Arm(self._number, asked) if arms else Read(self._number, plan))
+    def _perform(self, step: Step) -> None:
+        self.state = (
+            State.ARMING if isinstance(step, Arm) else State.OPENING if isinstance(step, Open) else State.READING
+        )
+        self.outputs.append(step)
 
     def replies(self, number: int, outcome: list[Reply] | Exception) -> None:
         """What a plan brought; in order with notices, unless it is a `bulk` one."""
-        if not self._awaits(number, Phase.IN_ORDER, Phase.ASIDE):
-            return
-        note = outcome[-1][-1] if isinstance(outcome, list) and isinstance(outcome[-1], list) and outcome[-1] else None
-        if self._division.answered(note, fence=bool(self._attachments.values)):
-            self._decode(outcome)
-        else:
-            self._outcome = outcome
-            self.outputs.append(Fence(number))
+        if self._awaits(number, Phase.IN_ORDER, Phase.ASIDE):
+            self._go_on(outcome if isinstance(outcome, Exception) else partial(self._feed.answered, outcome))
 
     def fenced(self, number: int, error: Exception | None = None) -> None:
         """All that was published before the fence was asked for has arrived, unless there was an `error`."""
         if self._awaits(number, Phase.FENCING):
-            self._decode(error or self._outcome)
+            self._go_on(error or self._feed.fenced)
 
     def _awaits(self, number: int, *phases: Phase) -> bool:
-        return number == self._number and self.state is State.READING and self._division.phase in phases
+        return self.state is State.READING and self._feed.awaits(number, *phases)
 
-    def _decode(self, outcome: list[Reply] | Exception) -> None:
-        """Go on with a read: what is in it has arrived."""
-        assert self._plan is not None
+    def _go_on(self, outcome: Callable[[], Step | None] | Exception) -> None:
+        """Take the next step of a read; if it is not known which updates are in what was read, read again."""
         try:
             if isinstance(outcome, Exception):
                 raise outcome
-            result = decoded(self._plan, outcome)
+            step = outcome()
         except Exception as error:
             self._fail(error)
             return
-        finally:
-            self._outcome = []
-        if isinstance(result, Plan):
-            self._send(result)
-        elif self._division.divide(result.also[0]):
-            self.state, self._plan = State.OPENING, None
-            if self._tracked:
-                self._attachments.opening(result)
-            self.outputs.append(Open(self._number, result))
-        else:
+        if step is None:
             self._read()
+        else:
+            self._perform(step)
 
     def opened(self, number: int, tree: Any) -> None:
         """The ships have made a tree of a snapshot: it is the copy now.
 
         Tells of the updates that it has, then applies what came later.
         """
-        if number != self._number or self.state is not State.OPENING:
+        if number != self._feed.number or self.state is not State.OPENING:
             return
-        covered, later = self._division.take()
+        covered, later = self._feed.take()
         before, self.tree, self.state = self.tree, tree, State.CURRENT
-        if self._tracked:
-            self._attachments.opened()
-        self._teller.snapshot(before, tree, covered, stored=self._tracked)
+        self._events.snapshot(before, tree, covered, stored=self._feed.tracked)
         if self._begins:
             self._begins = False
             self.outputs.append(Ready())
@@ -400,23 +362,87 @@ class Replica:
         self._ask_to_look()
 
     def failed(self, number: int, error: Exception) -> None:
-        """The ships could not make a tree of a snapshot."""
-        if number == self._number and self.state is State.OPENING:
+        if number == self._feed.number and self.state is State.OPENING:
             self._fail(error)
 
     def _fail(self, error: Exception) -> None:
-        covered, later = self._division.give_up()
-        self._attachments.failed()
-        self._teller.miss(covered)
+        covered, later = self._feed.give_up()
+        self._events.miss(covered)
         self.state = State.UNREAD if isinstance(error, RedisError) else State.BROKEN
         self.outputs.append(Failed(error))
         if not self._begins and isinstance(error, BadData | WrongKind | NotAllowed):
             # The copy must not go on saying what was there before.
             before, self.tree = self.tree, Unreadable(show((self._keys.name, *self.path)), str(error))
             if self.tree != before:
-                self._teller.lose(self.tree)
-        if self._teller.told is not Told.INITIAL:
-            self._teller.told = Told.GAP
+                self._events.lose(self.tree)
+        if self._events.report is not Report.INITIAL:
+            self._events.report = Report.GAP
             for heard in later:  # newer than what could not be read
                 self._take(heard)
         self._ask_to_look()
+
+
+class EarlyUpdates:
+    """Updates that were told before the server had them, one of each publisher at most.
+
+            told()                                   settle(): the update itself comes
+        ----------> in the copy --------------------------------------------------------> confirmed, told already
+                       |  |                          settle(): something else comes first
+                       |  +-------------------------------------------------------------> wrong, told with a gap
+                       | read(): a snapshot takes the copy's place, and may not have it
+                       v
+                    awaited ------------------------------------------------------------> told again by its notice
+                          |                          settle(): something else comes first
+                          +-------------------------------------------------------------> wrong, told with a gap
+
+    In both states it is wrong, too, if it does not come for long (`overdue`): the server has refused it, or its
+    publisher is dead.
+    """
+
+    def __init__(self) -> None:
+        self._told: dict[str, Notice] = {}
+        self._in_copy: set[str] = set()
+        self._notes: dict[str, int] = {}  # that have come since each of them
+
+    def __bool__(self) -> bool:
+        return bool(self._told)
+
+    def fits(self, notice: Notice) -> bool:
+        """Return whether an update may be reported: its slot identifies it, and it depends on none of the others."""
+        return notice.slot is not None and notice.publisher not in self._told and not self._touches(notice)
+
+    def told(self, notice: Notice) -> None:
+        self._told[notice.publisher] = notice
+        self._notes[notice.publisher] = 0
+        self._in_copy.add(notice.publisher)
+
+    def settle(self, notice: Notice, missing: int) -> Outcome:
+        """Compare with an update that the server has, before which so many of its publisher are missing."""
+        early = self._told.pop(notice.publisher, None)
+        is_in_copy = notice.publisher in self._in_copy
+        self._in_copy.discard(notice.publisher)
+        self._notes.pop(notice.publisher, None)
+        if early is None:
+            return Outcome.WRONG if self._touches(notice) else Outcome.NEW
+        if missing != 0 or (early.sequence, early.slot, early.path) != (notice.sequence, notice.slot, notice.path):
+            return Outcome.WRONG
+        return Outcome.CONFIRMED if is_in_copy else Outcome.NEW
+
+    def overdue(self) -> bool:
+        """The server was asked for its note; return whether one of them should have been confirmed by now."""
+        for publisher in self._notes:
+            self._notes[publisher] += 1
+        return any(notes >= _PATIENT for notes in self._notes.values())
+
+    def read(self) -> None:
+        """A snapshot takes the place of the copy. It is reported without a gap as far as this goes."""
+        self._in_copy.clear()
+
+    def clear(self) -> None:
+        self._told.clear()
+        self._in_copy.clear()
+        self._notes.clear()
+
+    def _touches(self, notice: Notice) -> bool:
+        """Return whether what an update changes depends on whether one of these came before it."""
+        return any(concerns(notice, other.path) or concerns(other, notice.path) for other in self._told.values())

@@ -26,12 +26,12 @@ __all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "U
 
 
 class Link:
-    """A follower and the manager it is at: made by the first `follow`, anew after a fork or in another loop.
+    """A follower and the manager it is at: made by the first `follow`, and again after a fork or in another loop.
 
     Attributes:
-        told: Called with each state of the copy; see `Follower`.
-        closed: It was closed, and does not begin anew.
-        follower: Who follows, or has followed elsewhere; None before it has begun.
+        on_state: Called with each state of the copy; see `Follower`.
+        closed: It was closed, and does not begin again.
+        follower: The present one, or one of another process or loop; None before it has begun.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Link:
         self._stored = stored
         self._largest = largest
         self._heartbeat = heartbeat
-        self.told: Callable[[Any], None] = unnoticed
+        self.on_state: Callable[[Any], None] = unnoticed
         self._manager: SubscriptionManager | None = None
         self._following: asyncio.Lock | None = None
         self.closed = False
@@ -92,7 +92,7 @@ class Link:
                     largest=self._largest,
                     heartbeat=self._heartbeat,
                 )
-                self.follower.told = self.told
+                self.follower.on_state = self.on_state
                 self.follower.queues = self._queues
                 try:
                     await manager.follow(self.follower)
@@ -190,7 +190,7 @@ class SilentSubscriber(Following):
         """Begin to follow. When this returns, no later publish is missed. Idempotent; two or three round trips.
 
         Raises:
-            NotConnected: Nobody listens there.
+            NotConnected: No server listens there.
             InterfaceClosed: It was closed before.
         """
         await self._link.follow()
@@ -355,7 +355,7 @@ class CallbackSubscriber(SilentSubscriber):
             self._begin()
         await self._updates.listen()
         if self._calls is None:
-            # The manager keeps them though nobody may hold the subscriber: it works until the interface is closed.
+            # The manager keeps them: a subscriber that the program does not hold works until the interface is closed.
             self._calls = Calls(self._caller(), self._updates, manager.callers)
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -39,7 +39,7 @@ class Subscribing:
         self._transport = transport
         self._host = host
         self._on_confirmed = confirmed
-        self._invited: set[Topic] = set()  # publishers of this host know that somebody listens
+        self._invited: set[Topic] = set()  # publishers of this host know of a listener
 
     async def subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
         """Subscribe and wait until the server has confirmed each topic; raise the first refusal."""
@@ -68,13 +68,12 @@ class Subscribing:
             answer.set_result(None)
 
     def invite(self, wire: Wire, topic: Topic) -> None:
-        """Have publishers of this host know that somebody looks into their memory; a refusal means that they do not."""
+        """Have publishers of this host know that a listener reads their memory; a refusal means that they do not."""
         if self._host:
             self._invited.add(topic)
             wire.send([self._command(self._near(topic))], lambda _: None)
 
     def leave(self, wire: Wire | None, topic: Topic) -> None:
-        """Unsubscribe, if there is a connection still."""
         left = [topic, self._near(topic)] if topic in self._invited else [topic]
         self._invited.discard(topic)
         if wire is None or not wire.alive:
@@ -92,12 +91,11 @@ class Subscribing:
         return f"{self._prefix(topic)}SUBSCRIBE", topic.name
 
     def _prefix(self, topic: Topic) -> str:
-        """Return what the server's commands for this kind of topic begin with."""
         return "P" if topic.pattern else "S" if self._transport.sharded else ""
 
 
 class Invalidations:
-    """Turns the server's messages on; who may not have them is warned, once for each interface."""
+    """Turns the server's messages on; a user without the right is warned, once for each interface."""
 
     def __init__(self) -> None:
         self._warned = False
@@ -106,7 +104,7 @@ class Invalidations:
         """Have the server tell of changes of what is read over a connection; at most one round trip.
 
         Raises:
-            ServerNotReady: It answers nobody now; to be tried again.
+            ServerNotReady: It answers no client now; to be tried again.
         """
         if wire.tracked is not None:
             return
@@ -143,7 +141,6 @@ class Invalidations:
         return not refused
 
     def may_not_touch(self, wire: Wire, refusal: Exception) -> None:
-        """Take it that the user may not read keys so, and warn."""
         self._refused(wire, blamed(refusal, ("TYPE",)), "+type")
 
     def _refused(self, wire: Wire, reason: Exception, right: str) -> None:
@@ -167,8 +164,8 @@ class Heartbeats:
 
     Args:
         tasks: Where the looks run.
-        listeners: Returns who listens over a connection.
-        forget: Called every second: forgets what nobody listens to any more, and returns who is left.
+        listeners: Returns the listeners over a connection.
+        forget: Called every second: forgets topics without listeners, and returns the listeners that are left.
         answered: Called when a connection has answered.
         on_note: Called with a listener and the server's note for it, or an error of the server.
     """
@@ -190,11 +187,9 @@ class Heartbeats:
         self._beating: dict[Wire, asyncio.Task[Any]] = {}
 
     def start(self, wire: Wire) -> None:
-        """Look at a new connection."""
         self._beating[wire] = self._tasks.start(self._beat(wire), "reem heartbeat")
 
     def lost(self, wire: Wire) -> None:
-        """A connection is gone; its task ends by itself."""
         self._beating.pop(wire, None)
 
     def limit_period(self, seconds: float) -> None:
@@ -229,7 +224,6 @@ class Heartbeats:
         return min([_PERIOD, *(listener.heartbeat for listener in self._forget())])
 
     def _notes(self, wire: Wire) -> list[str]:
-        """Return the notes to ask for."""
         return sorted({listener.note for listener in self._listeners(wire) if listener.note is not None})
 
     def _probe(self, wire: Wire, now: float) -> None:

@@ -21,7 +21,7 @@ from ...pubsub.division import Division, Heard, divided_read
 from ...pubsub.gaps import GapDetector
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...session import Session
-from ..recording.fetch import fetch
+from ..recording.key_reader import fetch
 from .history import History
 from .partial_reads import noted_text
 from .timeline import PENDING
@@ -84,7 +84,7 @@ class Fetcher:
 
     Attributes:
         behind: Keys with an announcement that has not been answered.
-        finished: Keys of which something was read; whoever wants to know empties it before.
+        finished: Keys of which something was read; the reader of it empties it before.
         failed: Called with a key of which something could not be read, and may be later.
     """
 
@@ -134,12 +134,10 @@ class Fetcher:
             self._news.set()
 
     def heard(self, event: Event) -> None:
-        """Take notice of an update, whatever it is."""
         if event.name == self._name:
             hear(self._division, event)
 
     async def run(self) -> None:
-        """Read what is wanted, for ever."""
         while True:
             path, with_arrays = await self._next()
             try:
@@ -221,14 +219,14 @@ def _array_bytes(tree: Any) -> int:
 
 
 def reading_after(note: str) -> Division[Event]:
-    """Return what tells the updates that are in what is read from those that are not, given the last one's note."""
+    """Return what divides the updates around a read, given the note of the last one before it."""
     division: Division[Event] = Division(GapDetector(_RECENT))
     division.gaps.begin_with(note.encode())
     return division
 
 
 def hear(division: Division[Event], event: Event) -> None:
-    """Take notice of an update of what is read."""
+    """Note an update of what is being read."""
     if division.gaps.count(event) is not None:
         division.hear(Heard(event, None if event.gap else 0))
 

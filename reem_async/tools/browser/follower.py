@@ -16,9 +16,10 @@ from ...errors import RedisError, ReemError
 from ...plan.notices import note_of
 from ...plan.paths import Path
 from ...plan.trees import MISSING
+from ...pubsub.finder import find_regularly, present_keys
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event, Monitor
-from ...store.catalog import names
+from ...pubsub.refresh import BACKGROUND_RATE
 from .fetcher import Allowance, Fetcher
 from .history import History
 from .stored_changes import StoredChanges
@@ -27,14 +28,6 @@ __all__ = ["Follower"]
 
 _WAITING = 50_000
 """Updates that wait for this program before the oldest are skipped."""
-
-_FIND_SECONDS = 1.0
-"""Seconds between looks for keys that somebody has stored."""
-_FIND_PAUSE = 10
-"""Times what such a look took, at least, until the next: as in a recording."""
-
-_READ_BYTES = 8 << 20
-"""Bytes of arrays a second that are read for the past: four pictures a second each of two cameras."""
 
 # Keys whose last notice is remembered.
 _MOST_HEARD = 100_000
@@ -70,14 +63,14 @@ class Follower:
         self._interface = interface
         self._history = history
         allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
-        arrays = Allowance(_READ_BYTES, history.budget / 2)
+        arrays = Allowance(BACKGROUND_RATE, history.budget / 2)  # four pictures a second each of two cameras
         session = interface.session
         self._fetcher = Fetcher(session, history, arrays, self._last_note, self._fence, self._touch)
         self._stored = StoredChanges(
             session, history, self._fetcher, allowance, self._last_note, self._pump, self._fence
         )
         self._monitor = Monitor(interface, policy=Last(_WAITING))
-        self._fetcher.failed = self._monitor.doubted = self._stored.doubt
+        self._fetcher.failed = self._monitor.invalidated = self._stored.doubt
         self._monitor.broken, self._monitor.changed = self._stored.lost, self._stored.changed
         self._tasks: list[asyncio.Task[None]] = []
         self._heard: dict[str, Heard] = {}
@@ -91,13 +84,12 @@ class Follower:
         await self._interface.initialize()
         await self._monitor.listen()
         await self._monitor.watch_changes()
-        self.names = sorted([name async for name in names(self._interface)])
+        self.names = sorted(await self._present())
         self._stored.begin(self.names)
-        for work in (self._follow(), self._fetcher.run(), self._stored.run(), self._go_on_finding()):
+        for work in (self._follow(), self._fetcher.run(), self._stored.run(), find_regularly(self._search)):
             self._tasks.append(asyncio.create_task(work))
 
     async def close(self) -> None:
-        """End."""
         tasks, self._tasks = self._tasks, []
         for task in tasks:
             task.cancel()
@@ -107,16 +99,16 @@ class Follower:
 
     @property
     def skipped(self) -> int:
-        """How many updates came too fast to be taken."""
+        """How many updates were dropped because they came too fast."""
         return self._monitor.dropped
 
     @property
     def hears_of_changes(self) -> bool:
-        """Whether no server has refused to tell which keys are changed."""
+        """Whether no server has refused to report which keys are changed."""
         return manager_of(self._interface.session).hears_of_changes
 
     def is_told(self, name: str) -> bool:
-        """Return whether the server tells when the arrays of a key are changed."""
+        """Return whether the server reports changes of the arrays of a key."""
         return self._stored.is_told(name)
 
     def is_shared(self, name: str) -> bool:
@@ -130,17 +122,16 @@ class Follower:
             self._take(event)
 
     async def _fence(self) -> None:
-        """Take all that was published before now."""
+        """Take all updates that were published before now."""
         await manager_of(self._interface.session).fence()
         self._pump()
 
     def _pump(self) -> None:
-        """Take what has arrived already."""
+        """Take the updates that have arrived already."""
         for event in arrived(self._monitor):
             self._take(event)
 
     async def _touch(self, path: Path, tree: Any) -> None:
-        """Have the server tell of the next change of the arrays at a path."""
         await self._stored.touch(path, tree)
 
     def _take(self, event: Event) -> None:
@@ -182,18 +173,17 @@ class Follower:
 
     # --- which keys there are
 
-    async def _go_on_finding(self) -> None:
-        """Look for new keys every second, and among very many less often."""
-        while True:
-            await asyncio.sleep(_FIND_SECONDS)
-            began = time.monotonic()
-            try:
-                await self._find()
-            except (RedisError, ReemError, OSError) as error:
-                self.lost = str(error)
-            else:
-                self.lost = self._ended()
-                await asyncio.sleep(_FIND_PAUSE * (time.monotonic() - began))
+    async def _search(self) -> bool:
+        try:
+            await self._find()
+        except (RedisError, ReemError, OSError) as error:
+            self.lost = str(error)
+        else:
+            self.lost = self._ended()
+        return True
+
+    async def _present(self) -> set[str]:
+        return await present_keys(self._interface.session, ["*"])
 
     def _ended(self) -> str:
         """Return why following ended, if it did: what is shown would no longer be news."""
@@ -201,9 +191,8 @@ class Follower:
         return f"following ended: {ended[0].exception()!r}" if ended else ""
 
     async def _find(self) -> None:
-        """Look which keys there are: nothing else tells of new ones that are only stored."""
         before = set(self.names)
-        present = {name async for name in names(self._interface)}
+        present = await self._present()
         # The list may be older than what was heard meanwhile.
         present.update(set(self.names) - before)
         self.names = sorted(present)

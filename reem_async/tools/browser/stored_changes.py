@@ -16,13 +16,14 @@ from itertools import islice, takewhile
 from typing import Any
 
 from ...errors import BadData, RedisError, ReemError
+from ...plan import Reply
 from ...plan.paths import Path, below
 from ...plan.placeholders import Unreadable, marked
 from ...plan.trees import MISSING
-from ...pubsub.division import Division
+from ...pubsub.division import Division, divided_reads
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
-from ...pubsub.refresh import RefreshTimer
+from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
 from .addresses import is_addressable
 from .fetcher import Allowance, Fetcher, hear, reading_after, rebased
@@ -39,14 +40,10 @@ _REST = 4
 """How many times as long as reading documents took none are read: others ask the server, and this program, too."""
 _PAUSE = 0.1
 """Seconds after a read that failed."""
-_LOOK_BYTES = 8 << 20
-"""Bytes of documents a second that are read, a quarter of them of one."""
+_SHARE = 4
+"""A key may take one in so many of the bytes that are read."""
 _LARGE = 1 << 18
 """Bytes of a document from which it is part of the past only as far as there is an allowance."""
-_QUICKEST, _SLOWEST = 0.02, 0.5
-"""Seconds from a change that a notice came with to the look for what was stored besides; see `RefreshTimer`."""
-_PATIENCE = 0.015
-"""Seconds in which the notice of a change is taken."""
 
 
 class StoredChanges:
@@ -92,12 +89,12 @@ class StoredChanges:
     # --- what is heard
 
     def begin(self, present: Iterable[str]) -> None:
-        """Read the keys that there are at the beginning: what they hold is no change."""
+        """Read the keys that are there at the beginning: what they hold is no change."""
         self._unseen.update(present)
         self.listed(self._unseen, ())
 
     def listed(self, present: Iterable[str], gone: Iterable[str]) -> None:
-        """Read those of the keys there are that the server does not tell of, and those that are gone."""
+        """Read the present keys that the server does not report, and those that are gone."""
         untold = [name for name in present if self._document(name) not in self._told]
         self._read_soon([*untold, *gone])
 
@@ -106,11 +103,10 @@ class StoredChanges:
         return name not in self._unseen
 
     def is_told(self, name: str) -> bool:
-        """Return whether the server tells when the arrays of a key are changed, as far as they are known."""
+        """Return whether the server reports changes of the known arrays of a key."""
         return self._arrays.get(name, {}).keys() <= self._told
 
     def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed, by its name there; None for every key."""
         self._pump()  # a notice that came before is of an earlier change
         if key is None:
             self.lost()
@@ -121,11 +117,10 @@ class StoredChanges:
         if key in self._arrays.get(name, ()):
             self._changed.add(key)
         elif key != self._document(name):
-            return  # somebody else's on this connection
+            return  # another listener's on this connection
         self._ask(name)
 
     def heard(self, event: Event) -> None:
-        """Take notice of a published update."""
         name, arrays = event.name, self._arrays.get(event.name, {})
         if name in self._reading:
             hear(self._reading[name], event)
@@ -133,7 +128,7 @@ class StoredChanges:
             self._looks[name].heard += 1
         for key in arrays.keys() - self._told:
             if below(arrays[key], event.path) or below(event.path, arrays[key]):
-                # It is touched before it is fetched. Else it may have been stored anew behind the update already.
+                # It is touched before it is fetched. Else it may have been stored again behind the update already.
                 (self._changed.discard if event.value is ANNOUNCED else self._changed.add)(key)
         if event.gap:
             self.doubt(name)
@@ -146,7 +141,7 @@ class StoredChanges:
         self._ask(name)
 
     def lost(self) -> None:
-        """Note that nobody knows what was changed: there is no connection that it is told on."""
+        """Note that changes may be unknown: the connection that reports them is lost."""
         self._told.clear()
         for arrays in self._arrays.values():
             self._changed.update(arrays)
@@ -157,7 +152,7 @@ class StoredChanges:
     def _ask(self, name: str) -> None:
         """Have a key read when its next look is due."""
         if name not in self._looks:
-            self._looks[name] = RefreshTimer(self, lambda it: it._read_soon([name]), _QUICKEST, _SLOWEST, _PATIENCE)
+            self._looks[name] = RefreshTimer(self, lambda it: it._read_soon([name]), BACKGROUND)
         self._looks[name].ask()
 
     def _read_soon(self, names: Iterable[str]) -> None:
@@ -167,7 +162,6 @@ class StoredChanges:
     # --- what is read
 
     async def run(self) -> None:
-        """Read what is due, for ever."""
         while True:
             await self._news.wait()
             self._news.clear()
@@ -182,25 +176,24 @@ class StoredChanges:
                     await asyncio.sleep(_PAUSE)
                 took = time.monotonic() - began
                 # At the beginning the page waits for it; what it asks for goes first.
-                await asyncio.sleep(0.002 if self._unseen else max(_REST * took, size / _LOOK_BYTES))
+                await asyncio.sleep(0.002 if self._unseen else max(_REST * took, size / BACKGROUND_RATE))
 
     def close(self) -> None:
-        """Look no more."""
         for looks in self._looks.values():
             looks.cancel()
 
     async def touch(self, path: Path, tree: Any) -> None:
-        """Have the server tell of the next change of the arrays in what is about to be read at a path."""
+        """Have the server report the next change of the arrays in what is about to be read at a path."""
         name = str(path[0])
         self._arrays.setdefault(name, {}).update(self._arrays_in(path, tree))
         await self._touch(name)
 
     async def _touch(self, name: str) -> None:
-        """Have the server tell of the next change of a key and its arrays."""
+        """Have the server report the next change of a key and its arrays."""
         asked = {self._document(name), *self._arrays.get(name, ())} - self._told
         if asked:
             keys = self._session.keys(name)
-            # In order with what is told: what it says of a key before that is of an earlier change.
+            # In order with reports: a report before that is of an earlier change.
             if not await manager_of(self._session).touch(keys.channel, asked, lambda: self._told.update(asked)):
                 self._told -= asked | {keys.document}
 
@@ -215,21 +208,22 @@ class StoredChanges:
         await asyncio.gather(*[self._touch(name) for name in names])
         self._fetcher.finished.clear()
         self._reading = divisions = {name: reading_after(self._last_note(name)) for name in names}
-        try:
+
+        async def read() -> list[tuple[bytes | None, Reply] | None]:
             for division in divisions.values():
                 division.asked(in_order=False)
-            found = dict(zip(names, await noted_texts(self._session, [(name,) for name in names]), strict=True))
-            unheard = [name for name, it in found.items() if it and not divisions[name].answered(it[1])]
-            if unheard:
-                await self._fence()
+            return await noted_texts(self._session, [(name,) for name in names])
+
+        try:
+            found = await divided_reads([*divisions.values()], read, self._fence)
         finally:
             self._reading = {}
-        for name, it in found.items():
+        for name, it in zip(names, found, strict=True):
             size = len(it[0] or b"") if it else 0
             if name in self._looks:
-                self._looks[name].earliest = asyncio.get_running_loop().time() + 4 * size / _LOOK_BYTES
-            # What it has of what is being fetched, nobody knows.
-            if it is None or not divisions[name].divide(it[1]) or self._fetcher.concerns(name):
+                self._looks[name].earliest = asyncio.get_running_loop().time() + _SHARE * size / BACKGROUND_RATE
+            # It is not known what it has of what is being fetched.
+            if it is None or self._fetcher.concerns(name):
                 self._ask(name)
                 continue
             later = [each.update for each in divisions[name].take()[1] if each.update is not None]
@@ -240,10 +234,10 @@ class StoredChanges:
             self._unseen.discard(name)
             if it[0] is None:
                 self._let_go(name)
-        return sum([len(it[0] or b"") for it in found.values() if it])
+        return sum([len(it[0] or b"") for it in found if it])
 
     def _let_go(self, name: str) -> None:
-        """Keep nothing of a key that is gone. If it comes again the server tells once, or it is listed as a new one."""
+        """Keep nothing of a key that is gone. If it comes again the server reports it, or it is listed as a new one."""
         self._told.discard(self._document(name))
         if name in self._looks and not self._looks[name].due:
             del self._looks[name]
@@ -282,7 +276,7 @@ class StoredChanges:
             self._looks[name].found()
 
     def _changed_in(self, name: str, arrays: dict[str, Path]) -> list[Path]:
-        """Take note of a key's arrays; return where those are that were stored anew, which are to be read."""
+        """Note a key's arrays; return where those are that were stored again and must be read."""
         before = self._arrays.pop(name, {}).keys()
         if arrays:
             self._arrays[name] = arrays
@@ -291,7 +285,7 @@ class StoredChanges:
         new = arrays.keys() - before
         if new and self._document(name) in self._told:
             self._ask(name)  # the server is to tell of them too
-        if name not in self._unseen:  # they may have been stored anew since they were published
+        if name not in self._unseen:  # they may have been stored again since they were published
             self._changed |= new
         # Those that were touched since: the next change of the others would be missed.
         changed = [key for key in arrays if key in self._changed and key in self._told]

@@ -87,7 +87,7 @@ class KeyQueue:
         return skipped(head) if head.role == Role.UPDATE else head
 
     def asked(self) -> None:
-        """What the first item asks for is being read from now on."""
+        """The read for the first item begins."""
         self._line = self.order
         self.division.asked(in_order=False)
 
@@ -99,7 +99,7 @@ class KeyQueue:
         covered, _ = self.division.take()
         line, loss = self._line, -1
         for heard in covered:
-            if heard.update is None:  # the note names an update that was lost: who knows what it has changed
+            if heard.update is None:  # the note names an update that was lost, which may have changed anything
                 loss = line
             else:
                 line = max(line, heard.update.order)

@@ -18,11 +18,10 @@ from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...pubsub.monitor import ANNOUNCED, Event
-from ...pubsub.refresh import RefreshTimer
+from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
-from .fetch import Fetched
 from .key_queue import KeyQueue
-from .key_reader import KeyReader
+from .key_reader import Fetched, KeyReader
 from .order import Item
 from .roles import Kind, Role
 from .stored import pruned
@@ -40,16 +39,10 @@ _LET_PASS = 0.004
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
 _FAST = 20_000_000
 """Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
-_READ_RATE = 8e6
-"""Bytes a second of each key that are read for what is only stored."""
-_QUICKEST, _SLOWEST = 0.02, 0.5
-"""Seconds from a change that a notice came with to the look for what was stored besides; see `RefreshTimer`."""
-_PATIENCE = 0.015
-"""Seconds in which the notice of a change is taken: longer than those for which updates wait for each other."""
 
 
 class Collector(Protocol):
-    """What a key recorder needs of the recorder."""
+    """What is needed of the recorder, which imports this module."""
 
     session: Session
     writer_thread: WriterThread
@@ -58,28 +51,23 @@ class Collector(Protocol):
     patterns: list[Pattern]
     fetching: asyncio.Semaphore
 
-    async def fence(self) -> None:
-        """Wait until everything published before now has been handed to the key recorders."""
+    async def fence(self) -> None: ...
 
-    def look_for_losses(self) -> None:
-        """Note it if updates were dropped that nobody had taken yet."""
+    def look_for_losses(self) -> None: ...
 
-    def hurry(self) -> None:
-        """Look more often at what was published: large updates come fast."""
+    def hurry(self) -> None: ...
 
-    def failed(self, error: Exception) -> None:
-        """End the recording: something went wrong that should not."""
+    def failed(self, error: Exception) -> None: ...
 
     @property
-    def hears_of_changes(self) -> bool:
-        """Whether the server tells which keys are changed."""
+    def hears_of_changes(self) -> bool: ...
 
 
 class KeyRecorder:
     """The updates of one top-level key.
 
     Args:
-        collector: The recorder.
+        collector: The recording.
         name: The key.
 
     Attributes:
@@ -102,7 +90,7 @@ class KeyRecorder:
         self.busy: asyncio.Task[None] | None = None
         self.news = False
         self.absent = False
-        self.looks = RefreshTimer(self, KeyRecorder._look, _QUICKEST, _SLOWEST, _PATIENCE)
+        self.looks = RefreshTimer(self, KeyRecorder._look, BACKGROUND)
 
     @property
     def is_over(self) -> bool:
@@ -110,7 +98,6 @@ class KeyRecorder:
         return self.absent and self.busy is None and not self._queue.items and not self.looks.due
 
     def on_event(self, event: Event) -> None:
-        """Take one update."""
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
         stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
         self.news = self.news or len(event.path) == 1
@@ -128,31 +115,29 @@ class KeyRecorder:
             self._add(Item(role, event.path, event.value, stamp, self._queue.order, event.size))
 
     def lost(self, missed: int | None) -> None:
-        """Note that updates were lost, and read the key anew."""
+        """Note that updates were lost, and read the key again."""
         self._reader.forget()
         self._queue.order += 1
         self._add(self._item(Role.GAP, missed))
         self.read()
 
     def read(self) -> None:
-        """Read the whole key from the server, if that is not about to happen anyway."""
+        """Read the whole key from the server, unless such a read is pending."""
         self._known = True
         self._queue.doubt()
         if not self._queue.will_read(Role.STATE):
             self._add(self._item(Role.STATE, ANNOUNCED))
 
     def follow(self) -> None:
-        """See to it that the server tells what is changed; what was stored until then is looked for."""
-        if not self._reader.told and self._collector.hears_of_changes:
+        """Have the server report changes; what was stored until then is looked for."""
+        if not self._reader.feed.tracked and self._collector.hears_of_changes:
             self.looks.ask()
 
     def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed, the document's or an attachment's; None for every key."""
         if self._reader.changed(key):
             self.looks.ask()
 
     def _look(self) -> None:
-        """See what was changed."""
         written = self._collector.writer_thread.stored
         if self._name in written:  # by the last look
             written.discard(self._name)
@@ -182,7 +167,6 @@ class KeyRecorder:
             self.busy = started(self._drain(), f"reem record {self._name}")
 
     def _emit(self, item: Item) -> None:
-        """Hand an item to the writing thread."""
         role, value = item.role, item.value
         if not self._whole and role in (Role.STATE, Role.STORED, Role.UPDATE, Role.FOUND):
             value = value if value is MISSING else pruned(value, item.path, self._collector.patterns)
@@ -192,20 +176,20 @@ class KeyRecorder:
             self._collector.writer_thread.counts.skip(item.path)
         if role in (Role.STATE, Role.STORED, Role.UPDATE, Role.DELETE) and (role != Role.DELETE or len(item.path) == 1):
             self.absent = role == Role.DELETE or value is MISSING
-        kind = Kind.STORED if role == Role.STORED else Kind.READ  # read: nobody knows who wrote it
+        kind = Kind.STORED if role == Role.STORED else Kind.READ  # read: its writer is unknown
         kind = Kind.PUBLISHED if item.changes else kind
         if not self._collector.writer_thread.put(Operation(role, item.path, value, item.stamp, kind), item.size):
             self._reader.forget()
 
     async def _drain(self) -> None:
-        """Emit what waits, in order, fetching what has to be."""
+        """Emit what waits, in order, and fetch values that were only announced."""
         try:
             while self._queue.items:
                 for item in self._queue.ready():
                     self._emit(item)
                 if self._queue.items and not await self._fetched(self._queue.items[0]):
                     await asyncio.sleep(_PAUSE)
-        except Exception as error:  # nobody waits for this task: the recording must not go on as if nothing were
+        except Exception as error:  # no call waits for this task: the recording must not go on without it
             self._collector.failed(error)
         finally:
             self.busy = None
@@ -222,14 +206,13 @@ class KeyRecorder:
             return False
         self._complaint = ""
         if head.is_whole:
-            self.looks.earliest = asyncio.get_running_loop().time() + found.size / _READ_RATE
+            self.looks.earliest = asyncio.get_running_loop().time() + found.size / BACKGROUND_RATE
         self._collector.look_for_losses()  # what it has of them was published
         if self._queue.settle(found.value, found.size):
             self.read()
         return True
 
     async def _read(self, head: Item) -> Fetched:
-        """Read what the first item announces."""
         if head.role == Role.STATE:
             self._reader.forget()
         if head.is_whole:
@@ -246,7 +229,7 @@ class KeyRecorder:
         await asyncio.sleep(let_pass - collector.clock.since(head.stamp[0]))
 
     def _give_up(self, head: Item, error: Exception) -> None:
-        """Leave out what cannot be fetched; the key is read anew later: soon, or at a keyframe if it is no value."""
+        """Leave out what cannot be fetched; the key is read again later: soon, or at a keyframe if it is no value."""
         if self._complaint != str(error):
             logger.warning("%s could not be read and is not recorded: %s", show(head.path), error)
         self._complaint = str(error)

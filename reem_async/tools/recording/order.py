@@ -43,7 +43,6 @@ class Item:
 
     @property
     def deleted(self) -> bool:
-        """What was there is gone."""
         return self.role == Role.DELETE
 
     @property
@@ -58,7 +57,7 @@ class Item:
 
     @property
     def changes(self) -> bool:
-        """Whether somebody published a change of the key, known or not; a gap stands for whatever was lost in it."""
+        """Whether a change of the key was published, known or not; a gap stands for all that was lost in it."""
         return self.role in (Role.UPDATE, Role.DELETE, Role.SKIP, Role.GAP)
 
 
@@ -71,7 +70,6 @@ def is_replaced(items: Iterable[Item]) -> bool:
 
 
 def skipped(item: Item) -> Item:
-    """Return that an update cannot be recorded."""
     return dataclasses.replace(item, role=Role.SKIP, value=None, size=0)
 
 
@@ -116,14 +114,14 @@ def _outcome(item: Item, found: Any, size: int, later: Sequence[Item]) -> list[I
     if is_own(item.path, later):
         if found is not MISSING:
             return [dataclasses.replace(item, value=found, size=size)]
-        # The server refused it, or what it wrote was removed by somebody who does not publish.
+        # The server refused it, or what it wrote was removed by a client that does not publish.
         return [skipped(item), _found(item, item.path, MISSING, 0)]
     rest = rest_of(found, item.path, later).value
     return [skipped(item)] if rest is MISSING else [skipped(item), _found(item, item.path, rest, size)]
 
 
 def _found(item: Item, path: Path, value: Any, size: int) -> Item:
-    """Return what is known to be at a path behind an update, though nobody published it like that."""
+    """Return what is known to be at a path behind an update, though it was not published like that."""
     return Item(Role.FOUND, path, value, (item.stamp[0], item.stamp[1], 0), item.order, size)
 
 

@@ -6,9 +6,8 @@ import asyncio
 import time
 from collections.abc import Sequence
 
-from ...connection import RedisInterface
 from ...plan.paths import Pattern
-from ...store.catalog import names
+from ...pubsub.finder import present_keys
 from .key_recorder import Collector, KeyRecorder
 
 __all__ = ["RecordedKeys"]
@@ -22,41 +21,31 @@ class RecordedKeys:
 
     Args:
         collector: The recorder.
-        interface: The server.
         patterns: What is recorded of all that is published.
     """
 
-    def __init__(self, collector: Collector, interface: RedisInterface, patterns: Sequence[Pattern]) -> None:
+    def __init__(self, collector: Collector, patterns: Sequence[Pattern]) -> None:
         self._collector = collector
-        self._interface = interface
         self._patterns = patterns
         self.tops = list(dict.fromkeys(pattern.top for pattern in patterns))
         self._recorders: dict[str, KeyRecorder] = {}
         self._over: set[str] = set()  # keys that were gone at the last keyframe
 
     def of(self, name: str) -> KeyRecorder:
-        """Return what records a key; made when first asked for."""
         recorder = self._recorders.get(name)
         if recorder is None:
             recorder = self._recorders[name] = KeyRecorder(self._collector, name)
         return recorder
 
     def concerns(self, name: str) -> bool:
-        """Return whether the key is recorded, or a part of it."""
         return any(pattern.concerns((name,)) for pattern in self._patterns)
 
     async def present(self) -> set[str]:
-        """Return the keys there are, of those that are recorded."""
-        found: set[str] = set()
-        for top in self.tops:
-            if "*" in top or "?" in top:
-                found.update([name async for name in names(self._interface, top)])
-            else:
-                found.add(top)
-        return found
+        """Return the keys there are, of those that are recorded; those that are recorded by name always."""
+        globs = {top for top in self.tops if "*" in top or "?" in top}
+        return {*self.tops} - globs | await present_keys(self._collector.session, globs)
 
     def changed(self, key: str | None) -> None:
-        """Take the server's word that a key was changed, by its name there; None for every key."""
         if key is None:
             for recorder in self._recorders.values():
                 recorder.changed(None)
@@ -67,28 +56,27 @@ class RecordedKeys:
             self._recorders[name].changed(key)
 
     def follow(self, present: set[str]) -> None:
-        """Have the server tell of keys that are there and that it does not tell of yet: they have come to be."""
+        """Have the server report changes of keys that are there and that it does not report yet."""
         for name in present:
             if self.concerns(name):
                 self.of(name).follow()
 
     def be_due(self) -> None:
-        """Have every key be read when somebody looks next, however much was read of it of late."""
+        """Let the next look read every key, however much was read of it of late."""
         for recorder in self._recorders.values():
             recorder.looks.earliest = 0.0
 
     def look_at_once(self) -> None:
-        """Look now where a look is due."""
         for recorder in self._recorders.values():
             recorder.looks.now()
 
     def lost(self) -> None:
-        """Note that updates of any key may be lost, and read all keys anew."""
+        """Note that updates of any key may be lost, and read all keys again."""
         for recorder in self._recorders.values():
             recorder.lost(None)
 
     async def settled(self, patience: float) -> None:
-        """Wait until nothing is being fetched, but not for ever."""
+        """Wait until no key is being fetched, at most so many seconds."""
         deadline = time.monotonic() + patience
         while (
             busy := [recorder.busy for recorder in self._recorders.values() if recorder.busy]
@@ -96,14 +84,13 @@ class RecordedKeys:
             await asyncio.wait(busy, timeout=deadline - time.monotonic())
 
     def cancel(self) -> None:
-        """Fetch nothing more."""
         for recorder in self._recorders.values():
             recorder.looks.cancel()
             if recorder.busy is not None:
                 recorder.busy.cancel()
 
     def read_silent(self, present: set[str]) -> None:
-        """Read keys that were not published as a whole since the last keyframe: somebody may have stored something.
+        """Read keys that were not published as a whole since the last keyframe: they may have been stored.
 
         Args:
             present: The keys there are.
@@ -118,12 +105,10 @@ class RecordedKeys:
                 recorder.read()
 
     def forget_news(self) -> None:
-        """Take all keys for ones of which nothing was published."""
         for recorder in self._recorders.values():
             recorder.news = False
 
     def keyframe(self, number: int) -> None:
-        """Write the whole of all keys as the recording has it."""
         self._let_go()
         for recorder in self._recorders.values():
             recorder.keyframe(number)

@@ -24,6 +24,7 @@ from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, parse_patterns
+from ...pubsub.finder import find_regularly
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...session import Session
@@ -39,14 +40,10 @@ from .writer_thread import Operation, WriterThread
 
 __all__ = ["Recorder", "RecorderStatus", "description"]
 
-# Seconds between looks at keyframes that are due, the disk, and keys that must be read anew.
+# Seconds between looks at keyframes that are due, the disk, and keys that must be read again.
 _TICK = 0.1
 # Updates that may wait for the event loop: 25 seconds at 2 kHz.
 _WAITING = 50_000
-_FIND_SECONDS = 1.0
-"""Seconds between looks for keys that somebody has stored."""
-_FIND_PAUSE = 10
-"""Times what such a look took, at least, until the next: a server with a million keys is asked for a thousand pages."""
 # Large values that are fetched at the same time: more would not be faster, and be more memory.
 _FETCHES = 8
 _PATIENCE = 3.0
@@ -93,10 +90,10 @@ class Recorder:
     A large one that others changed inside before it was fetched is skipped, and counted; what is left of it is
     recorded as found, so that the updates inside of it have their place. At the
     beginning, every `keyframe` seconds and after each gap the whole of the keys is written, so that any
-    instant can be rebuilt quickly. Nobody who publishes waits for the recorder. What it cannot keep up with it drops,
+    instant can be rebuilt quickly. No publisher waits for the recorder. What it cannot keep up with it drops,
     and counts.
 
-    What is only stored, by whomever, is recorded a moment after the server has told that something was changed, as
+    What is only stored, by any client, is recorded a moment after the server has reported that it was changed, as
     what it led to (`LogUpdate.kind` is "stored"): several changes in a moment are one. The moment is some
     hundredths of a second; of a key that is published all the time half a second, and as long as 8 MB a second
     take to read it. A key that is only stored is found within a second of its making. Where the user may not use
@@ -140,19 +137,19 @@ class Recorder:
         self.patterns = parse_patterns(patterns)
         self.session = interface.session
         self.clock = Clock()
-        self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes nobody at the very moment
+        self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes no process at the very moment
         self.fetching = asyncio.Semaphore(_FETCHES)
         self._samples = samples_of(sample)
         if not self.patterns and not self._samples:
             raise BadValue("nothing to record: give a pattern such as '*', or sample=")
         self._keyframe_seconds = keyframe
         self._keyframes = 0
-        self._keys = RecordedKeys(self, interface, self.patterns)
+        self._keys = RecordedKeys(self, self.patterns)
         tops = self._keys.tops
         self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
         if self._monitor is not None:
-            self._monitor.doubted = lambda name: self._key_recorder(name).lost(None)
-            self._monitor.begun_anew = self._keys.lost
+            self._monitor.invalidated = lambda name: self._key_recorder(name).lost(None)
+            self._monitor.resynchronised = self._keys.lost
             self._monitor.changed = self._keys.changed
         self._sampler = Sampler(self.session, self._samples, self._sampled)
         self._tasks: list[asyncio.Task[None]] = []
@@ -185,7 +182,7 @@ class Recorder:
                 await self._settled(_PATIENCE)
             self._sampler.start()
             self._begin(self._tick)
-            self._begin(self._go_on_finding)
+            self._begin(lambda: find_regularly(self._search))
             await self._appear()
         except BaseException:
             await self._end()
@@ -202,7 +199,7 @@ class Recorder:
             self._sink.output.appear()
 
     def _begin(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        """Do something beside the recorded program; if it goes wrong, the recording ends."""
+        """Start a task; if it fails, the recording ends."""
 
         async def watched() -> None:
             try:
@@ -304,7 +301,7 @@ class Recorder:
                 give_way()
 
     def _pump(self) -> None:
-        """Take what has arrived already."""
+        """Take the updates that have arrived already."""
         for event in arrived(self._monitor) if self._monitor is not None else ():
             self._key_recorder(event.name).on_event(event)
 
@@ -327,25 +324,23 @@ class Recorder:
         return manager_of(self.session).hears_of_changes
 
     def hurry(self) -> None:
-        """Look more often at what was published: large updates come fast."""
+        """Look more often for updates: large ones come fast."""
         manager_of(self.session).limit_batch_delay(HURRIED)
 
     def failed(self, error: Exception) -> None:
-        """End the recording: something went wrong that should not."""
+        """End the recording for an unexpected error."""
         self._failure = error
         self._done.set()
 
     @property
     def _connected(self) -> bool:
-        """Whether there is anything to hear, and a connection that it comes on."""
         return self._monitor is not None and self._monitor.connected
 
     async def _settled(self, patience: float) -> None:
-        """Wait until nothing is being fetched, but not for ever."""
         await self._keys.settled(patience)
 
     async def _complete(self, deadline: float) -> None:
-        """Read anew what was dropped at the last moment: the file is to end with what is there."""
+        """Read again what was dropped at the last moment: the file is to end with what is there."""
         writer = self.writer_thread
         while self._connected and writer.failure is None and time.monotonic() < deadline:
             await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
@@ -358,7 +353,7 @@ class Recorder:
     # What is done from time to time.
 
     async def _tick(self) -> None:
-        """Keep the recording complete: read anew what is behind, write keyframes, end if the disk is full."""
+        """Keep the recording complete: read what is behind, write keyframes, end if the disk is full."""
         due = time.monotonic() + self._keyframe_seconds
         while True:
             await asyncio.sleep(_TICK)
@@ -373,23 +368,19 @@ class Recorder:
                         await self._look()
                 self._keyframe_of_all()
 
-    async def _go_on_finding(self) -> None:
-        """Look for new keys every second, and among very many less often: a server has other things to do, too."""
-        while True:
-            await asyncio.sleep(_FIND_SECONDS)
-            begun = time.monotonic()
-            with contextlib.suppress(RedisError, OSError):  # no connection now: it is made again
-                if self.hears_of_changes:
-                    await self._find()
-            await asyncio.sleep(_FIND_PAUSE * (time.monotonic() - begun))
+    async def _search(self) -> bool:
+        """Follow new keys, if the server reports changes: else keys are read at each keyframe."""
+        with contextlib.suppress(RedisError, OSError):  # no connection now: it is made again
+            if self.hears_of_changes:
+                await self._find()
+        return True
 
     async def _find(self) -> None:
-        """Follow the keys that somebody has stored since: nothing else tells of them."""
         if self._monitor is not None:
             self._keys.follow(await self._keys.present())
 
     def _catch_up(self) -> None:
-        """Read the keys anew of which something is missing, if there is room for it."""
+        """Read the keys again of which something is missing, if there is room for it."""
         self.look_for_losses()
         if self._connected and self.writer_thread.waiting < (1 << 20):
             for name in list(self.writer_thread.behind):
@@ -398,14 +389,14 @@ class Recorder:
                     self._key_recorder(name).read()
 
     def look_for_losses(self) -> None:
-        """Note it if updates were dropped that nobody had taken yet: they may be of any key."""
+        """Note updates that were dropped before they were taken: they may be of any key."""
         if self._monitor is not None and self._monitor.dropped > self._dropped:
             self.writer_thread.counts.dropped += self._monitor.dropped - self._dropped
             self._dropped = self._monitor.dropped
             self._keys.lost()
 
     async def _look_once_more(self) -> None:
-        """Read what is there at the end: somebody may have stored something since the last keyframe."""
+        """Read what is there at the end: keys may have been stored since the last keyframe."""
         self._keys.forget_news()
         if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
@@ -418,7 +409,7 @@ class Recorder:
                     await self._look()
 
     async def _look(self) -> None:
-        """Read keys of which nobody tells whether somebody has stored something since the last keyframe."""
+        """Read keys of which no server reports whether they were stored since the last keyframe."""
         if self._monitor is None:
             return
         self._keys.read_silent(await self._keys.present())
@@ -459,5 +450,5 @@ def description(
 def _user() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError, ImportError):  # nobody knows the name of this user
+    except (OSError, KeyError, ImportError):  # this user has no name
         return ""

@@ -13,7 +13,7 @@ from ...errors import BadInput, BadValue, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
 from ...session import Session
-from .fetch import fetch
+from .key_reader import fetch
 
 __all__ = ["Sample", "Sampler", "read_key_file", "samples_of"]
 

@@ -64,7 +64,6 @@ def nanoseconds(instant: Any) -> int:
 
 
 def _rounded(since: float) -> int:
-    """Return seconds in ns, rounded to microseconds."""
     whole = int(since)
     # The fraction by itself: a product of more than 2**51 microseconds would be rounded before it is rounded here.
     return whole * 1_000_000_000 + round((since - whole) * 1e6) * 1000
@@ -76,7 +75,6 @@ def published(time: float) -> int:
 
 
 def seconds(ns: int) -> float:
-    """Return an instant in seconds since 1970."""
     return ns / 1e9
 
 
@@ -89,7 +87,7 @@ class Clock:
 
     def stamp(self, received: float | None = None) -> int:
         """Return the log time of what was received now, or at `received` on this machine's clock, a moment ago."""
-        # At most a second: `received` is on a clock that somebody may have set in between.
+        # At most a second: `received` is on a clock that may have been set in between.
         ago = 0.0 if received is None else min(max(time.time() - received, 0.0), 1.0)
         now = time.monotonic_ns() + self._offset - int(ago * 1e9)
         # No two messages have the same log time: it is what tells a stored value from others of its path.
@@ -105,7 +103,7 @@ class Arrivals:
     """Tells when updates arrived that were taken a little later, several at once.
 
     The least time from a publisher's stamp to receiving is that of an update that did not wait; by as much as
-    another took longer, it has waited. Clocks that differ do no harm: what is told is never over `patience`
+    another took longer, it has waited. Clocks that differ do no harm: the result is never over `patience`
     before the update was taken, and never after.
 
     Args:

@@ -1,0 +1,256 @@
+"""One top-level key: reads of it, put between its updates. A state machine without I/O, clock or tasks.
+
+A subscriber, a recording and the page follow a key in the same way: they receive its updates, and read what the updates
+do not contain. Each read is a sequence of steps, which a driver performs:
+
+        read(plan) ----> Arm -- armed() --> Read -- answered() --+------------> Open -- take() --> at rest
+            |                                ^                   |               ^
+            +--- in order, or not tracked ---+                   +--> Fence -----+ fenced()
+                                             |                   |
+                                             +-------------------+  the plan goes on, or (None) it has to be read again
+
+- Arm: touch the keys over the connection of the notices. The server reports their next change from then on.
+- Read: send the plan's commands.
+- Fence: send a PING over the connection of the notices. When it is answered, all updates that the read contains have
+  been received.
+- Open: have the ships make values. The division then says which updates are in them (`division.py`).
+
+A read over the connection of the notices is in order with them. It needs neither Arm nor Fence.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from ..plan import Plan, Reply
+from ..plan.keys import Keys
+from ..plan.placeholders import Unreadable
+from ..plan.reads import RawRead
+from ..plan.replies import decoded
+from .division import Division, Heard, Phase
+from .gaps import GapDetector, Numbered
+
+__all__ = ["Arm", "Fence", "HeldAttachments", "KeyFeed", "Open", "Read", "Step", "last_note"]
+
+U = TypeVar("U", bound=Numbered)
+
+
+class Read(NamedTuple):
+    """Send the commands of a plan and bring the replies to `answered`.
+
+    Over the connection of the notices, or if the plan is `bulk` over another one.
+    """
+
+    number: int
+    plan: Plan
+
+
+class Arm(NamedTuple):
+    """Touch keys over the connection of the notices, so that the server reports changes; then call `armed`."""
+
+    number: int
+    keys: tuple[str, ...]
+
+
+class Fence(NamedTuple):
+    """Send a PING over the connection of the notices. When it is answered, call `fenced`."""
+
+    number: int
+
+
+class Open(NamedTuple):
+    """Have the ships make values of their replies. Then `take` returns which updates are in them."""
+
+    number: int
+    raw_read: RawRead
+
+
+Step = Read | Arm | Fence | Open
+
+
+class HeldAttachments:
+    """The attachments of a copy that need not be read again.
+
+    Attributes:
+        values: What ships made of them, by label and suffix.
+        asked: The keys that the last plan reads.
+    """
+
+    def __init__(self, keys: Keys) -> None:
+        self.values: dict[tuple[str, str], Any] = {}
+        self.asked: frozenset[str] = frozenset()
+        self._keys = keys
+        self._stale: set[str] = set()  # suffixes of those that were changed since they were asked for
+        self._raw: RawRead | None = None
+
+    def ask(self, plan: Plan) -> None:
+        """A plan is sent: its reply has all that was changed until now."""
+        self._stale.clear()
+        # The note changes with every update, and is no part of the value.
+        self.asked = frozenset(str(command[1]) for command in plan.commands) - {self._keys.last}
+
+    def change(self, key: str | None, *, covered: bool) -> bool:
+        """Forget what was changed; return whether this copy has it, or reads it.
+
+        Args:
+            key: Its name on the server, the document's or an attachment's; None for every key.
+            covered: What is being read has the change.
+        """
+        if key is None:
+            self.values.clear()
+            if not covered:
+                self._stale.update([name.removeprefix(self._keys.tag) for name in self.asked])
+            return True
+        if key == self._keys.document:
+            return True
+        suffix = key.removeprefix(self._keys.tag)  # empty for an array that is all of the document
+        held = [place for place in self.values if place[1] == suffix]
+        for place in held:
+            del self.values[place]
+        if not held and key not in self.asked:
+            return False  # another listener's on this connection
+        # It comes while a read is under way over another connection: what that brings may be older.
+        if not covered:
+            self._stale.add(suffix)
+        return True
+
+    def opening(self, raw_read: RawRead) -> None:
+        """Ships are making values of what was read."""
+        self._raw = raw_read
+
+    def failed(self) -> None:
+        """They could not, or nothing of it is kept."""
+        self._raw = None
+
+    def opened(self) -> None:
+        """They have: keep those whose keys were not changed since."""
+        raw, self._raw = self._raw, None
+        if raw is None:
+            return
+        for slot, ship, _ in raw.slots:
+            label, suffix = slot.placeholder.label, slot.placeholder.suffix
+            value = slot.container[slot.key]
+            if ship.blob is not None and suffix not in self._stale and type(value) is not Unreadable:
+                self.values[label, suffix] = value
+        self.values.update({place: it for place, it in raw.left.items() if place[1] not in self._stale})
+
+
+class KeyFeed(Generic[U]):
+    """The updates of one top-level key and the read that is under way.
+
+    Args:
+        keys: The key's names.
+        division: Which updates are in what is read; a new one if not given.
+
+    Attributes:
+        number: Of the last read. Answers to others are too late.
+        tracked: The server reports when what is read is changed.
+        dirty: Something was changed that no read which was asked for may have.
+        reads_all: The read that is under way has all that is followed of the key.
+        attachments: Those that need not be read again.
+    """
+
+    def __init__(self, keys: Keys, division: Division[U] | None = None) -> None:
+        self.division: Division[U] = division or Division(GapDetector())
+        self.number = 0
+        self.reads_all = True
+        self.tracked = self.dirty = False
+        self.attachments = HeldAttachments(keys)
+        self._plan: Plan | None = None  # on its way
+        self._outcome: list[Reply] = []  # of the plan, while its fence is on its way
+
+    def begin(self, *, initial: bool, tracked: bool) -> None:
+        """Start on a connection that is subscribed: the first one, or one after a loss."""
+        self.division.begin(initial=initial)
+        self.tracked, self.dirty = tracked, False
+        self.attachments.values.clear()
+
+    def change(self, key: str | None) -> bool:
+        """Note that a key was changed, None for every key; return whether only a new read of all shows the change."""
+        # Before a reply that is in order, and before keys are armed, a change is in what is being read.
+        covered = self.division.phase is Phase.IN_ORDER
+        is_news = self.attachments.change(key, covered=covered) and not (covered and self.reads_all)
+        self.dirty = self.dirty or is_news
+        return is_news
+
+    def read(self, plan: Plan) -> Read | Arm:
+        """Begin a read; it replaces one that is under way."""
+        self.number += 1
+        return self._ask(plan)
+
+    def _ask(self, plan: Plan) -> Read | Arm:
+        arms = plan.bulk and self.tracked
+        self.division.asked(in_order=arms or not plan.bulk)
+        self._plan = plan
+        if self.tracked:
+            self._arm(plan)
+        return Arm(self.number, tuple(self.attachments.asked)) if arms else Read(self.number, plan)
+
+    def arm(self, plan: Plan, *, reads_all: bool = True) -> frozenset[str]:
+        """Return the keys to touch before a plan is sent over another connection; then call `touched`."""
+        self.division.asked(in_order=True)
+        self._arm(plan)
+        self.reads_all = reads_all
+        return self.attachments.asked
+
+    def touched(self) -> None:
+        """The keys were touched, in order with reports of changes: what is changed from now on may not be read."""
+        if self.division.phase is Phase.IN_ORDER:
+            self.division.asked(in_order=False)
+
+    def _arm(self, plan: Plan) -> None:
+        self.dirty = False
+        self.attachments.ask(plan)
+
+    def armed(self) -> Read:
+        """The keys were touched: the server reports what is changed from now on."""
+        assert self._plan is not None
+        self.division.asked(in_order=False)
+        return Read(self.number, self._plan)
+
+    def awaits(self, number: int, *phases: Phase) -> bool:
+        """Return whether an answer is that to the present read, which is in one of these phases."""
+        return number == self.number and self.division.phase in phases
+
+    def answered(self, outcome: list[Reply]) -> Step | None:
+        """Go on with the replies to a plan; None if it has to be read again."""
+        # Held attachments belong together with the rest only if no change of theirs comes before the fence.
+        if self.division.answered(last_note(outcome), fence=bool(self.attachments.values)):
+            return self._decode(outcome)
+        self._outcome = outcome
+        return Fence(self.number)
+
+    def fenced(self) -> Step | None:
+        """Go on: all updates that were published before the fence have been received."""
+        outcome, self._outcome = self._outcome, []
+        return self._decode(outcome)
+
+    def _decode(self, outcome: list[Reply]) -> Step | None:
+        assert self._plan is not None
+        result: RawRead | Plan = decoded(self._plan, outcome)
+        if isinstance(result, Plan):
+            return self._ask(result)
+        if not self.division.divide(result.also[0]):
+            return None
+        self._plan = None
+        if self.tracked:
+            self.attachments.opening(result)
+        return Open(self.number, result)
+
+    def take(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
+        """Return which updates are in what was read, and which came later: the ships have made values of it."""
+        if self.tracked:
+            self.attachments.opened()
+        return self.division.take()
+
+    def give_up(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
+        """Return the same for a read that has failed."""
+        self.attachments.failed()
+        self._plan, self._outcome = None, []
+        return self.division.give_up()
+
+
+def last_note(replies: list[Reply]) -> Reply:
+    """Return the note that comes last in a transaction."""
+    last = replies[-1] if replies else None
+    return last[-1] if isinstance(last, list) and last else None

@@ -1,0 +1,36 @@
+"""Which keys there are: nothing announces a key that is only stored, so the server is asked every second."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Iterable
+
+from ..plan.paths import Pattern
+from ..session import Session
+
+__all__ = ["find_regularly", "present_keys"]
+
+_PERIOD = 1.0
+"""Seconds between searches."""
+_PAUSE = 10
+"""The time until the next search is at least so many times as long as the last one took. A server with a million keys
+is asked for a thousand pages, and has other things to do."""
+
+
+async def present_keys(session: Session, tops: Iterable[str]) -> set[str]:
+    """Return the top-level keys that some globs name; a round trip for about 1000 keys and each glob."""
+    return {name for top in dict.fromkeys(tops) async for name in session.names(Pattern(top))}
+
+
+async def find_regularly(find: Callable[[], Awaitable[bool]]) -> None:
+    """Call `find` every second, less often where it takes long, until it returns False.
+
+    The first call is a second from now. An exception of `find` ends this.
+    """
+    while True:
+        await asyncio.sleep(_PERIOD)
+        began = time.monotonic()
+        if not await find():
+            return
+        await asyncio.sleep(max(_PAUSE * (time.monotonic() - began) - _PERIOD, 0.0))
