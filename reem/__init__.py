@@ -15,7 +15,7 @@ from reem_async import __version__ as __version__
 from reem_async._installation import CURE, original_reem
 from reem_async.concurrency.queues import Every, Last, Newest
 from reem_async.plan.placeholders import Unreadable
-from reem_async.pubsub.updates import Origin, Update
+from reem_async.pubsub.events import Origin, Update
 
 from .accessor import Accessor
 from .connection import RedisInterface

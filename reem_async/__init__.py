@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from .connection import RedisInterface
     from .errors import *
     from .plan.placeholders import Unreadable
+    from .pubsub.events import Origin, Update
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
-    from .pubsub.updates import Origin, Update
     from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
     from .store import KeyValueStore, Reader, Writer
     from .store.publish import Publisher, PublishSpace
@@ -49,7 +49,7 @@ _HOMES = {
     "Last": ".concurrency.queues",
     "Newest": ".concurrency.queues",
     "NumpyShip": ".ships",
-    "Origin": ".pubsub.updates",
+    "Origin": ".pubsub.events",
     "PublishSpace": ".store.publish",
     "Publisher": ".store.publish",
     "Reader": ".store",
@@ -58,7 +58,7 @@ _HOMES = {
     "SpecialDatatypeShip": ".ships",
     "StateChange": ".transport.state",
     "Unreadable": ".plan.placeholders",
-    "Update": ".pubsub.updates",
+    "Update": ".pubsub.events",
     "Writer": ".store",
     "timeout": ".concurrency.timeouts",
 }

@@ -14,7 +14,7 @@ from conftest import ROOT, sized
 from reem_async.concurrency.locks import Locks
 from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Every, Last, Newest
 from reem_async.errors import QueueFull
-from reem_async.pubsub.updates import Update
+from reem_async.pubsub.events import Update
 from reem_async.transport.options import Options
 from reem_async.transport.packing import Packer
 

@@ -19,7 +19,7 @@ from reem_async.plan import placeholders, trees
 from reem_async.plan.documents import encode
 from reem_async.plan.floats import _as_parsed, exact_text, may_lose
 from reem_async.plan.paths import below, may_hold, parse, parse_shown, parse_suffix, show, suffix, to_jsonpath
-from reem_async.pubsub.updates import Update
+from reem_async.pubsub.events import Update
 from reem_async.ships import NumpyShip
 from reem_async.transport.packing import pack
 from reem_async.transport.parsing import MORE, LargeReader, SmallReader

@@ -361,3 +361,20 @@ async def test_closing_the_interface_ends_loops_over_patterns_in_a_cluster_too(c
     await asyncio.sleep(0)
     await interface.close()
     assert await asyncio.wait_for(waiting, 10) == "ended"
+
+
+async def test_a_watch_that_could_not_begin_may_begin_later(ainterface, akvs, key, monkeypatch):
+    """The call that failed had ended its loop for good."""
+    manager = manager_of(ainterface.session)
+    await akvs[key("a")].write(1)
+    watch = akvs.watch(key("*"))
+
+    async def refused(listeners):
+        raise ConnectionLost("cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(manager, "subscribe_all", refused)
+        with pytest.raises(ConnectionLost):
+            await watch.listen()
+    async with watch:
+        assert (await asyncio.wait_for(anext(watch), 10)).data == 1

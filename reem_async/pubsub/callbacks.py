@@ -18,9 +18,7 @@ from ..concurrency.timeouts import forget
 from ..errors import BadType
 
 if TYPE_CHECKING:
-    from .updates import Update
-
-__all__ = ["Caller", "Calls", "arranged"]
+    from .events import Update
 
 logger = logging.getLogger("reem.subscribe")
 

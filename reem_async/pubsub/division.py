@@ -37,8 +37,6 @@ from ..plan import Reply
 from ..plan.notices import parsed_note
 from .gaps import GapDetector, Numbered
 
-__all__ = ["Division", "Heard", "Phase", "divided_read", "divided_reads"]
-
 U = TypeVar("U", bound=Numbered)
 T = TypeVar("T")
 _TRIES = 10

@@ -30,8 +30,6 @@ from ..plan.replies import decoded
 from .division import Division, Heard, Phase
 from .gaps import GapDetector, Numbered
 
-__all__ = ["Arm", "Fence", "HeldAttachments", "KeyFeed", "Open", "Read", "Step", "last_note"]
-
 U = TypeVar("U", bound=Numbered)
 
 

@@ -9,8 +9,6 @@ from collections.abc import Awaitable, Callable, Iterable
 from ..plan.paths import Pattern
 from ..session import Session
 
-__all__ = ["find_regularly", "present_keys"]
-
 _PERIOD = 1.0
 """Seconds between searches."""
 _PAUSE = 10

@@ -28,13 +28,11 @@ from ..plan.trees import MISSING, copied
 from ..ships.registry import Ships
 from ..transport.route import is_unapplied
 from ..transport.wire import Wire
+from .events import Origin, Update
 from .listeners import Beginning, Listener, Topic, contained
 from .manager import SubscriptionManager
 from .refresh import LIVE, RefreshTimer
 from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replica, Skipped, Snapshot, Stored, Updated
-from .updates import Origin, Update
-
-__all__ = ["Follower", "Origin", "Update", "checked_largest"]
 
 logger = logging.getLogger("reem.subscribe")
 

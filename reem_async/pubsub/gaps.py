@@ -9,8 +9,6 @@ from typing import Protocol
 from ..plan import Reply
 from ..plan.notices import parsed_note
 
-__all__ = ["GapDetector", "Numbered", "Numbers"]
-
 # Ids of interfaces. A stranger may make up any number of them, so what is kept of them is bounded.
 _MOST_PUBLISHERS = 10_000
 _RECENT = 256

@@ -27,8 +27,6 @@ from .finder import find_regularly
 from .listeners import Beginning, Listener, Topic
 from .reorder import ReorderBuffer
 
-__all__ = ["KeyWatcher"]
-
 logger = logging.getLogger("reem.subscribe")
 
 # Seconds between looks whether something still waits, and how often: a second in all, twice what a buffer waits.

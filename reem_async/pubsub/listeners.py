@@ -21,18 +21,6 @@ from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.wire import Wire
 
-__all__ = [
-    "NO_LISTENERS",
-    "Beginning",
-    "Inbox",
-    "Listener",
-    "ListenerGroup",
-    "Topic",
-    "contained",
-    "is_invalidation",
-    "is_message",
-]
-
 logger = logging.getLogger("reem.subscribe")
 
 Arguments = ParamSpec("Arguments")

@@ -33,8 +33,6 @@ from .subscription_commands import Heartbeats, Invalidations, Subscribing
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport
 
-__all__ = ["Listener", "SubscriptionManager", "Topic", "manager_of"]
-
 logger = logging.getLogger("reem.subscribe")
 
 _LONGEST_PAUSE = 0.5

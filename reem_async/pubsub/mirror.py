@@ -19,8 +19,6 @@ from ..session import Session
 from .follower import Follower, checked_largest, own
 from .subscribers import Link, LocalAccessor
 
-__all__ = ["Mirror", "MirrorAccessor", "Tried"]
-
 _PROBES = 3
 """Probes in the time of `max_age`."""
 _SHORTEST = 0.005

@@ -14,8 +14,6 @@ from ..session import Session
 from .listeners import Listener, Topic
 from .manager import SubscriptionManager, manager_of
 
-__all__ = ["PatternStream"]
-
 Item = TypeVar("Item")
 
 

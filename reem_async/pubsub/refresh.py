@@ -7,8 +7,6 @@ import weakref
 from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
-__all__ = ["BACKGROUND", "BACKGROUND_RATE", "LIVE", "Pace", "RefreshTimer"]
-
 Owner = TypeVar("Owner")
 
 

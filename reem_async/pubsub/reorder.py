@@ -18,8 +18,6 @@ from ..plan.notices import Notice
 if TYPE_CHECKING:
     from .listeners import Listener
 
-__all__ = ["ReorderBuffer"]
-
 _PATIENCE = 0.5
 """Seconds to wait for what is older: ten times as long as nodes took to pass it on."""
 _REMEMBERED = 5.0

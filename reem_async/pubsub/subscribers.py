@@ -18,9 +18,9 @@ from ..plan.paths import Path, check_element, parse, show
 from ..plan.trees import MISSING, copied
 from ..session import Session
 from .callbacks import Caller, Calls, arranged
+from .events import Update
 from .follower import Follower, unnoticed
 from .manager import SubscriptionManager, manager_of
-from .updates import Update
 
 __all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
 

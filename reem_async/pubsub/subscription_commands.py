@@ -16,8 +16,6 @@ from ..transport import Transport
 from ..transport.wire import Wire
 from .listeners import Listener, Topic
 
-__all__ = ["Heartbeats", "Invalidations", "Subscribing"]
-
 logger = logging.getLogger("reem.subscribe")
 
 _TRACK = ("CLIENT", "TRACKING", "ON")

@@ -27,8 +27,6 @@ from .partial_reads import noted_text
 from .timeline import PENDING
 from .trees import Leaf, changed, framed, identical, leaf_of, tree_of, walk
 
-__all__ = ["Allowance", "Fetcher", "hear", "reading_after", "rebased"]
-
 _RECENT = 16
 """Updates that are known again if they come twice while something is read."""
 

@@ -24,8 +24,6 @@ from .fetcher import Allowance, Fetcher
 from .history import History
 from .stored_changes import StoredChanges
 
-__all__ = ["Follower"]
-
 _WAITING = 50_000
 """Updates that wait for this program before the oldest are skipped."""
 

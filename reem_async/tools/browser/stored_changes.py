@@ -32,8 +32,6 @@ from .partial_reads import noted_texts
 from .timeline import PENDING
 from .trees import Leaf, same, tree_of, walk
 
-__all__ = ["StoredChanges"]
-
 # Documents that are asked for in one round trip.
 _BATCH = 100
 _REST = 4

@@ -16,8 +16,6 @@ from ...pubsub.gaps import GapDetector, Numbered
 from .order import Item, is_replaced, settled, skipped
 from .roles import Role
 
-__all__ = ["KeyQueue"]
-
 _RECENT = 16
 """Updates that are known again if they come twice, where there may be thousands of keys."""
 

@@ -21,8 +21,6 @@ from ...store.reader import opened
 from .key_queue import KeyQueue
 from .stored import New, Unchanged
 
-__all__ = ["Fetched", "KeyReader", "fetch", "size_of"]
-
 Wait = Callable[[], Awaitable[None]]
 _SUFFIX = "", ".", "["
 """What may begin the names of attachments behind the tag of their key."""

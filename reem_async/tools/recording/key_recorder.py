@@ -28,8 +28,6 @@ from .stored import pruned
 from .times import Arrivals, Clock, published
 from .writer_thread import Operation, WriterThread
 
-__all__ = ["Collector", "KeyRecorder"]
-
 logger = logging.getLogger("reem.recording")
 
 _PAUSE = 0.1

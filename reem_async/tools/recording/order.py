@@ -18,8 +18,6 @@ from .roles import Role
 from .stored import carried
 from .times import AFTER
 
-__all__ = ["Item", "is_replaced", "settled", "skipped"]
-
 
 @dataclasses.dataclass(slots=True, eq=False)
 class Item:

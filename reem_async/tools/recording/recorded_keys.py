@@ -10,8 +10,6 @@ from ...plan.paths import Pattern
 from ...pubsub.finder import present_keys
 from .key_recorder import Collector, KeyRecorder
 
-__all__ = ["RecordedKeys"]
-
 _MOST_SILENT_READS = 500
 """Keys that are read again at one keyframe, if the server does not tell which were changed."""
 

@@ -38,8 +38,6 @@ from .sink import Sink
 from .times import HURRIED, PATIENCE, Arrivals, Clock
 from .writer_thread import Operation, WriterThread
 
-__all__ = ["Recorder", "RecorderStatus", "description"]
-
 # Seconds between looks at keyframes that are due, the disk, and keys that must be read again.
 _TICK = 0.1
 # Updates that may wait for the event loop: 25 seconds at 2 kHz.

@@ -11,19 +11,6 @@ import numpy as np
 from ...errors import BadType, BadValue
 from ...plan.paths import shorten
 
-__all__ = [
-    "AFTER",
-    "HURRIED",
-    "PATIENCE",
-    "STEP",
-    "Arrivals",
-    "Clock",
-    "Instant",
-    "nanoseconds",
-    "published",
-    "seconds",
-]
-
 Instant = float | np.datetime64
 """A point in time: seconds since 1970, or a numpy datetime64."""
 
