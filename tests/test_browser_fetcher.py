@@ -10,7 +10,7 @@ from conftest import aeventually
 
 from reem_async.errors import ConnectionLost
 from reem_async.pubsub.monitor import Monitor
-from reem_async.tools.browser.fetcher import Allowance, Fetcher
+from reem_async.tools.browser.fetcher import Allowance, Fetcher, Readings
 from reem_async.tools.browser.history import History
 
 LARGE = np.zeros((300, 300))
@@ -23,7 +23,10 @@ async def touch(path, tree):
 def fetcher_of(interface, name, fence, last_note=""):
     history = History(1000.0, 1 << 24)
     history.begin(name, b"{}")
-    return Fetcher(interface.session, history, Allowance(1e9, 1e9), lambda name: last_note, fence, touch), history
+    readings = Readings()
+    readings.notes[name] = last_note
+    fetcher = Fetcher(interface.session, history, Allowance(1e9, 1e9), readings, fence, touch)
+    return fetcher, history, readings
 
 
 async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(key, apspace, binterface):
@@ -36,9 +39,9 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
     async def fence():
         await apspace[key()]["l"][0].delete()
         for _ in range(3):
-            fetcher.heard(await anext(monitor))
+            readings.hear(await anext(monitor))
 
-    fetcher, history = fetcher_of(binterface, key(), fence)
+    fetcher, history, readings = fetcher_of(binterface, key(), fence)
     fetcher.want((key(),), time.time())
     task = asyncio.create_task(fetcher.run())
     await aeventually(lambda: not fetcher.behind)
@@ -56,7 +59,7 @@ async def test_nothing_is_waited_for_that_was_heard_of_before(key, apspace, bint
     async def fence():
         raise AssertionError("a fence")
 
-    fetcher, history = fetcher_of(binterface, key(), fence, f"{event.publisher} {event.sequence}")
+    fetcher, history, _ = fetcher_of(binterface, key(), fence, f"{event.publisher} {event.sequence}")
     fetcher.want((key(),), time.time())
     task = asyncio.create_task(fetcher.run())
     await aeventually(lambda: not fetcher.behind)
@@ -74,7 +77,7 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
         asked.set()
         raise ConnectionLost("gone")
 
-    fetcher, history = fetcher_of(binterface, key(), fence)
+    fetcher, history, _ = fetcher_of(binterface, key(), fence)
     fetcher.want((key(),), time.time())
     task = asyncio.create_task(fetcher.run())
     await asyncio.wait_for(asked.wait(), 10)

@@ -13,7 +13,7 @@ from picturekit import look_back, running_robot
 from reem_async import RedisInterface
 from reem_async.plan.trees import MISSING
 from reem_async.tools.browser import LiveSource
-from reem_async.tools.browser.fetcher import Allowance, Fetcher
+from reem_async.tools.browser.fetcher import Allowance, Fetcher, Readings
 from reem_async.tools.browser.frames import Frames
 from reem_async.tools.browser.history import History
 from reem_async.tools.browser.pictures import paint
@@ -59,7 +59,7 @@ def test_a_fetcher_ends_though_news_come_as_it_is_cancelled():
     async def work():
         allowance = Allowance(1.0, 1e6)
         assert allowance.take(1_000_000)
-        fetcher = Fetcher(None, History(1.0, 1000), allowance, lambda name: "", None, None)
+        fetcher = Fetcher(None, History(1.0, 1000), allowance, Readings(), None, None)
         fetcher._owed[("camera",)] = 500_000
         task = asyncio.create_task(fetcher.run())
         await asyncio.sleep(0.02)

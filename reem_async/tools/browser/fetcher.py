@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Awaitable, Callable, Iterable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from ...errors import BadData, RedisError, ReemError, WrongKind
 from ...plan import Reply
+from ...plan.notices import note_of
 from ...plan.paths import Path, below
 from ...plan.placeholders import marked
 from ...plan.trees import MISSING, get
@@ -29,6 +30,9 @@ from .trees import Leaf, changed, framed, identical, leaf_of, tree_of, walk
 
 _RECENT = 16
 """Updates that are known again if they come twice while something is read."""
+
+_MOST_NOTES = 100_000
+"""Keys whose last notice is remembered."""
 
 _PAUSE = 0.1
 """Seconds after a read that failed."""
@@ -63,6 +67,42 @@ class Allowance:
         return math.inf if size > self._most else max((size - self._saved) / self._rate, 0.0)
 
 
+class Readings:
+    """The reads that are under way, each with the division that says which updates are in what is read.
+
+    Attributes:
+        notes: The last notice of each key, as the server notes it.
+    """
+
+    def __init__(self) -> None:
+        self.notes: dict[str, str] = {}
+        self._under_way: dict[str, list[Division[Event]]] = {}
+
+    def hear(self, event: Event) -> None:
+        """Take an update of any key."""
+        if len(self.notes) > _MOST_NOTES:
+            self.notes.clear()
+        self.notes[event.name] = note_of(event.publisher, event.sequence)
+        for division in self._under_way.get(event.name, ()):
+            if division.gaps.count(event) is not None:
+                division.hear(Heard(event, None if event.gap else 0))
+
+    @contextmanager
+    def begin(self, names: Sequence[str]) -> Iterator[list[Division[Event]]]:
+        """Have divisions of new reads, one for each key, hear the updates of their keys."""
+        divisions: list[Division[Event]] = [Division(GapDetector(_RECENT)) for _ in names]
+        for name, division in zip(names, divisions, strict=True):
+            division.gaps.begin_with(self.notes.get(name, "").encode())
+            self._under_way.setdefault(name, []).append(division)
+        try:
+            yield divisions
+        finally:
+            for name, division in zip(names, divisions, strict=True):
+                self._under_way[name].remove(division)
+                if not self._under_way[name]:
+                    del self._under_way[name]
+
+
 class Fetcher:
     """Reads one announced value after the other, the newest of each path.
 
@@ -76,8 +116,8 @@ class Fetcher:
         session: The server.
         history: Where the values go.
         allowance: Bytes of arrays that may be read.
-        last_note: Returns the note of the last notice of a key that was heard.
-        fence: Returns when all that was published before has been `heard`.
+        readings: The reads that are under way.
+        fence: Returns when `readings` have all updates that were published before.
         touch: Called with a path, and what is known of it, directly before the arrays there are read.
 
     Attributes:
@@ -91,14 +131,14 @@ class Fetcher:
         session: Session,
         history: History,
         allowance: Allowance,
-        last_note: Callable[[str], str],
+        readings: Readings,
         fence: Callable[[], Awaitable[None]],
         touch: Callable[[Path, Any], Awaitable[None]],
     ) -> None:
         self._session = session
         self._history = history
         self._allowance = allowance
-        self._last_note = last_note
+        self._readings = readings
         self._fence = fence
         self._touch = touch
         self._paths: dict[Path, None] = {}
@@ -106,8 +146,7 @@ class Fetcher:
         self._owed: dict[Path, int] = {}  # whose arrays are to be read, and how many bytes they have
         self._rested = 0.0  # the instant from which on arrays may be read again, on the monotonic clock
         self._news = asyncio.Event()
-        self._name = ""  # what is being read, and what is heard of it meanwhile
-        self._division: Division[Event] = Division()
+        self._name = ""  # what is being read
         self.behind: set[str] = set()
         self.finished: set[str] = set()
         self.failed: Callable[[str], None] = lambda name: None
@@ -130,10 +169,6 @@ class Fetcher:
             self._checks.add(path)
             self._paths[path] = None
             self._news.set()
-
-    def heard(self, event: Event) -> None:
-        if event.name == self._name:
-            hear(self._division, event)
 
     async def run(self) -> None:
         while True:
@@ -169,13 +204,13 @@ class Fetcher:
 
     async def _fetch_one(self, path: Path, with_arrays: bool) -> None:
         self._name = name = str(path[0])
-        self._division = reading_after(self._last_note(name))
         try:
-            tree = await divided_read(self._division, partial(self._read, path, with_arrays), self._fence)
+            with self._readings.begin([name]) as (division,):
+                tree = await divided_read(division, partial(self._read, division, path, with_arrays), self._fence)
+                later = [each.update for each in division.take()[1] if each.update is not None]
         finally:
             self._name = ""
             self.finished.add(name)
-        later = [each.update for each in self._division.take()[1] if each.update is not None]
         tree = rebased(tree, path, later)
         self._note(path, tree)
         if not any(event.value is ANNOUNCED for event in later):
@@ -189,9 +224,9 @@ class Fetcher:
             if not identical(tree, self._history.tree(path, self._history.clock.now())):
                 self._history.add_read(path, tree, self._history.clock.now())
 
-    async def _read(self, path: Path, with_arrays: bool) -> tuple[Any, Reply]:
+    async def _read(self, division: Division[Event], path: Path, with_arrays: bool) -> tuple[Any, Reply]:
         """Return the document's part, with its arrays if it is their turn, and the note of what it includes."""
-        self._division.asked(in_order=False)
+        division.asked(in_order=False)
         text, note = await noted_text(self._session, path)
         if text is None:
             return MISSING, note
@@ -204,7 +239,7 @@ class Fetcher:
             return tree, note
         began = time.monotonic()
         await self._touch(path, tree)
-        self._division.asked(in_order=False)
+        division.asked(in_order=False)
         value, _, note = await fetch(self._session, self._session.keys(path[0]), path[1:])
         now = time.monotonic()
         self._rested = now + _REST * (now - began)
@@ -214,19 +249,6 @@ class Fetcher:
 def _array_bytes(tree: Any) -> int:
     """Return how many bytes the arrays in a tree have."""
     return sum([leaf_of(it).size for _, it in walk(tree, ()) if isinstance(it, Leaf | np.ndarray | bytes)])
-
-
-def reading_after(note: str) -> Division[Event]:
-    """Return what divides the updates around a read, given the note of the last one before it."""
-    division: Division[Event] = Division(GapDetector(_RECENT))
-    division.gaps.begin_with(note.encode())
-    return division
-
-
-def hear(division: Division[Event], event: Event) -> None:
-    """Note an update of what is being read."""
-    if division.gaps.count(event) is not None:
-        division.hear(Heard(event, None if event.gap else 0))
 
 
 def rebased(tree: Any, path: Path, later: Iterable[Event]) -> Any:

@@ -7,42 +7,29 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 from ...concurrency.queues import Last
 from ...concurrency.streams import arrived
 from ...connection import RedisInterface
 from ...errors import RedisError, ReemError
-from ...plan.notices import note_of
 from ...plan.paths import Path
 from ...plan.trees import MISSING
 from ...pubsub.finder import find_regularly, present_keys
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event, Monitor
 from ...pubsub.refresh import BACKGROUND_RATE
-from .fetcher import Allowance, Fetcher
+from .fetcher import Allowance, Fetcher, Readings
 from .history import History
 from .stored_changes import StoredChanges
 
 _WAITING = 50_000
 """Updates that wait for this program before the oldest are skipped."""
 
-# Keys whose last notice is remembered.
-_MOST_HEARD = 100_000
+_MOST_SHARED = 10_000
+"""Keys of which is remembered when their publisher has shared memory."""
 _SHARED_SECONDS = 10.0
 """For so long a publisher is said to share memory after it has; as in `reem top`."""
-
-
-class Heard(NamedTuple):
-    """The last notice of a key.
-
-    Attributes:
-        note: Which it was, as the server notes it.
-        shared: When the last one came whose value is in shared memory too, on the monotonic clock.
-    """
-
-    note: str = ""
-    shared: float = -math.inf
 
 
 class Follower:
@@ -63,15 +50,16 @@ class Follower:
         allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
         arrays = Allowance(BACKGROUND_RATE, history.budget / 2)  # four pictures a second each of two cameras
         session = interface.session
-        self._fetcher = Fetcher(session, history, arrays, self._last_note, self._fence, self._touch)
+        self._readings = Readings()
+        self._fetcher = Fetcher(session, history, arrays, self._readings, self._fence, self._touch)
         self._stored = StoredChanges(
-            session, history, self._fetcher, allowance, self._last_note, self._pump, self._fence
+            session, history, self._fetcher, allowance, self._readings, self._pump, self._fence
         )
         self._monitor = Monitor(interface, policy=Last(_WAITING))
         self._fetcher.failed = self._monitor.invalidated = self._stored.doubt
         self._monitor.broken, self._monitor.changed = self._stored.lost, self._stored.changed
         self._tasks: list[asyncio.Task[None]] = []
-        self._heard: dict[str, Heard] = {}
+        self._shared: dict[str, float] = {}  # when the last value of a key came that is in shared memory too
         self.names: list[str] = []
         self.lost = ""
 
@@ -111,7 +99,7 @@ class Follower:
 
     def is_shared(self, name: str) -> bool:
         """Return whether programs on the publisher's host could of late take what is published from its memory."""
-        return time.monotonic() - self._last_heard(name).shared < _SHARED_SECONDS
+        return time.monotonic() - self._shared.get(name, -math.inf) < _SHARED_SECONDS
 
     # --- what is published
 
@@ -134,11 +122,11 @@ class Follower:
 
     def _take(self, event: Event) -> None:
         name = event.name
-        if len(self._heard) > _MOST_HEARD:
-            self._heard.clear()
-        shared = time.monotonic() if event.local else self._last_heard(name).shared
-        self._heard[name] = Heard(note_of(event.publisher, event.sequence), shared)
-        self._fetcher.heard(event)
+        if event.local:
+            if len(self._shared) > _MOST_SHARED:
+                self._shared.clear()
+            self._shared[name] = time.monotonic()
+        self._readings.hear(event)
         self._stored.heard(event)
         if len(event.path) == 1 and event.deleted:
             self._forget(name)
@@ -150,12 +138,6 @@ class Follower:
         else:
             value = MISSING if event.deleted else event.value
             self._history.add(event.path, value, event.size, when)
-
-    def _last_heard(self, name: str) -> Heard:
-        return self._heard.get(name, Heard())
-
-    def _last_note(self, name: str) -> str:
-        return self._last_heard(name).note
 
     def _note_name(self, name: str) -> None:
         if not self._history.knows(name) and self._stored.is_new(name):

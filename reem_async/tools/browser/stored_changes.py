@@ -20,13 +20,13 @@ from ...plan import Reply
 from ...plan.paths import Path, below
 from ...plan.placeholders import Unreadable, marked
 from ...plan.trees import MISSING
-from ...pubsub.division import Division, divided_reads
+from ...pubsub.division import divided_reads
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
 from .addresses import is_addressable
-from .fetcher import Allowance, Fetcher, hear, reading_after, rebased
+from .fetcher import Allowance, Fetcher, Readings, rebased
 from .history import History
 from .partial_reads import noted_texts
 from .timeline import PENDING
@@ -52,7 +52,7 @@ class StoredChanges:
         history: Where changes go.
         fetcher: What reads arrays into it.
         allowance: Bytes of long documents that may be kept.
-        last_note: Returns the note of the last notice of a key that was heard.
+        readings: The reads that are under way.
         pump: Takes all notices that have arrived, each of which is to be `heard`.
         fence: Returns when all that was published before has been `heard`.
     """
@@ -63,7 +63,7 @@ class StoredChanges:
         history: History,
         fetcher: Fetcher,
         allowance: Allowance,
-        last_note: Callable[[str], str],
+        readings: Readings,
         pump: Callable[[], None],
         fence: Callable[[], Awaitable[None]],
     ) -> None:
@@ -71,14 +71,13 @@ class StoredChanges:
         self._history = history
         self._fetcher = fetcher
         self._allowance = allowance
-        self._last_note = last_note
+        self._readings = readings
         self._pump = pump
         self._fence = fence
         self._unseen: set[str] = set()  # there from the beginning, and not read yet
         self._due: dict[str, None] = {}
         self._news = asyncio.Event()
         self._looks: dict[str, RefreshTimer[StoredChanges]] = {}
-        self._reading: dict[str, Division[Event]] = {}
         # Names on the server: those whose next change it will tell, the arrays of each key, those that were changed.
         self._told: set[str] = set()
         self._arrays: dict[str, dict[str, Path]] = {}
@@ -120,8 +119,6 @@ class StoredChanges:
 
     def heard(self, event: Event) -> None:
         name, arrays = event.name, self._arrays.get(event.name, {})
-        if name in self._reading:
-            hear(self._reading[name], event)
         if name in self._looks:
             self._looks[name].heard += 1
         for key in arrays.keys() - self._told:
@@ -205,18 +202,15 @@ class StoredChanges:
         """Compare documents with what the changes led to; return how many bytes they have."""
         await asyncio.gather(*[self._touch(name) for name in names])
         self._fetcher.finished.clear()
-        self._reading = divisions = {name: reading_after(self._last_note(name)) for name in names}
+        with self._readings.begin(names) as divisions:
 
-        async def read() -> list[tuple[bytes | None, Reply] | None]:
-            for division in divisions.values():
-                division.asked(in_order=False)
-            return await noted_texts(self._session, [(name,) for name in names])
+            async def read() -> list[tuple[bytes | None, Reply] | None]:
+                for division in divisions:
+                    division.asked(in_order=False)
+                return await noted_texts(self._session, [(name,) for name in names])
 
-        try:
-            found = await divided_reads([*divisions.values()], read, self._fence)
-        finally:
-            self._reading = {}
-        for name, it in zip(names, found, strict=True):
+            found = await divided_reads(divisions, read, self._fence)
+        for name, division, it in zip(names, divisions, found, strict=True):
             size = len(it[0] or b"") if it else 0
             if name in self._looks:
                 self._looks[name].earliest = asyncio.get_running_loop().time() + _SHARE * size / BACKGROUND_RATE
@@ -224,7 +218,7 @@ class StoredChanges:
             if it is None or self._fetcher.concerns(name):
                 self._ask(name)
                 continue
-            later = [each.update for each in divisions[name].take()[1] if each.update is not None]
+            later = [each.update for each in division.take()[1] if each.update is not None]
             try:
                 self._compare(name, it[0], later)
             except BadData as error:  # what was there before is not there any more
