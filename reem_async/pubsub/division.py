@@ -211,4 +211,5 @@ async def divided_read(
         (found,) = await divided_reads([division], read_one, fence)
         if found is not None:
             return found[0]
+    division.give_up()
     raise Conflict("updates came all the time that were never heard of")
