@@ -186,8 +186,8 @@ async def test_what_is_changed_right_behind_the_touch_is_not_in_what_is_read(key
     async with connect as other, recording(other, [key()], file) as recorder:
         await aeventually(lambda: is_followed(recorder, key()))
         reader, looks = recorder._key_recorder(key())._reader, recorder._key_recorder(key()).looks
-        reader._reads_all, looks._patience = True, 60.0
-        touching = asyncio.create_task(reader._touch(reader._plan((), {})))
+        looks._pace = looks._pace._replace(notice_delay=60.0)
+        touching = asyncio.create_task(reader._touch(reader.feed.arm(reader._plan((), {}))))
         await asyncio.sleep(0)
         # From here to the next await this program takes nothing in.
         eventually(lambda: any(row["name"] == key("recorder") and row["cmd"] == "type" for row in raw.client_list()))
