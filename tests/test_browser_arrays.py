@@ -9,9 +9,8 @@ import pytest
 from PIL import Image
 
 from reem_async.errors import BadValue
-from reem_async.tools.browser.figures import histogram, line, statistics, table
-from reem_async.tools.browser.pictures import MAPS, colours_of, paint
-from reem_async.tools.browser.slices import look_at, parse_slice, part
+from reem_async.tools.browser.arrays import histogram, line, statistics, table
+from reem_async.tools.browser.pictures import MAPS, colours_of, look_at, paint, parse_slice, part
 
 MAGENTA = (255, 0, 255)
 

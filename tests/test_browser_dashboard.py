@@ -15,7 +15,7 @@ from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: 
 
 from reem.server import EmbeddedServer
 from reem_async.tools.browser.history import History
-from reem_async.tools.browser.marks import differing
+from reem_async.tools.browser.trees import differing
 
 expect = playwright.expect
 

@@ -22,7 +22,7 @@ from PIL import Image
 import reem
 from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import listen
-from reem_async.tools.browser.downloads import file_of
+from reem_async.tools.browser.arrays import file_of
 from reem_async.tools.browser.trees import Leaf, walk
 
 

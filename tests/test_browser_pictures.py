@@ -14,10 +14,8 @@ from reem_async import RedisInterface
 from reem_async.plan.trees import MISSING
 from reem_async.tools.browser import LiveSource
 from reem_async.tools.browser.fetcher import Allowance, Fetcher, Readings
-from reem_async.tools.browser.frames import Frames
-from reem_async.tools.browser.history import History
-from reem_async.tools.browser.pictures import paint
-from reem_async.tools.browser.previews import preview_of
+from reem_async.tools.browser.history import Frames, History
+from reem_async.tools.browser.pictures import paint, preview_of
 from reem_async.tools.browser.timeline import PENDING
 from reem_async.tools.browser.trees import Frame, Leaf, framed, leaf_of
 

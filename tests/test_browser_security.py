@@ -13,7 +13,7 @@ import pytest
 from browserkit import client_of, live, served
 from conftest import eventually
 
-from reem_async.tools.browser.guard import LOOPBACK
+from reem_async.tools.browser.app import LOOPBACK
 
 
 @pytest.fixture(scope="module")

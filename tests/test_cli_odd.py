@@ -27,7 +27,7 @@ import reem as blocking
 import reem.snapshots
 from reem_async.errors import BadData, ReemError
 from reem_async.plan.paths import parse
-from reem_async.tools.browser.downloads import file_of
+from reem_async.tools.browser.arrays import file_of
 from reem_async.tools.cli import build
 from reem_async.tools.cli.echo import _moment
 from reem_async.tools.cli.output import json_text, typed

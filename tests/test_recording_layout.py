@@ -20,9 +20,8 @@ from reem_async.errors import BadData, BadInput, BadValue
 from reem_async.plan.paths import parse_pattern
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.tools.recording.layout import from_json, to_json
+from reem_async.tools.recording.layout import decode, encode, from_json, schema_bytes, to_json
 from reem_async.tools.recording.log import stacked
-from reem_async.tools.recording.messages import decode, encode, schema_bytes
 from reem_async.tools.recording.sample import read_key_file
 from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
 from reem_async.tools.recording.stored import Stored, extract, planted, pruned, resolve

@@ -5,9 +5,8 @@ async with RedisInterface("localhost") as interface:
     await PageServer(app, listen("127.0.0.1", 8080)).run_until_stopped()
 """
 
-from .app import create_app
+from .app import PageServer, create_app, listen
 from .live import LiveSource
-from .serving import PageServer, listen
 from .source import NotKept, Sample, Series, Source, Status
 
 __all__ = ["LiveSource", "NotKept", "PageServer", "Sample", "Series", "Source", "Status", "create_app", "listen"]

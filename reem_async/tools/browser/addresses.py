@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from ...errors import BadKey
-from ...plan.paths import Path, check_element, check_top_key, parse, parse_suffix, suffix
-
-__all__ = ["address", "is_addressable", "path_of", "snippets"]
+from ...plan.paths import Path, check_top_key, parse, parse_suffix, suffix
+from ...plan.trees import is_addressable as is_addressable
 
 # Characters.
 _LONGEST = 4096
@@ -28,15 +27,6 @@ def path_of(text: str) -> Path:
     if path:
         check_top_key(path[0])
     return path
-
-
-def is_addressable(key: str | int) -> bool:
-    """Return whether the server's paths can lead to `key`."""
-    try:
-        check_element(key, ())
-    except BadKey:
-        return False
-    return True
 
 
 def snippets(path: Path, url: str, namespace: str) -> dict[str, str]:

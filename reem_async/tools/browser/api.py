@@ -1,23 +1,178 @@
-"""What the page asks for: the tree, values, plots, and time. Everything as JSON, but pictures."""
+"""What the page asks for as JSON: the tree, values, plots, time, and the stream of what changed."""
 
 from __future__ import annotations
 
+import asyncio
+import json
+import math
 import secrets
+from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
+import orjson
+from starlette.datastructures import Headers
 from starlette.requests import Request
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from ...errors import BadData, BadKey, BadValue, MissingKey
+from ...errors import (
+    BadData,
+    BadInput,
+    BadKey,
+    BadValue,
+    MissingKey,
+    NotAllowed,
+    PartialWrite,
+    PathRefused,
+    RedisError,
+    ReemError,
+    ServerFull,
+    ServerReadOnly,
+    WrongKind,
+)
 from ...plan.paths import Path, show
 from .addresses import address, path_of
-from .answers import Refused, answered, at_of, body_of, integer_of, number_of, path_in, reply, told, value_path_in
-from .guard import same_origin
-from .nodes import Node, visible
-from .source import NotKept, Series, Source
+from .source import Node, NotKept, Series, Source, visible
 
-__all__ = ["Api"]
+# Requests: parameters are checked, and errors become answers with the right status.
+
+
+# Bytes: what a person edits on a page.
+LARGEST_BODY = 1 << 16
+
+# The first that fits counts, so special errors stand before what they are special cases of.
+_STATUS: tuple[tuple[type[Exception], int], ...] = (
+    (NotKept, 409),
+    (MissingKey, 404),
+    (BadInput, 400),
+    (PathRefused, 409),
+    (BadData, 422),
+    # The server answers, and refuses this: a page must not take it for lost.
+    *((refusal, 409) for refusal in (WrongKind, PartialWrite, NotAllowed, ServerFull, ServerReadOnly)),
+    (RedisError, 503),
+    (OSError, 503),
+    (ReemError, 500),
+)
+
+
+class Refused(Exception):
+    """A request is not answered.
+
+    Attributes:
+        status: The HTTP status.
+    """
+
+    def __init__(self, status: int, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+def reply(content: Any, status: int = 200) -> Response:
+    """Return a JSON response."""
+    return Response(orjson.dumps(content), status, media_type="application/json")
+
+
+def answered(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    """Return a handler whose errors become answers."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            return await handler(request)
+        except Refused as error:
+            return reply({"error": str(error)}, error.status)
+        except (ReemError, RedisError, OSError) as error:
+            status = next(status for kind, status in _STATUS if isinstance(error, kind))
+            return reply({"error": visible(str(error))}, status)
+
+    return answer
+
+
+def path_in(request: Request) -> Path:
+    """Return the path asked for."""
+    return path_of(request.query_params.get("path", ""))
+
+
+def value_path_in(request: Request) -> Path:
+    """Return the path asked for, which must lead to a value: the root is none.
+
+    Raises:
+        BadValue: It is missing or empty.
+    """
+    path = path_in(request)
+    if not path:
+        raise BadValue("path= is missing; give a key, such as path=foo.bar")
+    return path
+
+
+def at_of(request: Request) -> float | None:
+    """Return the instant asked for, None for now."""
+    return number_of(request, "at")
+
+
+def number_of(request: Request, name: str) -> float | None:
+    """Return a finite number, None if there is none."""
+    text = request.query_params.get(name, "")
+    if not text:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise BadValue(f"{name}={text[:20]!r} is not a number")
+    return number
+
+
+def integer_of(request: Request, name: str, default: int, most: int) -> int:
+    """Return a number from 0 to `most`."""
+    number = number_of(request, name)
+    return default if number is None else int(max(0, min(number, most)))
+
+
+def told(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
+    """Return a handler that says in its answer what is not there: to a page that follows a key, that is no error."""
+
+    async def answer(request: Request) -> Response:
+        try:
+            return await handler(request)
+        except (MissingKey, NotKept, BadData) as error:
+            return reply({"missing": visible(str(error))})
+
+    return answered(answer)
+
+
+async def body_of(request: Request) -> Any:
+    """Return the JSON a request carries.
+
+    Raises:
+        Refused: More than `LARGEST_BODY`, or not JSON.
+    """
+    if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+        raise Refused(415, "send application/json")
+    body = bytearray()
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > LARGEST_BODY:
+            raise Refused(413, f"more than {LARGEST_BODY} bytes; use Python for large values")
+    try:
+        # The standard library's parser keeps integers of any size, which the store then refuses by name.
+        return json.loads(bytes(body), parse_constant=_no_number)
+    except (ValueError, RecursionError) as error:
+        raise Refused(400, f"this is not JSON: {error}") from None
+
+
+def _no_number(text: str) -> None:
+    raise ValueError(f"{text} is no number in JSON")
+
+
+def same_origin(headers: Headers) -> bool:
+    """Return whether the page that sends a request came from here: both headers are set by the browser."""
+    origin, site = headers.get("origin", ""), headers.get("sec-fetch-site", "same-origin")
+    return site == "same-origin" and origin.partition("://")[2] == headers.get("host", "") != ""
+
+
+# The tree, values, plots, and time.
+
 
 # What one question of a page may ask for, so that no page keeps the program from answering others: open branches of the
 # tree, rows of one and of all of them, paths that are marked as changed, points of a curve, paths that a search names,
@@ -192,3 +347,68 @@ def _thinned(series: Series) -> Series:
     places = sorted(chosen)
     lines = [[values[index] for index in places] for values in series.lines]
     return Series(series.names, [series.times[index] for index in places], lines)
+
+
+# Server-sent events.
+
+
+# Seconds between two looks: a page draws no faster.
+_PAUSE = 0.1
+_QUIET = 1.0
+"""Seconds after which something is sent though nothing changed: the page knows by it that all is well."""
+
+# Paths that are named; beyond, the page is told only that there are more and looks at all it shows.
+_MOST_PATHS = 100
+# Pages that are told of changes at the same time, each over a connection that stays open.
+_MOST_CLIENTS = 64
+
+
+class Events:
+    """Tells pages what changed in a source.
+
+    Each page is told which paths changed since it was last told, however long that took: a slow page
+    is told less often, and nothing piles up for it.
+
+    Args:
+        source: What is shown.
+        ending: Whether the program ends.
+    """
+
+    def __init__(self, source: Source, ending: Callable[[], bool]) -> None:
+        self._source = source
+        self._ending = ending
+        self._clients = 0
+
+    def routes(self) -> list[Route]:
+        """Return the route below /api."""
+        return [Route("/events", answered(self.events), methods=["GET"])]
+
+    async def events(self, request: Request) -> Response:
+        """Answer with a stream that goes on until the page or the program ends."""
+        if self._clients >= _MOST_CLIENTS:
+            raise Refused(503, f"{_MOST_CLIENTS} pages are open already; close some")
+        # The second keeps a proxy (nginx) from collecting events before it passes them on.
+        headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
+        return StreamingResponse(self._stream(), headers=headers, media_type="text/event-stream")
+
+    async def _stream(self) -> AsyncIterator[bytes]:
+        self._clients += 1
+        try:
+            # Milliseconds until a browser that lost the connection tries again.
+            yield b"retry: 1000\n\n"
+            told, quiet, before = self._source.status().end, 0.0, ""
+            while not self._ending():
+                status = self._source.status()
+                paths = await self._source.changes(told, status.end, _MOST_PATHS)
+                if paths or status.lost != before or quiet >= _QUIET:
+                    content = {
+                        **status._asdict(),
+                        "paths": [address(path) for path in paths],
+                        "more": len(paths) >= _MOST_PATHS,
+                    }
+                    yield b"data: " + orjson.dumps(content) + b"\n\n"
+                    told, quiet, before = status.end, 0.0, status.lost
+                await asyncio.sleep(_PAUSE)
+                quiet += _PAUSE
+        finally:
+            self._clients -= 1

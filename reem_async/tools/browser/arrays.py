@@ -1,9 +1,14 @@
-"""What the page asks of arrays and bytes: pictures, tables, lines, histograms, files."""
+"""Arrays and bytes on the page: tables, lines, histograms, pictures, and files to download."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
+import re
 from collections.abc import Callable
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 import anyio
 import anyio.to_thread
@@ -13,17 +18,290 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ...errors import BadType
+from ...errors import BadType, BadValue
 from ...plan.paths import Path, show
-from .answers import answered, at_of, integer_of, number_of, reply, told, value_path_in
-from .figures import MOST_COLUMNS, MOST_ROWS, histogram, line, statistics, table
-from .pictures import LARGEST_SIDE, MAPS, Picture, colours_of, paint
-from .previews import Preview
-from .slices import Slice, look_at, parse_slice, part
-from .source import NotKept, Sample, Source
-from .trees import Leaf
+from ..jsontext import json_text
+from .addresses import address
+from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
+from .pictures import LARGEST_SIDE, MAPS, Picture, Preview, Slice, colours_of, look_at, paint, parse_slice, part
+from .source import NotKept, Sample, Source, shown_text
+from .trees import Leaf, leaf_of
 
-__all__ = ["Arrays", "picture_type"]
+# Tables, lines and histograms: as much of an array as a screen has room for.
+
+
+# Of a table that is sent at once.
+MOST_ROWS, MOST_COLUMNS = 200, 64
+# Of a line: about as many as a screen has pixels.
+_POINTS = 1000
+# Curves in one plot: of more columns nobody can tell one from the other.
+_MOST_CURVES = 16
+# Numbers that histograms and statistics look at; of larger arrays an even selection.
+_SAMPLE = 4_000_000
+
+
+def table(plane: np.ndarray[Any, Any], row: int, column: int, rows: int, columns: int) -> dict[str, Any]:
+    """Return some rows and columns of an array of at most two axes, as text."""
+    if plane.ndim > 2:
+        raise BadValue(f"a table shows two axes, not {plane.ndim}; choose the others with an index")
+    grid = plane.reshape(-1, 1) if plane.ndim == 1 else plane.reshape(1, 1) if plane.ndim == 0 else plane
+    row, column = _start(row, grid.shape[0]), _start(column, grid.shape[1])
+    cut = grid[row : row + min(rows, MOST_ROWS), column : column + min(columns, MOST_COLUMNS)]
+    return {
+        "shape": list(grid.shape),
+        "row": row,
+        "column": column,
+        "columns": cut.shape[1],
+        "cells": [[cell(item) for item in items] for items in cut],
+    }
+
+
+def _start(wanted: int, size: int) -> int:
+    return max(0, min(wanted, size - 1))
+
+
+def cell(item: Any) -> str:
+    """Return one item of an array as text: numbers with all their digits, of which the page shows six."""
+    if isinstance(item, np.floating):
+        return str(item).removesuffix(".0")
+    if isinstance(item, np.complexfloating):
+        return f"{complex(item):.5g}"
+    if isinstance(item, np.integer) and not isinstance(item, np.timedelta64):
+        return str(int(item))
+    if isinstance(item, np.bool_):
+        return "true" if item else "false"
+    text = shown_text(str(item), 80)
+    return text if isinstance(item, np.str_) else text[1:-1]
+
+
+def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
+    """Return an array of one axis, or its columns, as lines: the extremes of each part where there are too many.
+
+    Of complex numbers it is the magnitude, and `magnitude` says so.
+    """
+    if plane.ndim not in (1, 2) or plane.dtype.kind not in "biufc":
+        raise BadValue(f"an array of {plane.dtype} {list(plane.shape)} is no line; choose axes with an index")
+    magnitude = plane.dtype.kind == "c"
+    if magnitude:
+        plane = np.abs(plane)
+    columns = plane.reshape(-1, 1) if plane.ndim == 1 else plane
+    total = columns.shape[1]
+    columns = columns[:, :_MOST_CURVES]
+    places, picked = _thinned(columns)
+    names = [""] if plane.ndim == 1 else [f"[{index}]" for index in range(columns.shape[1])]
+    return {
+        "names": names,
+        "times": places,
+        "lines": [[_finite(item) for item in column] for column in picked.T.tolist()],
+        "more": total - columns.shape[1],
+        "magnitude": magnitude,
+    }
+
+
+def _thinned(columns: np.ndarray[Any, Any]) -> tuple[list[int], np.ndarray[Any, Any]]:
+    """Return the rows to draw, and which they are: of each part those where a line has its extremes."""
+    count, curves = columns.shape
+    if count <= _POINTS:
+        return list(range(count)), columns
+    step = -(-count * 2 * curves // _POINTS)
+    chosen = {0, count - 1}
+    for edge in range(0, count, step):
+        piece = columns[edge : edge + step].astype(np.float64)
+        for substitute, pick in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+            chosen.update((edge + pick(np.where(np.isnan(piece), substitute, piece), axis=0)).tolist())
+    places = sorted(chosen)
+    return places, columns[places]
+
+
+def histogram(array: np.ndarray[Any, Any], bins: int = 64) -> dict[str, Any]:
+    """Return how many numbers of an array fall into each of `bins` equal parts of their range."""
+    if array.dtype.kind not in "biuf":
+        raise BadValue(f"an array of {array.dtype} has no histogram; show it as a table")
+    flat = _sampled(array).astype(np.float64)
+    flat = flat[np.isfinite(flat)]
+    if not flat.size:
+        return {"low": 0.0, "high": 1.0, "counts": []}
+    low, high = float(flat.min()), float(flat.max())
+    if array.dtype.kind in "biu" and high - low < 256:
+        # Whole numbers: a bar for each, its middle at the number.
+        low, high, bins = low - 0.5, high + 0.5, int(high - low) + 1
+    with np.errstate(all="ignore"):
+        edges = np.linspace(low, high, bins + 1)
+    if not (edges[:-1] < edges[1:]).all():  # floats have no room between them for so many parts, or no end of them
+        return {"low": low, "high": high, "counts": [int(flat.size)]}
+    counts, _ = np.histogram(flat, bins, (low, high))
+    return {"low": low, "high": high, "counts": counts.tolist()}
+
+
+def statistics(array: np.ndarray[Any, Any]) -> dict[str, Any]:
+    """Return the smallest and largest number, the mean, and how many are not finite; empty for what has none."""
+    if array.dtype.kind not in "biuf" or not array.size:
+        return {}
+    sample = _sampled(array)
+    finite = sample[np.isfinite(sample)] if sample.dtype.kind == "f" else sample
+    found: dict[str, Any] = {"bad": int(sample.size - finite.size), "sampled": sample.size < array.size}
+    if finite.size:
+        with np.errstate(all="ignore"):
+            mean = float(finite.mean(dtype=float))
+        found |= {
+            "low": cell(finite.min()),
+            "high": cell(finite.max()),
+            "mean": repr(mean).removesuffix(".0"),
+        }
+    return found
+
+
+def _sampled(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    flat = array.reshape(-1)
+    return flat[:: -(-flat.size // _SAMPLE)] if flat.size > _SAMPLE else flat
+
+
+def _finite(item: Any) -> float | None:
+    number = float(item)
+    return number if math.isfinite(number) else None
+
+
+# Files: `/view/<path>?format=json`, `npy`, `csv`, `png` or `bin`.
+
+
+_LONGEST_LIST = 1_000_000
+"""Numbers of an array up to which it is written as a list."""
+# All else is replaced in the plain name; the second one has all characters, percent-encoded (RFC 6266).
+_UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+def file_of(value: Any, path: Path, kind: str, chosen: str | None) -> tuple[bytes, str]:
+    """Return a value as a file, and its media type.
+
+    Args:
+        value: The value, arrays included.
+        path: Where it is.
+        kind: One of `FORMATS`.
+        chosen: The part of an array that is wanted, such as "0,:,:"; None for what a view shows first.
+
+    Raises:
+        BadType: The value cannot be such a file.
+        BadValue: There is no such format.
+    """
+    if kind not in FORMATS:
+        raise BadValue(f"format={kind[:20]!r} is none of {', '.join(FORMATS)}")
+    make, media_type = FORMATS[kind]
+    return make(value, path, chosen), media_type
+
+
+def disposition(path: Path, kind: str, chosen: str | None = None) -> str:
+    """Return the header that gives a file its name; that of a part of an array says which."""
+    whole = address(path)[:80] + (f"[{chosen[:40]}]" if chosen else "")
+    name = _UNSAFE.sub("_", whole).strip("._") or "value"
+    return f"attachment; filename=\"{name}.{kind}\"; filename*=UTF-8''{quote(f'{whole}.{kind}', '')}"
+
+
+def _json(value: Any, path: Path, chosen: str | None) -> bytes:
+    _check_json(value, path)
+    try:
+        return json_text(value, pretty=True).encode()
+    except UnicodeEncodeError:
+        raise _no_text(path) from None
+
+
+def _check_json(value: Any, path: Path) -> None:
+    """Raise BadType for what is not kept for this instant, and for arrays that are too long for a list."""
+    if isinstance(value, dict | list):
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            _check_json(item, (*path, key))
+    elif not (value is None or isinstance(value, str | bool | int | float | bytes)):
+        if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST:
+            return
+        leaf = leaf_of(value)
+        raise BadType(f"{show(path)}, {leaf.label} {leaf.summary}, cannot be JSON; choose npy for it, or use Python")
+
+
+def _bin(value: Any, path: Path, chosen: str | None) -> bytes:
+    if not isinstance(value, bytes):
+        raise BadType(f"{show(path)} is of type {type(value).__name__}, not bytes; use another format")
+    return value
+
+
+def _npy(value: Any, path: Path, chosen: str | None) -> bytes:
+    array = _array(value, path)
+    file = io.BytesIO()
+    np.lib.format.write_array(file, _part(array, chosen, array.ndim), allow_pickle=False)
+    return file.getvalue()
+
+
+def _csv(value: Any, path: Path, chosen: str | None) -> bytes:
+    array = _array(value, path)
+    if chosen is None and array.ndim > 2:
+        raise BadType(
+            f"{show(path)} has {array.ndim} axes, CSV two: choose a slice, such as {'0,' * (array.ndim - 2)}:,:"
+        )
+    plane = _part(array, chosen, 2)
+    file = io.StringIO()
+    writer = csv.writer(file)
+    # A structured array has a column for each field.
+    names = plane.dtype.names
+    if names:
+        writer.writerow(names)
+        rows = plane.reshape(-1).tolist()
+    else:
+        rows = plane.reshape(-1, 1).tolist() if plane.ndim < 2 else plane.tolist()
+    writer.writerows([[_cell(item) for item in row] for row in rows])
+    try:
+        return file.getvalue().encode()
+    except UnicodeEncodeError:
+        raise _no_text(path) from None
+
+
+def _no_text(path: Path) -> BadType:
+    """Return what is raised for text of an array that no file of text can hold."""
+    return BadType(f"{show(path)} has an array with half of a surrogate pair, which UTF-8 lacks; choose npy for it")
+
+
+def _cell(item: Any) -> Any:
+    """Return what goes into a cell: text that a spreadsheet would run as a formula is quoted."""
+    return f"'{item}" if isinstance(item, str) and item[:1] in ("=", "+", "-", "@", "\t") else item
+
+
+def _png(value: Any, path: Path, chosen: str | None) -> bytes:
+    array = _array(value, path)
+    if chosen is None:
+        plane = look_at(array.dtype, array.shape).views.get("image")
+        if plane is None:
+            raise BadType(f"{show(path)}, an array of {array.dtype} {list(array.shape)}, is no picture")
+        return paint(part(array, plane), side=LARGEST_SIDE).png
+    return paint(_part(array, chosen, 3), side=LARGEST_SIDE).png
+
+
+def _array(value: Any, path: Path) -> np.ndarray[Any, Any]:
+    if isinstance(value, np.ndarray):
+        return value
+    if isinstance(value, list):
+        try:
+            array = np.array(value)
+        except ValueError:
+            array = np.array([], object)
+        if array.dtype.kind in "biuf":
+            return array
+    what = "not kept for this instant" if isinstance(value, Leaf) else f"of type {type(value).__name__}"
+    raise BadType(f"{show(path)} is {what}, not an array; use format=json")
+
+
+def _part(array: np.ndarray[Any, Any], chosen: str | None, most_free: int) -> np.ndarray[Any, Any]:
+    return array if chosen is None else part(array, parse_slice(chosen, array.shape, most_free))
+
+
+FORMATS: dict[str, tuple[Callable[[Any, Path, str | None], bytes], str]] = {
+    "json": (_json, "application/json"),
+    "npy": (_npy, "application/octet-stream"),
+    "csv": (_csv, "text/csv; charset=utf-8"),
+    "png": (_png, "image/png"),
+    "bin": (_bin, "application/octet-stream"),
+}
+"""What a value can be downloaded as."""
+
+
+# The routes.
+
 
 Result = TypeVar("Result")
 

@@ -17,14 +17,10 @@ from ...store.reader import DocumentReader
 from .addresses import address, snippets
 from .follower import Follower
 from .history import History
-from .marks import differing
-from .nodes import Node, Page, node_of
 from .partial_reads import keys_at, peek
-from .source import NotKept, Sample, Series, Status, counted, numbers_in
+from .source import Node, NotKept, Page, Sample, Series, Status, counted, node_of, numbers_in
 from .timeline import UNKNOWN
-from .trees import Frame, Leaf, thawed, tree_of_outline, walk
-
-__all__ = ["LiveSource"]
+from .trees import Frame, Leaf, differing, thawed, tree_of_outline, walk
 
 _LARGEST = 1 << 28
 """Bytes of arrays up to which a value is read for a page."""

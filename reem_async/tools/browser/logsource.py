@@ -17,12 +17,8 @@ from ...plan.paths import Path, show
 from ...plan.trees import MISSING, get
 from ..recording.log import Log, open_log
 from .addresses import address
-from .marks import differing
-from .nodes import Node, Page, node_of
-from .source import Sample, Series, Status, counted, is_small_vector, numbers_in, rate_span
-from .trees import tree_of_outline, walk
-
-__all__ = ["LogSource"]
+from .source import Node, Page, Sample, Series, Status, counted, is_small_vector, node_of, numbers_in, rate_span
+from .trees import differing, tree_of_outline, walk
 
 Result = TypeVar("Result")
 

@@ -17,10 +17,8 @@ from ...plan.reads import count_in, entries_command, get_command
 from ...plan.replies import checked, type_name
 from ...session import Session
 from .addresses import is_addressable
-from .nodes import Node, node_of, shown_text
+from .source import Node, node_of, shown_text
 from .trees import tree_of
-
-__all__ = ["keys_at", "noted_text", "noted_texts", "peek"]
 
 _LONGEST = 2048
 """Bytes of a text that are fetched to show its beginning; placeholders are shorter."""

@@ -1,8 +1,9 @@
-"""Arrays as PNG: grey, colour, and colour maps for everything else; scaled down to the screen."""
+"""Arrays as pictures: which part of one is shown, PNG files with colour maps, and the small pictures that are kept."""
 
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,117 @@ from PIL import Image
 
 from ...errors import BadValue
 
-__all__ = ["LARGEST_SIDE", "MAPS", "Picture", "colours_of", "paint", "range_of", "shrunk"]
+# The part of an array that a view shows: one index or a colon for each axis.
+
+
+Slice = tuple[int | None, ...]
+"""For each axis an index, or None for all of it."""
+
+_INDEX = re.compile(r"-?\d{1,12}")
+# Rows and columns up to which an array is read as numbers.
+_SMALL = 16
+# Columns up to which an array is drawn as lines.
+_MOST_CURVES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How an array can be shown.
+
+    Attributes:
+        view: What says most: "image", "line" or "table"; empty for an array without items.
+        views: All that make sense, each with the part of the array it begins with.
+    """
+
+    view: str
+    views: dict[str, Slice]
+
+
+def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Look:
+    """Return how an array of this dtype and shape is best shown."""
+    if 0 in shape:
+        return Look("", {})
+    if not shape:
+        return Look("table", {"table": ()})
+    numeric = dtype.kind in "biuf"
+    views: dict[str, Slice] = {}
+    # The order is that of the tabs of the page.
+    if numeric and (plane := _image_slice(dtype, shape)) is not None:
+        views["image"] = plane
+    if numeric or dtype.kind == "c":
+        views["line"] = _line_slice(shape)
+    views["table"] = _leading(shape, 2) if not _has_channels(shape) else (None, None, 0)[-len(shape) :]
+    if _has_channels(shape) and len(shape) > 3:
+        views["table"] = (*[0] * (len(shape) - 3), None, None, 0)
+    if numeric:
+        views["histogram"] = (None,) * len(shape)
+    return Look(_best(shape, views), views)
+
+
+def _best(shape: tuple[int, ...], views: dict[str, Slice]) -> str:
+    if "image" in views and min(_image_size(shape)) >= _SMALL:
+        return "image"
+    narrow = len(shape) == 1 or (len(shape) == 2 and shape[1] <= _MOST_CURVES)
+    return "line" if "line" in views and narrow and shape[0] > _SMALL else "table"
+
+
+def _has_channels(shape: tuple[int, ...]) -> bool:
+    return len(shape) >= 3 and shape[-1] in (1, 3, 4) and min(shape[-3:-1]) > 1
+
+
+def _image_size(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return shape[-3:-1] if _has_channels(shape) else shape[-2:]
+
+
+def _image_slice(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Slice | None:
+    if len(shape) < 2:
+        return None
+    return _leading(shape, 3 if _has_channels(shape) else 2)
+
+
+def _line_slice(shape: tuple[int, ...]) -> Slice:
+    if _has_channels(shape):  # the channels along the row in the middle
+        return (*[0] * (len(shape) - 3), shape[-3] // 2, None, None)
+    if len(shape) >= 2 and shape[-1] <= _MOST_CURVES:
+        return _leading(shape, 2)
+    return (*[size // 2 for size in shape[:-2]], *([shape[-2] // 2] if len(shape) > 1 else []), None)
+
+
+def _leading(shape: tuple[int, ...], free: int) -> Slice:
+    fixed = max(len(shape) - free, 0)
+    return (*[0] * fixed, *[None] * (len(shape) - fixed))
+
+
+def parse_slice(text: str, shape: tuple[int, ...], most_free: int) -> Slice:
+    """Return the part that `text` names, such as "0,:,:".
+
+    Raises:
+        BadValue: Not one colon or index within its axis for each of the axes, or too many colons.
+    """
+    words = [word.strip() for word in text.split(",")] if text.strip() else []
+    if len(words) != len(shape):
+        raise BadValue(f"the slice {text[:40]!r} has {len(words)} parts, the array has {len(shape)} axes")
+    found: list[int | None] = []
+    for word, size in zip(words, shape, strict=True):
+        if word == ":":
+            found.append(None)
+        elif _INDEX.fullmatch(word) and -size <= int(word) < size:
+            found.append(int(word))
+        else:
+            raise BadValue(f"the slice has {word[:20]!r} for an axis of {size} items; use : or a number below {size}")
+    if found.count(None) > most_free:
+        raise BadValue(f"the slice {text[:40]!r} leaves {found.count(None)} axes; this view shows {most_free} at most")
+    return tuple(found)
+
+
+def part(array: np.ndarray[Any, Any], chosen: Slice) -> np.ndarray[Any, Any]:
+    """Return the part of an array, without copying it."""
+    view: np.ndarray[Any, Any] = array[tuple([slice(None) if index is None else index for index in chosen])]
+    return np.asarray(view)
+
+
+# PNG: grey, colour, and colour maps for everything else; scaled down to the screen.
+
 
 # Nine colours each, evenly spaced; what is between is mixed.
 _ANCHORS = {
@@ -157,3 +268,82 @@ def _lookup(colours: str) -> np.ndarray[Any, Any]:
 def colours_of(colours: str) -> list[str]:
     """Return 64 colours of a map, from its low to its high end, as CSS writes them; raises BadValue."""
     return [f"#{red:02x}{green:02x}{blue:02x}" for red, green, blue in _lookup(colours)[1::4].tolist()]
+
+
+# Previews: what is kept of an array if there is no room for the whole.
+
+
+_SIDE = 320
+"""Pixels of the longer side: a quarter of those of a camera's 640 x 480."""
+
+# Of JPEG, 1 to 95: a preview is to be small, and stands for what is not kept.
+_QUALITY = 80
+_LEVELS = 254
+"""Levels of a number; one more, the first, stands for what is not finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Preview:
+    """A small picture of an array.
+
+    Attributes:
+        file: A JPEG file of bytes, a PNG file of anything else: its numbers in 254 levels from `low` to `high`.
+        dtype, shape: Those of the array.
+        chosen: The part of the array that it shows: what a view begins with.
+        low, high: The range of the numbers in that part.
+        bad: How many of them are NaN or infinite.
+    """
+
+    file: bytes
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    chosen: Slice
+    low: float
+    high: float
+    bad: int
+
+    def paint(self, colours: str, low: float | None, high: float | None, *, side: int, bgr: bool) -> Picture:
+        """Return the picture, as `pictures.paint` would make it of the array; raises BadValue."""
+        low, high = self.low if low is None else low, self.high if high is None else high
+        found = paint(self._pixels(), colours, low, high, side=side, bgr=bgr)
+        axes = [size for size, index in zip(self.shape, self.chosen, strict=True) if index is None]
+        return Picture(found.png, found.low, found.high, self.bad, (axes[1], axes[0]))
+
+    def _pixels(self) -> np.ndarray[Any, Any]:
+        pixels = np.asarray(Image.open(io.BytesIO(self.file)))
+        if self.dtype == np.uint8:
+            return pixels
+        # Halves: the difference of two large floats may be more than the largest float.
+        part = np.maximum(pixels.astype(np.float64) - 1, 0) / _LEVELS
+        numbers = 2 * (self.low / 2 + part * (self.high / 2 - self.low / 2))
+        return np.where(pixels == 0, np.nan, numbers)
+
+
+def preview_of(array: np.ndarray[Any, Any]) -> Preview | None:
+    """Return a small picture of an array, None of one that is no picture or not larger than its preview."""
+    look = look_at(array.dtype, array.shape)
+    if look.view != "image":
+        return None
+    chosen = look.views["image"]
+    plane = part(array, chosen)
+    if plane.ndim == 3 and plane.shape[2] == 1:
+        plane = plane[:, :, 0]
+    low, high, bad = range_of(plane, None, None)
+    file = io.BytesIO()
+    # A camera's picture compresses well as JPEG; numbers must come back as numbers, so they are PNG in levels.
+    if plane.dtype == np.uint8:
+        image = Image.fromarray(np.ascontiguousarray(shrunk(plane, _SIDE)))
+        image.save(file, "PNG" if image.mode == "RGBA" else "JPEG", quality=_QUALITY)  # JPEG has no transparency
+    else:
+        Image.fromarray(_preview_levels(shrunk(plane, _SIDE), low, high)).save(file, "PNG", compress_level=3)
+    small = file.getvalue()
+    # A preview that is not much smaller than its array is no help.
+    return Preview(small, array.dtype, array.shape, chosen, low, high, bad) if len(small) < array.nbytes // 2 else None
+
+
+def _preview_levels(plane: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
+    numbers = plane.astype(np.float64)
+    with np.errstate(all="ignore"):
+        scaled = (numbers / 2 - low / 2) / ((high / 2 - low / 2) or 1.0) * _LEVELS
+    levels = np.clip(np.nan_to_num(scaled) + 0.5, 0, _LEVELS).astype(np.uint8) + np.uint8(1)
+    return np.ascontiguousarray(np.where(np.isfinite(numbers), levels, np.uint8(0)))

@@ -12,8 +12,6 @@ from ...plan.paths import Path, below
 from ...plan.trees import MISSING, get
 from .trees import changed, strip, tree_of, weight
 
-__all__ = ["PENDING", "UNKNOWN", "BufferedPast", "Change", "Kept", "concerns"]
-
 PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
 """In place of a value that was announced, and is not known."""
 

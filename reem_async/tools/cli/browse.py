@@ -99,7 +99,7 @@ def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: i
 
 async def _serve(source: Source, host: str, port: int, allow_write: bool, open_: bool) -> None:
     from reem_async.tools.browser import PageServer, create_app, listen
-    from reem_async.tools.browser.guard import LOOPBACK, is_loopback, new_token, own_names
+    from reem_async.tools.browser.app import LOOPBACK, is_loopback, new_token, own_names
 
     # Reachable from this machine only: then the name in the request is checked, and no token is needed. From others
     # a token is, and the name may be any of this machine's.
@@ -133,7 +133,7 @@ def _has_screen() -> bool:
 
 
 def _address(host: str, port: int, token: str | None) -> str:
-    from reem_async.tools.browser.guard import own_address
+    from reem_async.tools.browser.app import own_address
 
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
         host = own_address(host)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from ...errors import BadData, ReemError
 
-__all__ = ["DamagedRecording", "RecordingFailed"]
-
 
 class RecordingFailed(ReemError):
     """The file could not be written any further (disk full, ...); what was written until then can be read."""

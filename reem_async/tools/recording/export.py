@@ -21,8 +21,6 @@ from .log import EXACT, Log, numbers
 from .roles import Kind
 from .stored import Stored, is_inline
 
-__all__ = ["FORMATS", "Export", "check_format", "export"]
-
 # Rows of a group in a Parquet file, and those that are in memory at once.
 _ROWS = 10_000
 _DELETED, _STORED = "", "."

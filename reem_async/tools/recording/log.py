@@ -21,14 +21,11 @@ from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.packing import CommandRecorder
-from .container import Container
+from .container import Container, Ref, Totals
 from .log_reader import RecordedPast, Stream
 from .roles import Role
 from .stored import LOST, Stored, pruned, resolve
-from .timeline import Ref, Totals
 from .times import Instant, nanoseconds, seconds
-
-__all__ = ["EXACT", "ArrayHandle", "ChannelSummary", "Log", "LogPath", "LogUpdate", "numbers", "open_log", "stacked"]
 
 # Whole keys as they were at some instant: who goes through time, or draws a slider, asks for neighbours again and
 # again.

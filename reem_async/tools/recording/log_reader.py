@@ -18,17 +18,13 @@ from ...plan.paths import Path, Pattern, below
 from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .container import Container, Progress
+from .container import Container, Progress, Ref, Timeline, Totals
 from .errors import DamagedRecording
-from .layout import from_json
+from .layout import decode, from_json
 from .mcap_reader import Numbers
-from .messages import decode
 from .roles import NEWS, Kind, Role
 from .sink import CHANNELS
 from .stored import LOST, Stored, applied, opened
-from .timeline import Ref, Timeline, Totals
-
-__all__ = ["RecordedPast", "Stream"]
 
 
 @dataclass(frozen=True, slots=True)

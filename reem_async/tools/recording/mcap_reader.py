@@ -21,11 +21,6 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, MetadataIndex, Schema, Statistics
 
-__all__ = [
-    "HEAD", "MAGIC", "ChunkInfo", "Contents", "Footer", "Index", "Numbers", "Source", "index_of", "index_places",
-    "parse_index", "read_footer", "read_summary", "record_starts",
-]  # fmt: skip
-
 Numbers = np.ndarray[Any, Any]
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -34,10 +34,8 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from .contents import slices
 from .output import Output
-from .yielding import slices
-
-__all__ = ["COMPRESSIONS", "Writer"]
 
 _MAGIC = b"\x89MCAP0\r\n"
 # Bytes after which a chunk is closed: large enough to compress well, small enough to be unpacked for one message.

@@ -11,9 +11,7 @@ from typing import Any
 
 from ...errors import BadValue
 from ..partfile import Lock, PartFile, is_locked, lock
-from .yielding import slices
-
-__all__ = ["FileGone", "Output"]
+from .contents import slices
 
 
 class FileGone(OSError):

@@ -18,8 +18,6 @@ from .log import Log, LogUpdate
 from .roles import Kind
 from .times import Instant, nanoseconds, seconds
 
-__all__ = ["ReplayStatus", "Replayer"]
-
 
 @dataclass(frozen=True, slots=True)
 class ReplayStatus:

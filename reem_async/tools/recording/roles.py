@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-__all__ = ["NEWS", "Kind", "Role"]
-
 
 class Role(StrEnum):
     """What a message says; the metadata of its channel has it as `reem.role`."""

@@ -15,8 +15,6 @@ from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
 from ...session import Session
 from .key_reader import fetch
 
-__all__ = ["Sample", "Sampler", "read_key_file", "samples_of"]
-
 
 class Sample(NamedTuple):
     """A path that is read every so many seconds."""

@@ -23,24 +23,10 @@ import orjson
 from ...errors import BadValue
 from ...plan.paths import Path, show
 from .errors import RecordingFailed
-from .layout import Document, topic_of
+from .layout import Document, Encoded, schema_bytes, topic_of
 from .mcap_writer import COMPRESSIONS, Writer
-from .messages import Encoded, schema_bytes
 from .output import Output
 from .roles import Kind, Role
-
-__all__ = [
-    "CHANNELS",
-    "FLUSH_SECONDS",
-    "FORMAT",
-    "OPEN",
-    "FullError",
-    "Signature",
-    "Sink",
-    "fits",
-    "schema_text",
-    "signature",
-]
 
 FORMAT = "1"
 FLUSH_SECONDS = 0.25

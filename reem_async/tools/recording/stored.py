@@ -18,26 +18,6 @@ from ...plan.trees import MISSING, CannotApply, difference, get, is_addressable,
 from .contents import Content
 from .roles import Kind, Role
 
-__all__ = [
-    "LONGEST_INLINE",
-    "LOST",
-    "New",
-    "NotWritten",
-    "Store",
-    "Stored",
-    "Unchanged",
-    "applied",
-    "carried",
-    "differing",
-    "extract",
-    "is_inline",
-    "opened",
-    "planted",
-    "pruned",
-    "resolve",
-    "without",
-]
-
 LONGEST_INLINE = 64
 """Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""
 

@@ -23,13 +23,10 @@ from ...plan.trees import MISSING, CannotApply, get, replaced, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent
-from .layout import WRAPPER, Document, to_json
-from .messages import encode
+from .layout import WRAPPER, Document, encode, to_json
 from .roles import Kind, Role
 from .sink import FullError, Sink
 from .stored import LOST, NotWritten, Stored, Unchanged, differing, extract, opened, planted, pruned, without
-
-__all__ = ["Counts", "Operation", "WriterThread"]
 
 logger = logging.getLogger("reem.recording")
 
