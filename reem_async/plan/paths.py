@@ -237,6 +237,11 @@ def below(path: Path, ancestor: Path) -> bool:
     return path[: len(ancestor)] == ancestor
 
 
+def related(one: Path, other: Path) -> bool:
+    """Return whether one path leads to, or through, the other: a change at one changes what is at the other."""
+    return below(one, other) or below(other, one)
+
+
 def may_hold(written: Path, member: Path) -> bool:
     """Return whether a write at `written` may have replaced the attachment `member`.
 

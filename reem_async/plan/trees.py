@@ -6,6 +6,7 @@ instant. The rules are those of the server, so a copy that applies every update 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from typing import Any, Final
 
@@ -75,6 +76,43 @@ def removed(tree: Any, path: Path) -> Any:
     parent = parent.copy()
     del parent[path[-1]]
     return replaced(tree, path[:-1], parent)
+
+
+def changed(tree: Any, path: Path, value: Any) -> Any:
+    """Return `tree` with `value` at `path` (MISSING removes what is there); unchanged where the server would refuse."""
+    try:
+        return removed(tree, path) if value is MISSING else replaced(tree, path, value)
+    except CannotApply:
+        return tree
+
+
+def mapped(tree: Any, convert: Callable[[Any], Any]) -> Any:
+    """Return a copy of `tree` with each leaf as `convert` returns it.
+
+    An entry of a dict for which it returns MISSING is left out. An item of a list becomes None: the others keep their
+    places.
+    """
+    kind = type(tree)
+    if kind is dict:
+        items = {key: mapped(item, convert) for key, item in tree.items()}
+        return {key: item for key, item in items.items() if item is not MISSING}
+    if kind is list:
+        found = [mapped(item, convert) for item in tree]
+        return [None if item is MISSING else item for item in found]
+    return convert(tree)
+
+
+def walk(tree: Any, path: Path) -> Iterator[tuple[Path, Any]]:
+    """Yield every path in `tree`, which is at `path`, and what is there; parents first."""
+    # No recursion: documents may be nested a hundred deep, and a generator for each level is slow.
+    stack = [(path, tree)]
+    while stack:
+        where, it = stack.pop()
+        yield where, it
+        if type(it) is dict:
+            stack.extend([((*where, key), item) for key, item in reversed(it.items())])
+        elif type(it) is list:
+            stack.extend([((*where, key), it[key]) for key in reversed(range(len(it)))])
 
 
 def copied(tree: Any) -> Any:

@@ -12,10 +12,10 @@ from itertools import takewhile
 from operator import attrgetter
 from typing import Any
 
-from ...plan.paths import Path
+from ...plan.paths import Path, related
 from ...plan.trees import MISSING
 from .source import rate_span
-from .timeline import PENDING, UNKNOWN, BufferedPast, Change, Kept, concerns
+from .timeline import PENDING, UNKNOWN, BufferedPast, Change, Kept
 from .trees import Frame, Leaf, same, tree_of, walk, weight
 
 # One clock for everything in the buffer, which is never set back.
@@ -87,7 +87,7 @@ class Frames:
     def concerning(self, path: Path) -> Iterator[Frame]:
         """Yield the frames at, above and below a path."""
         for where, line in self._lines.items():
-            if concerns(where, path):
+            if related(where, path):
                 yield from line
 
     def forget(self, start: float, is_there: Callable[[Path], bool]) -> None:

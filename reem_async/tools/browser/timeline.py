@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ...errors import BadData
 from ...plan.past import Past
-from ...plan.paths import Path, below
+from ...plan.paths import Path, related
 from ...plan.trees import MISSING, get
 from .trees import changed, strip, tree_of, weight
 
@@ -52,11 +52,6 @@ class Kept(NamedTuple):
     late: float = 0.0
 
 
-def concerns(where: Path, path: Path) -> bool:
-    """Return whether a change at one path changes what is at the other."""
-    return below(path, where) or below(where, path)
-
-
 class Places:
     """The numbers of changes by their paths."""
 
@@ -87,14 +82,14 @@ class Places:
     def lasts(self, end: int, path: Path = ()) -> Iterator[int]:
         """Yield the last number below `end` of each path that concerns `path`; of all for the root."""
         for where in self._numbers:
-            if not path or concerns(where, path):
+            if not path or related(where, path):
                 number = self.last(where, end)
                 if number >= 0:
                     yield number
 
     def of(self, path: Path) -> list[int]:
         """Return the numbers of all changes that concern `path`, in order."""
-        found = [numbers for where, numbers in self._numbers.items() if concerns(where, path)]
+        found = [numbers for where, numbers in self._numbers.items() if related(where, path)]
         return found[0].copy() if len(found) == 1 else sorted([number for numbers in found for number in numbers])
 
 
@@ -261,7 +256,7 @@ class BufferedPast(Past[int]):
         wanted = set(paths)
         count = self.upto(at)
         for change in reversed(self.changes[max(count - _LOOK_BACK, 0) : count]):
-            hit = [path for path in wanted if concerns(change.path, path)]
+            hit = [path for path in wanted if related(change.path, path)]
             for path in hit:
                 found[path] = change.time
                 wanted.discard(path)

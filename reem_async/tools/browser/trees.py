@@ -13,7 +13,9 @@ import orjson
 from ...errors import BadData
 from ...plan.paths import Path
 from ...plan.placeholders import Unreadable, find, marked
-from ...plan.trees import MISSING, CannotApply, get, removed, replaced
+from ...plan.trees import MISSING, get, mapped
+from ...plan.trees import changed as changed
+from ...plan.trees import walk as walk
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
 from .pictures import preview_of
@@ -72,22 +74,12 @@ _SHIPPED = (Frame, Leaf, np.ndarray, bytes)
 
 def framed(tree: Any) -> Any:
     """Return `tree` with a `Frame` in the place of each array and of bytes; it takes milliseconds for a picture."""
-    if isinstance(tree, dict):
-        return {key: framed(item) for key, item in tree.items()}
-    if isinstance(tree, list):
-        return [framed(item) for item in tree]
-    return Frame(tree) if isinstance(tree, np.ndarray | bytes) else tree
+    return mapped(tree, lambda it: Frame(it) if isinstance(it, np.ndarray | bytes) else it)
 
 
 def thawed(tree: Any) -> Any:
-    """Return `tree` with the content of each `Frame` in its place, or what is to be said of it."""
-    if isinstance(tree, dict):
-        return {key: thawed(item) for key, item in tree.items()}
-    if isinstance(tree, list):
-        return [thawed(item) for item in tree]
-    if isinstance(tree, Frame):
-        return tree.leaf if tree.whole is None else tree.whole
-    return tree
+    """Return `tree` with the content of each `Frame` in its place, or a `Leaf` if the content is not kept."""
+    return mapped(tree, lambda it: (it.leaf if it.whole is None else it.whole) if isinstance(it, Frame) else it)
 
 
 def leaf_of(value: Any) -> Leaf:
@@ -135,27 +127,6 @@ def tree_of_outline(it: Outline) -> Any:
     return Leaf(it.kind, it.summary, it.size)
 
 
-def changed(tree: Any, path: Path, value: Any) -> Any:
-    """Return `tree` with `value` at `path` (MISSING removes what is there); unchanged where that does not fit."""
-    try:
-        return removed(tree, path) if value is MISSING else replaced(tree, path, value)
-    except CannotApply:
-        return tree
-
-
-def walk(tree: Any, path: Path) -> Iterator[tuple[Path, Any]]:
-    """Yield every path in `tree`, which is at `path`, and what is there; parents first."""
-    # No recursion: documents may be nested a hundred deep, and a generator for each level is slow.
-    stack = [(path, tree)]
-    while stack:
-        where, it = stack.pop()
-        yield where, it
-        if isinstance(it, dict):
-            stack.extend([((*where, key), item) for key, item in reversed(it.items())])
-        elif isinstance(it, list):
-            stack.extend([((*where, key), it[key]) for key in reversed(range(len(it)))])
-
-
 def same(one: Any, other: Any) -> bool:
     """Return whether two trees are equal, as far as is known: of arrays, that they are alike."""
     if isinstance(one, dict) and isinstance(other, dict):
@@ -183,11 +154,8 @@ def _bits(it: Any) -> bytes | None:
 
 def strip(tree: Any) -> Any:
     """Return `tree` with a `Leaf` in the place of everything that a ship carries, but what a `Frame` holds."""
-    if isinstance(tree, dict):
-        return {key: strip(item) for key, item in tree.items()}
-    if isinstance(tree, list):
-        return [strip(item) for item in tree]
-    return tree if isinstance(tree, (Frame, Unreadable, *_SCALARS)) or tree is MISSING else leaf_of(tree)
+    kept = (Frame, Unreadable, *_SCALARS)
+    return mapped(tree, lambda it: it if isinstance(it, kept) or it is MISSING else leaf_of(it))
 
 
 def weight(tree: Any) -> int:

@@ -14,7 +14,7 @@ from mcap.records import Channel, Metadata
 
 from ...errors import BadData
 from ...plan.past import Past
-from ...plan.paths import Path, Pattern, below
+from ...plan.paths import Path, Pattern, below, related
 from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
@@ -274,7 +274,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
     def _concerning(self, path: Path) -> list[Stream]:
         """Return the streams with news on what is at, above or below a path."""
         streams = self.names.get(str(path[0]), []) if path else self.streams
-        return [it for it in streams if it.role in NEWS and (below(it.path, path) or below(path, it.path))]
+        return [it for it in streams if it.role in NEWS and related(it.path, path)]
 
     def updates(self, after: int, until: int, patterns: Sequence[Pattern]) -> Iterator[tuple[Ref, Stream, Any]]:
         """Yield all news that patterns name between two instants; what is damaged is skipped."""
@@ -300,10 +300,10 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         """
         anchor, streams = self._anchor(path), self._streams_of(path)
         roles = (*NEWS, Role.KEYFRAME)
-        related = [it for it in streams if it.role in roles and (below(it.path, anchor) or below(anchor, it.path))]
-        tree = self.tree(anchor, after) if related and after >= 0 else MISSING
+        chosen = [it for it in streams if it.role in roles and related(it.path, anchor)]
+        tree = self.tree(anchor, after) if chosen and after >= 0 else MISSING
         last: Any = MISSING
-        for refs in self._instants([each for it in related for each in it.channels], after, until):
+        for refs in self._instants([each for it in chosen for each in it.channels], after, until):
             is_read, is_whole = False, True
             for ref in refs:
                 stream = self._of_channel[ref.channel]

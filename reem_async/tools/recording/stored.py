@@ -14,7 +14,7 @@ import numpy as np
 
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING, CannotApply, difference, get, is_addressable, removed, replaced, same
+from ...plan.trees import MISSING, changed, difference, get, is_addressable, mapped, removed, replaced, same
 from .contents import Content
 from .roles import Kind, Role
 
@@ -86,7 +86,9 @@ def carried(tree: Any, before: Any) -> Any:
     """Return what was read, with what an earlier read brought that `before` has and that will not be written itself."""
     news: dict[int, New] = {}
     _collect(before, news)
-    return _with(tree, news) if news else tree
+    if not news:
+        return tree
+    return mapped(tree, lambda it: news.get(id(it), it) if type(it) is Unchanged else it)
 
 
 def _collect(tree: Any, news: dict[int, New]) -> None:
@@ -94,14 +96,6 @@ def _collect(tree: Any, news: dict[int, New]) -> None:
         news[id(tree.later)] = tree
     for child in tree.values() if type(tree) is dict else tree if type(tree) is list else ():
         _collect(child, news)
-
-
-def _with(tree: Any, news: dict[int, New]) -> Any:
-    if type(tree) is dict:
-        return {key: _with(child, news) for key, child in tree.items()}
-    if type(tree) is list:
-        return [_with(child, news) for child in tree]
-    return news.get(id(tree), tree) if type(tree) is Unchanged else tree
 
 
 class NotWritten(Exception):
@@ -164,16 +158,9 @@ def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
 def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
     """Return a copy of `tree` with every `Stored` replaced by what `load` makes of it.
 
-    What it makes MISSING of is left out; an item of a list is None then, and the others keep their places.
+    What it makes MISSING of is left out, as in `mapped`.
     """
-    kind = type(tree)
-    if kind is dict:
-        items = {key: resolve(item, load) for key, item in tree.items()}
-        return {key: item for key, item in items.items() if item is not MISSING}
-    if kind is list:
-        found = [resolve(item, load) for item in tree]
-        return [None if item is MISSING else item for item in found]
-    return load(tree) if kind is Stored else tree
+    return mapped(tree, lambda it: load(it) if type(it) is Stored else it)
 
 
 def opened(tree: Any, path: Path, load: Callable[[Stored], Any]) -> Any:
@@ -212,14 +199,9 @@ def planted(tree: Any, path: Path, value: Any) -> Any:
 
 def applied(tree: Any, path: Path, role: Role, kind: Kind, value: Any) -> Any:
     """Return `tree` after one recorded update of `path`; unchanged where the server had refused it."""
-    if role == Role.DELETE:
-        return without(tree, path, kind)
-    if kind == Kind.READ:
-        return planted(tree, path, value)
-    try:
-        return replaced(tree, path, value)
-    except CannotApply:
-        return tree
+    if kind != Kind.READ:
+        return changed(tree, path, MISSING if role == Role.DELETE else value)
+    return without(tree, path, kind) if role == Role.DELETE else planted(tree, path, value)
 
 
 def without(tree: Any, path: Path, kind: Kind) -> Any:
