@@ -26,7 +26,7 @@ import reem.recording
 from reem_async.errors import BadData, BadValue, MissingKey
 from reem_async.tools.recording import DamagedRecording, Recorder, RecordingFailed, open_log
 from reem_async.tools.recording import mcap_writer as recording_writer
-from reem_async.tools.recording.mcap_writer import Writer
+from reem_async.tools.recording.mcap_writer import McapWriter
 from reem_async.tools.recording.output import Output
 from reem_async.tools.recording.times import Arrivals
 
@@ -68,7 +68,7 @@ def test_what_is_written_is_what_the_library_reads(compression, tmp_path):
     file, rng = tmp_path / "written.mcap", random.Random(1)
     sizes = [0, 1, 100, (1 << 16) - 1, 1 << 16, (1 << 16) + 1, 3 << 20, *(rng.randrange(3000) for _ in range(500))]
     output = Output(file, overwrite=False)
-    writer = Writer(output, compression, "test")
+    writer = McapWriter(output, compression, "test")
     schema = writer.register_schema("a schema", "jsonschema", b"{}")
     channels = [writer.register_channel(f"/topic{n}", "json", schema, {"key": "ä"}) for n in range(3)]
     sent = []
@@ -104,7 +104,7 @@ def test_memory_does_not_grow_with_the_length_of_a_recording(tmp_path, monkeypat
     """The index of chunks grows by ten bytes for each channel and chunk; it waits in a file, and is complete."""
     monkeypatch.setattr(recording_writer, "_INDEX_BYTES", 1 << 14)
     output = Output(tmp_path / "long.mcap", overwrite=False)
-    writer = Writer(output, "none", "test")
+    writer = McapWriter(output, "none", "test")
     schema = writer.register_schema("a schema", "jsonschema", b"{}")
     channels = [writer.register_channel(f"/topic{n}", "json", schema, {}) for n in range(100)]
     used = []

@@ -24,7 +24,7 @@ from reem_async.tools.recording.layout import decode, encode, from_json, schema_
 from reem_async.tools.recording.log import stacked
 from reem_async.tools.recording.sample import read_key_file
 from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
-from reem_async.tools.recording.stored import Stored, extract, planted, pruned, resolve
+from reem_async.tools.recording.stored import Reference, extract, planted, pruned, resolve
 from reem_async.tools.recording.times import AFTER, STEP, Clock, nanoseconds, seconds
 from reem_async.transport.packing import CommandRecorder
 
@@ -50,7 +50,7 @@ def there_and_back(value):
     def store(label, path, data):
         encoded = encode(label, data, "some.path", TIME)
         kept[path] = label, encoded
-        return Stored(label, path, TIME, 0)
+        return Reference(label, path, TIME, 0)
 
     document = to_json(extract(value, ("top",), store))
     orjson.loads(document.text)
@@ -112,7 +112,7 @@ def test_viewers_see_numbers_where_they_are():
     tree = {
         "q": np.array([0.5, np.nan]),
         "n": 2**53 + 1,
-        "image": Stored("numpy", ("a", "b"), 5, 12, "", "uint8", (3, 4)),
+        "image": Reference("numpy", ("a", "b"), 5, 12, "", "uint8", (3, 4)),
     }
     shown = to_json(tree).tree
     assert shown["q"] == [0.5, None]
@@ -323,7 +323,7 @@ def test_only_what_patterns_name_is_kept():
     assert pruned({"left": 1}, ("robot",), patterns) == {}
     assert pruned(1, ("robot",), patterns) is MISSING
     assert pruned(tree, ("arm",), patterns) is MISSING
-    long, image = (Stored(label, ("robot", "left"), 0, 9) for label in ("list", "numpy"))
+    long, image = (Reference(label, ("robot", "left"), 0, 9) for label in ("list", "numpy"))
     assert pruned({"left": long, "right": image}, ("robot",), patterns) == {"left": long}  # as a short list
 
 

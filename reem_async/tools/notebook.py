@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from .browser.pictures import Picture
+    from .browser.pictures import RenderedPicture
 
 __all__ = ["complete_below", "load_ipython_extension", "picture_of", "unload_ipython_extension"]
 
@@ -97,7 +97,7 @@ class _Shape(str):
     __repr__ = str.__str__
 
 
-def _caption(array: np.ndarray[Any, Any], found: Picture) -> str:
+def _caption(array: np.ndarray[Any, Any], found: RenderedPicture) -> str:
     shape = ",".join(map(str, array.shape))
     bad = f", {found.bad} of {array.size} are NaN or infinite" if found.bad else ""
     return f"{array.dtype}[{shape}], black is {found.low:.6g}, white is {found.high:.6g}{bad}"

@@ -55,7 +55,7 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
 )
 
 
-class Refused(Exception):
+class RefusedRequest(Exception):
     """A request is not answered.
 
     Attributes:
@@ -78,7 +78,7 @@ def answered(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Req
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
-        except Refused as error:
+        except RefusedRequest as error:
             return reply({"error": str(error)}, error.status)
         except (ReemError, RedisError, OSError) as error:
             status = next(status for kind, status in _STATUS if isinstance(error, kind))
@@ -145,20 +145,20 @@ async def body_of(request: Request) -> Any:
     """Return the JSON a request carries.
 
     Raises:
-        Refused: More than `LARGEST_BODY`, or not JSON.
+        RefusedRequest: More than `LARGEST_BODY`, or not JSON.
     """
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
-        raise Refused(415, "send application/json")
+        raise RefusedRequest(415, "send application/json")
     body = bytearray()
     async for chunk in request.stream():
         body += chunk
         if len(body) > LARGEST_BODY:
-            raise Refused(413, f"more than {LARGEST_BODY} bytes; use Python for large values")
+            raise RefusedRequest(413, f"more than {LARGEST_BODY} bytes; use Python for large values")
     try:
         # The standard library's parser keeps integers of any size, which the store then refuses by name.
         return json.loads(bytes(body), parse_constant=_no_number)
     except (ValueError, RecursionError) as error:
-        raise Refused(400, f"this is not JSON: {error}") from None
+        raise RefusedRequest(400, f"this is not JSON: {error}") from None
 
 
 def _no_number(text: str) -> None:
@@ -300,19 +300,19 @@ class Api:
     async def write(self, request: Request) -> Response:
         """Publish a value, if that is allowed, and asked by a page from here."""
         if not self.allow_write:
-            raise Refused(403, "this page is read-only; start it with: reem browse --allow-write")
+            raise RefusedRequest(403, "this page is read-only; start it with: reem browse --allow-write")
         if not same_origin(request.headers):
-            raise Refused(403, "this did not come from a page of this program")
+            raise RefusedRequest(403, "this did not come from a page of this program")
         offered = request.headers.get("x-reem-key", "")
         # The key of this start of the program, which only its own page has: no other site can make a browser send it.
         if not secrets.compare_digest(offered.encode(), self.key.encode()):
-            raise Refused(403, "the page is older than this program; load it again")
+            raise RefusedRequest(403, "the page is older than this program; load it again")
         content = await body_of(request)
         if not isinstance(content, dict) or "value" not in content or not isinstance(content.get("path"), str):
-            raise Refused(400, 'send {"path": ..., "value": ...}')
+            raise RefusedRequest(400, 'send {"path": ..., "value": ...}')
         path = path_of(content["path"])
         if not path:
-            raise Refused(400, "a top-level key is needed")
+            raise RefusedRequest(400, "a top-level key is needed")
         await self._source.write(path, content["value"])
         return reply({"written": address(path)})
 
@@ -386,7 +386,7 @@ class Events:
     async def events(self, request: Request) -> Response:
         """Answer with a stream that goes on until the page or the program ends."""
         if self._clients >= _MOST_CLIENTS:
-            raise Refused(503, f"{_MOST_CLIENTS} pages are open already; close some")
+            raise RefusedRequest(503, f"{_MOST_CLIENTS} pages are open already; close some")
         # The second keeps a proxy (nginx) from collecting events before it passes them on.
         headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
         return StreamingResponse(self._stream(), headers=headers, media_type="text/event-stream")

@@ -23,7 +23,7 @@ from ...plan.paths import Path, show
 from ..jsontext import json_text
 from .addresses import address
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
-from .pictures import LARGEST_SIDE, MAPS, Picture, Preview, Slice, colours_of, look_at, paint, parse_slice, part
+from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
 from .source import NotKept, Sample, Source, shown_text
 from .trees import Leaf, leaf_of
 
@@ -394,7 +394,7 @@ class Arrays:
         colours, bgr = request.query_params.get("map", "grey"), request.query_params.get("bgr") == "1"
 
         # A preview has its range with it; its statistics would be those of a small picture.
-        def work() -> tuple[Picture, dict[str, Any]]:
+        def work() -> tuple[RenderedPicture, dict[str, Any]]:
             if isinstance(array, Preview):
                 return array.paint(colours, low, high, side=side, bgr=bgr), {}
             return paint(part(array, chosen), colours, low, high, side=side, bgr=bgr), statistics(array)

@@ -15,7 +15,7 @@ from typing import Any
 from ...plan.paths import Path, related
 from ...plan.trees import MISSING
 from .source import rate_span
-from .timeline import PENDING, UNKNOWN, BufferedPast, Change, Kept
+from .timeline import PENDING, UNKNOWN, BufferedChange, BufferedPast, Kept
 from .trees import Frame, Leaf, same, tree_of, walk, weight
 
 # One clock for everything in the buffer, which is never set back.
@@ -25,7 +25,7 @@ _WAITED = 1.0
 """Seconds before now that something may have been received, at most: the clock may have been set since."""
 
 
-class Clock:
+class BufferClock:
     """This machine's clock, but for its being set back: it goes on then, ahead of it by as much.
 
     A step forward is taken, as the one after a computer has slept.
@@ -209,14 +209,14 @@ class History:
     def __init__(self, seconds: float, budget: int) -> None:
         self.seconds = seconds
         self.budget = budget
-        self.clock = Clock()
+        self.clock = BufferClock()
         self.start = self.clock.now()
         self.frames = Frames(seconds)
         self.dropped = 0
         self._bytes = 0  # of all but the frames
         self._lines: dict[str, BufferedPast] = {}
         # The same changes twice: by key, to know what a key held; all in order, to forget the oldest first.
-        self._all: deque[Change] = deque()
+        self._all: deque[BufferedChange] = deque()
         self._heavy: set[str] = set()  # keys whose base may hold arrays
         self._trimmed = 0.0
 
@@ -234,7 +234,7 @@ class History:
         """
         # A change is put into the line of its top-level key: only those can change what was at a path.
         line = self._line(str(path[0]))
-        change = Change(when, path, value, size + _OVERHEAD, answer)
+        change = BufferedChange(when, path, value, size + _OVERHEAD, answer)
         line.add(change)
         self._all.append(change)
         self._bytes += change.size
@@ -397,7 +397,7 @@ class History:
         count = sum([not change.answer for change in some])
         return count / (span[1] - span[0]) if count else None
 
-    def between(self, since: float, until: float) -> Iterator[Change]:
+    def between(self, since: float, until: float) -> Iterator[BufferedChange]:
         """Yield the changes after `since` and not after `until`, newest first."""
         for change in reversed(self._all):
             if change.time <= since:

@@ -26,7 +26,7 @@ _MOST_CURVES = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ArrayViews:
     """How an array can be shown.
 
     Attributes:
@@ -38,12 +38,12 @@ class Look:
     views: dict[str, Slice]
 
 
-def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Look:
+def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> ArrayViews:
     """Return how an array of this dtype and shape is best shown."""
     if 0 in shape:
-        return Look("", {})
+        return ArrayViews("", {})
     if not shape:
-        return Look("table", {"table": ()})
+        return ArrayViews("table", {"table": ()})
     numeric = dtype.kind in "biuf"
     views: dict[str, Slice] = {}
     # The order is that of the tabs of the page.
@@ -56,7 +56,7 @@ def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Look:
         views["table"] = (*[0] * (len(shape) - 3), None, None, 0)
     if numeric:
         views["histogram"] = (None,) * len(shape)
-    return Look(_best(shape, views), views)
+    return ArrayViews(_best(shape, views), views)
 
 
 def _best(shape: tuple[int, ...], views: dict[str, Slice]) -> str:
@@ -142,7 +142,7 @@ LARGEST_SIDE = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class RenderedPicture:
     """An array as a picture.
 
     Attributes:
@@ -167,7 +167,7 @@ def paint(
     *,
     side: int = 1024,
     bgr: bool = False,
-) -> Picture:
+) -> RenderedPicture:
     """Return a picture of an array of shape (rows, columns) or (rows, columns, 1, 3 or 4).
 
     Args:
@@ -201,7 +201,7 @@ def paint(
         _mark(pixels, small)
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG", compress_level=1)
-    return Picture(file.getvalue(), low, high, bad, size)
+    return RenderedPicture(file.getvalue(), low, high, bad, size)
 
 
 def range_of(plane: np.ndarray[Any, Any], low: float | None, high: float | None) -> tuple[float, float, int]:
@@ -302,12 +302,12 @@ class Preview:
     high: float
     bad: int
 
-    def paint(self, colours: str, low: float | None, high: float | None, *, side: int, bgr: bool) -> Picture:
+    def paint(self, colours: str, low: float | None, high: float | None, *, side: int, bgr: bool) -> RenderedPicture:
         """Return the picture, as `pictures.paint` would make it of the array; raises BadValue."""
         low, high = self.low if low is None else low, self.high if high is None else high
         found = paint(self._pixels(), colours, low, high, side=side, bgr=bgr)
         axes = [size for size, index in zip(self.shape, self.chosen, strict=True) if index is None]
-        return Picture(found.png, found.low, found.high, self.bad, (axes[1], axes[0]))
+        return RenderedPicture(found.png, found.low, found.high, self.bad, (axes[1], axes[0]))
 
     def _pixels(self) -> np.ndarray[Any, Any]:
         pixels = np.asarray(Image.open(io.BytesIO(self.file)))

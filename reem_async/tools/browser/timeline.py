@@ -22,7 +22,7 @@ _LOOK_BACK = 2000
 """Changes looked at to find when a path last changed."""
 
 
-class Change(NamedTuple):
+class BufferedChange(NamedTuple):
     """One change.
 
     Attributes:
@@ -52,7 +52,7 @@ class Kept(NamedTuple):
     late: float = 0.0
 
 
-class Places:
+class ChangeIndex:
     """The numbers of changes by their paths."""
 
     __slots__ = ("_numbers",)
@@ -126,14 +126,14 @@ class BufferedPast(Past[int]):
         self._base = base
         self._times: list[float] = []
         self._gone = 0  # the number of the first change that is still here
-        self._known, self._pending = Places(), Places()
+        self._known, self._pending = ChangeIndex(), ChangeIndex()
         self._moves: list[int] = []  # where an item was removed from a list: those behind it have other paths since
         self.base_size = len(base) if isinstance(base, bytes) else 0
-        self.changes: list[Change] = []
+        self.changes: list[BufferedChange] = []
         self.text = text
         self.whole = base is not UNKNOWN
 
-    def add(self, change: Change) -> None:
+    def add(self, change: BufferedChange) -> None:
         """Append a change; times never go back."""
         # Numbers only grow; what was folded into the base keeps its number, so indexes need not be made anew.
         number = self._gone + len(self.changes)

@@ -19,7 +19,7 @@ from ...plan.trees import MISSING
 from ..partfile import PartFile, there_already
 from .log import EXACT, Log, numbers
 from .roles import Kind
-from .stored import Stored, is_inline
+from .stored import Reference, is_inline
 
 # Rows of a group in a Parquet file, and those that are in memory at once.
 _ROWS = 10_000
@@ -299,7 +299,7 @@ def _places(path: Path, value: Any, result: Export) -> Iterator[Path]:
     elif isinstance(value, list) and not all(isinstance(item, bool | int | float) for item in value):
         for index, item in enumerate(value):
             yield from _places((*path, index), item, result)
-    elif isinstance(value, Stored) and value.label not in ("numpy", "list"):
+    elif isinstance(value, Reference) and value.label not in ("numpy", "list"):
         result.left_out[_name(path)] = f"{value.label}, not an array"
     elif value is not None:
         yield path

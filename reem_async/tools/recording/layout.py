@@ -32,7 +32,7 @@ from ...plan.paths import Path, shorten
 from ...ships.numpy import NumpyShip, flat
 from ...ships.registry import Ships
 from .errors import DamagedRecording
-from .stored import Stored
+from .stored import Reference
 
 NOTES = "$ship"
 WRAPPER = "value"
@@ -44,7 +44,7 @@ _LARGEST_EXACT = 2**53
 _DTYPE = re.compile(r"[<>|=][biuf]\d{1,2}")
 
 
-class Document(NamedTuple):
+class JsonMessage(NamedTuple):
     """A tree ready to be written.
 
     Attributes:
@@ -66,8 +66,8 @@ def topic_of(path: Path) -> str:
     return "/" + "/".join([str(key) for key in path])
 
 
-def to_json(tree: Any) -> Document:
-    """Return a tree, arrays already replaced by `Stored` where they are long, as a JSON object with its notes."""
+def to_json(tree: Any) -> JsonMessage:
+    """Return a tree, arrays already replaced by `Reference` where they are long, as a JSON object with its notes."""
     notes: list[Any] = []
     shown = _shown(tree, None, notes)
     # A root with a "$ship" of its own would be taken for one with notes.
@@ -75,7 +75,7 @@ def to_json(tree: Any) -> Document:
     root: dict[str, Any] = {WRAPPER: shown} if wrapped else shown
     if notes:
         root[NOTES] = orjson.dumps(notes).decode()
-    return Document(root, wrapped)
+    return JsonMessage(root, wrapped)
 
 
 _Place = Any
@@ -96,12 +96,12 @@ def _shown(value: Any, place: _Place, notes: list[Any]) -> Any:
         return {key: _shown(item, (place, key), notes) for key, item in value.items()}
     if kind is list:
         return [_shown(item, (place, index), notes) for index, item in enumerate(value)]
-    if kind is Stored:
+    if kind is Reference:
         return _shown_stored(value, place, notes)
     return _shown_array(value, place, notes)
 
 
-def _shown_stored(it: Stored, place: _Place, notes: list[Any]) -> dict[str, Any]:
+def _shown_stored(it: Reference, place: _Place, notes: list[Any]) -> dict[str, Any]:
     note = [_flat(place), "stored", it.label, it.path, it.at, it.size, it.summary, it.dtype, it.shape]
     notes.append(note)
     shape = {} if it.shape is None else {"dtype": it.dtype, "shape": it.shape}
@@ -140,7 +140,7 @@ def _flat(place: _Place) -> list[str | int]:
 
 
 def from_json(text: bytes, *, wrapped: bool) -> Any:
-    """Return the tree of a message, long arrays as `Stored`.
+    """Return the tree of a message, long arrays as `Reference`.
 
     Raises:
         DamagedRecording: Not what `to_json` writes.
@@ -177,7 +177,7 @@ def _exact(shown: Any, kind: str, *note: Any) -> Any:
             raise ValueError(note)
         if shape is not None and not _are_sizes(shape):
             raise ValueError(shape)
-        return Stored(label, tuple(path), at, size, summary, dtype, None if shape is None else tuple(shape))
+        return Reference(label, tuple(path), at, size, summary, dtype, None if shape is None else tuple(shape))
     raise ValueError(kind)
 
 
@@ -221,7 +221,7 @@ _ENCODINGS = {encoding: form for form, encoding in _PICTURES.items()}
 _NUMPY = NumpyShip()
 
 
-class Encoded(NamedTuple):
+class EncodedMessage(NamedTuple):
     """One value as a message.
 
     Attributes:
@@ -302,7 +302,7 @@ def schema_bytes(schema: str) -> bytes:
     return files.SerializeToString()
 
 
-def encode(label: str, value: Any, frame: str, time: int) -> Encoded:
+def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
     """Return an array, or the bytes of any other ship, as a message.
 
     Args:
@@ -320,14 +320,14 @@ def encode(label: str, value: Any, frame: str, time: int) -> Encoded:
     return _encoded("reem.Blob", "", _CLASSES["reem.Blob"](label=label, size=len(value)), time, [value])
 
 
-def _encoded(schema: str, channels: str, head: Any, time: int, pieces: list[Any]) -> Encoded:
+def _encoded(schema: str, channels: str, head: Any, time: int, pieces: list[Any]) -> EncodedMessage:
     """Return the message `head` with its data field put behind it, which saves copies of the data."""
     head.timestamp.seconds, head.timestamp.nanos = divmod(time, 1_000_000_000)
     number = head.DESCRIPTOR.fields_by_name[_DATA_FIELD[schema]].number
     # The wire format of a bytes field: number and type (2) in one varint, the length in another, the bytes. Fields of a
     # message may come in any order, so the data can be last.
     tag = bytes([number << 3 | 2]) + _varint(sum([len(piece) for piece in pieces]))
-    return Encoded(schema, channels, [head.SerializeToString() + tag, *pieces])
+    return EncodedMessage(schema, channels, [head.SerializeToString() + tag, *pieces])
 
 
 def _varint(number: int) -> bytes:
@@ -348,7 +348,7 @@ def _is_picture(label: str, array: np.ndarray[Any, Any]) -> bool:
     )
 
 
-def _picture(array: np.ndarray[Any, Any], frame: str, time: int) -> Encoded:
+def _picture(array: np.ndarray[Any, Any], frame: str, time: int) -> EncodedMessage:
     height, width, *last = array.shape
     channels = last[0] if last else 1
     head = _CLASSES["foxglove.RawImage"](
@@ -361,7 +361,7 @@ def _picture(array: np.ndarray[Any, Any], frame: str, time: int) -> Encoded:
     return _encoded("foxglove.RawImage", str(channels) if last else "", head, time, [flat(array)])
 
 
-def _array_message(array: np.ndarray[Any, Any], time: int) -> Encoded:
+def _array_message(array: np.ndarray[Any, Any], time: int) -> EncodedMessage:
     head: Any = _CLASSES["reem.NdArray"](dtype=str(array.dtype)[:100], shape=array.shape)
     if array.size and array.dtype.kind in "biuf":
         with np.errstate(all="ignore"):

@@ -22,9 +22,9 @@ from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.packing import CommandRecorder
 from .container import Container, Ref, Totals
-from .log_reader import RecordedPast, Stream
+from .log_reader import RecordedPast, RecordedStream
 from .roles import Role
-from .stored import LOST, Stored, pruned, resolve
+from .stored import LOST, Reference, pruned, resolve
 from .times import Instant, nanoseconds, seconds
 
 # Whole keys as they were at some instant: who goes through time, or draws a slider, asks for neighbours again and
@@ -83,7 +83,7 @@ class ArrayHandle:
     shape: tuple[int, ...] | None
     size: int
     summary: str
-    _stored: Stored
+    _stored: Reference
     _past: RecordedPast
 
     def read(self) -> Any:
@@ -247,9 +247,9 @@ class Log:
         found = self._at(place, nanoseconds(instant))
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
-        return self._past.value(found) if type(found) is Stored else resolve(found, self._recorded)
+        return self._past.value(found) if type(found) is Reference else resolve(found, self._recorded)
 
-    def _recorded(self, it: Stored) -> Any:
+    def _recorded(self, it: Reference) -> Any:
         """Return a value, or what stands in a tree for one that could not be recorded; raises DamagedRecording."""
         if it.label != LOST:
             return self._past.value(it)
@@ -285,7 +285,7 @@ class Log:
         trees = self._trees_at(nanoseconds(instant))
         return {name: resolve(tree, self._handle) for name, tree in trees.items()}
 
-    def _handle(self, it: Stored) -> ArrayHandle:
+    def _handle(self, it: Reference) -> ArrayHandle:
         return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._past)
 
     def outline_at(self, instant: Instant) -> dict[str, Outline]:
@@ -369,14 +369,14 @@ class Log:
                 yield self._update(ref, stream, read, deleted=False)
 
     def outlines_of(self, patterns: Sequence[str] = ("*",)) -> Iterator[tuple[float, Path, Any, str]]:
-        """Yield time, path, value and kind of each update; arrays that are not short are `Stored`, and not read.
+        """Yield time, path, value and kind of each update; arrays that are not short are `Reference`, and not read.
 
         The value is MISSING where the path was deleted.
         """
         for ref, stream, value in self._news(-1, _END, patterns):
             yield seconds(ref.time), stream.path, value, stream.kind.value
 
-    def _news(self, after: int, until: int, patterns: Sequence[str]) -> Iterator[tuple[Ref, Stream, Any]]:
+    def _news(self, after: int, until: int, patterns: Sequence[str]) -> Iterator[tuple[Ref, RecordedStream, Any]]:
         """Yield the updates that patterns name, with what they name of the value; MISSING for a deletion."""
         wanted = [parse_pattern(text) for text in patterns]
         for ref, stream, value in self._past.updates(after, until, wanted):
@@ -384,7 +384,7 @@ class Log:
             if left is not MISSING or value is MISSING:
                 yield ref, stream, left
 
-    def _update(self, ref: Ref, stream: Stream, value: Any, *, deleted: bool) -> LogUpdate:
+    def _update(self, ref: Ref, stream: RecordedStream, value: Any, *, deleted: bool) -> LogUpdate:
         published, sequence = self._past.stamp(ref)
         return LogUpdate(
             seconds(ref.time), stream.path, value, deleted, seconds(published), sequence, stream.kind.value
@@ -481,7 +481,7 @@ def outlined(tree: Any, path: Path) -> Outline:
         pairs = tree.items() if kind is dict else enumerate(tree)
         children = tuple([outlined(item, (*path, key)) for key, item in pairs])
         return Outline(path, kind.__name__, "", None, sum([child.size for child in children]), children)
-    if kind is Stored:
+    if kind is Reference:
         return Outline(path, tree.label, tree.summary, None, tree.size)
     if kind is np.ndarray:
         size, summary = NumpyShip().describe(tree)

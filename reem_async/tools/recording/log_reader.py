@@ -24,11 +24,11 @@ from .layout import decode, from_json
 from .mcap_reader import Numbers
 from .roles import NEWS, Kind, Role
 from .sink import CHANNELS
-from .stored import LOST, Stored, applied, opened
+from .stored import LOST, Reference, applied, opened
 
 
 @dataclass(frozen=True, slots=True)
-class Stream:
+class RecordedStream:
     """What was recorded of one path in one role; several channels if its type changed.
 
     Attributes:
@@ -48,7 +48,7 @@ class _FoundDamage(Exception):
     """A part of the file turned out to be damaged and was left out: what needs it is to be found again."""
 
 
-class RecordedPast(Past[tuple[Ref, Stream]]):
+class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     """The contents of a recording. Positions of changes are log times, in ns.
 
     Args:
@@ -70,13 +70,13 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         self._timeline = Timeline(container)
         self.unreadable = 0
         self._has_skipped = False
-        by_place: dict[tuple[Path, str, str], Stream] = {}
-        self._of_channel: dict[int, Stream] = {}
+        by_place: dict[tuple[Path, str, str], RecordedStream] = {}
+        self._of_channel: dict[int, RecordedStream] = {}
         # A path has several channels in one role if its type changed: for users they are one stream.
         for channel in container.channels.values():
             place = _place(channel.metadata)
             if place is not None:
-                stream = by_place.setdefault(place, Stream(*place, []))
+                stream = by_place.setdefault(place, RecordedStream(*place, []))
                 stream.channels.append(channel.id)
                 self._of_channel[channel.id] = stream
         is_described = any(record.name == "reem" for record in container.metadata)
@@ -84,7 +84,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
             raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
         container.damaged += self._missing(is_described)
         self.streams = list(by_place.values())
-        self.names: dict[str, list[Stream]] = {}
+        self.names: dict[str, list[RecordedStream]] = {}
         self._parts: dict[Path, list[int]] = {}
         for stream in self.streams:
             # These say what is missing, not what was there.
@@ -107,17 +107,17 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         return sum(count for count in listed.values() if count > 0)
 
     def tree(self, path: Path, until: int) -> Any:
-        """Return what was at a full path at an instant (ns), long arrays as `Stored`; or MISSING."""
+        """Return what was at a full path at an instant (ns), long arrays as `Reference`; or MISSING."""
         while True:
             # Each try that fails has taken a damaged chunk out, so this ends.
             with contextlib.suppress(_FoundDamage):
                 return self.at(path, until)
 
-    def _path(self, change: tuple[Ref, Stream]) -> Path:
+    def _path(self, change: tuple[Ref, RecordedStream]) -> Path:
         return change[1].path
 
-    def _value(self, change: tuple[Ref, Stream]) -> Any:
-        """Return what a message says; a value that cannot be read is represented by a `Stored`: the rest can be read.
+    def _value(self, change: tuple[Ref, RecordedStream]) -> Any:
+        """Return the value of a message; a `Reference` for one that cannot be read, so that the rest can be.
 
         Raises:
             _FoundDamage: It turned out to be damaged, so it has to be left out.
@@ -130,7 +130,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
             label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
             if label in ("", "list"):  # it has places of its own, and nobody could tell whether something was there
                 raise
-            return Stored(label, stream.path, ref.time, 0, label)
+            return Reference(label, stream.path, ref.time, 0, label)
         if loaded is None:
             raise _FoundDamage
         return loaded[0]
@@ -138,16 +138,16 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
     def _anchor(self, path: Path) -> Path:
         return _anchor(path, self._streams_of(path))
 
-    def _streams_of(self, path: Path) -> list[Stream]:
+    def _streams_of(self, path: Path) -> list[RecordedStream]:
         return self.names.get(str(path[0]), []) if path else []
 
-    def _newest_whole(self, path: Path, until: int) -> tuple[int, tuple[Ref, Stream]] | None:
+    def _newest_whole(self, path: Path, until: int) -> tuple[int, tuple[Ref, RecordedStream]] | None:
         roles = (*NEWS, Role.KEYFRAME)
         bases = [it for it in self._streams_of(path) if it.role in roles and below(path, it.path)]
         newest = self._newest(bases, until, -1)
         return None if newest is None else (newest[0].time, newest)
 
-    def _streams_inside(self, path: Path) -> list[Stream]:
+    def _streams_inside(self, path: Path) -> list[RecordedStream]:
         # Roles that only repeat are left out here: they say nothing that is not in the updates.
         streams = self._streams_of(path)
         return [it for it in streams if it.role in NEWS and len(it.path) > len(path) and below(it.path, path)]
@@ -155,30 +155,30 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
     def _has_moves(self, path: Path, after: int, until: int) -> bool:
         return any(it.role == Role.DELETE and isinstance(it.path[-1], int) for it in self._streams_inside(path))
 
-    def _inner(self, path: Path, after: int, until: int) -> Iterable[tuple[Ref, Stream]]:
+    def _inner(self, path: Path, after: int, until: int) -> Iterable[tuple[Ref, RecordedStream]]:
         channels = [channel for stream in self._streams_inside(path) for channel in stream.channels]
         return [(ref, self._of_channel[ref.channel]) for ref in self._between(channels, after, until)]
 
-    def _inner_lasts(self, path: Path, after: int, until: int) -> Iterable[tuple[int, tuple[Ref, Stream]]]:
+    def _inner_lasts(self, path: Path, after: int, until: int) -> Iterable[tuple[int, tuple[Ref, RecordedStream]]]:
         lasts = [self._newest([stream], until, after) for stream in self._streams_inside(path)]
         return [(it[0].time, it) for it in lasts if it is not None]
 
-    def _applied(self, tree: Any, path: Path, change: tuple[Ref, Stream], value: Any) -> Any:
+    def _applied(self, tree: Any, path: Path, change: tuple[Ref, RecordedStream], value: Any) -> Any:
         stream = change[1]
         return applied(opened(tree, path, self._list), path, stream.role, stream.kind, value)
 
     def _inside(self, tree: Any, path: Path) -> Any:
         return get(opened(tree, path, self._list), path)
 
-    def _list(self, it: Stored) -> Any:
+    def _list(self, it: Reference) -> Any:
         """Return a long list; what stands for it, if it is damaged."""
         try:
             return self.value(it)
         except BadData:
             return it
 
-    def _newest(self, streams: Iterable[Stream], until: int, after: int) -> tuple[Ref, Stream] | None:
-        best: tuple[Ref, Stream] | None = None
+    def _newest(self, streams: Iterable[RecordedStream], until: int, after: int) -> tuple[Ref, RecordedStream] | None:
+        best: tuple[Ref, RecordedStream] | None = None
         for stream in streams:
             # What is older than the best one so far is not even looked for.
             for channel in stream.channels:
@@ -197,7 +197,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         for _, refs in itertools.groupby(self._timeline.between(channels, after, until), key=lambda ref: ref.time):
             yield sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
 
-    def _load(self, ref: Ref, stream: Stream) -> list[Any] | None:
+    def _load(self, ref: Ref, stream: RecordedStream) -> list[Any] | None:
         """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
         if stream.role == Role.DELETE:
             return [MISSING]
@@ -209,7 +209,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
             return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
         return [self._stored(channel, ref.time, stream.path, message.data)]
 
-    def _readable(self, ref: Ref, stream: Stream) -> list[Any] | None:
+    def _readable(self, ref: Ref, stream: RecordedStream) -> list[Any] | None:
         """Return a list of the value of a message; None, and it is counted, if it is damaged."""
         with contextlib.suppress(BadData):
             loaded = self._load(ref, stream)
@@ -219,21 +219,21 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         self._has_skipped = True
         return None
 
-    def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Stored:
+    def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Reference:
         """Return what stands for a value that is a message of its own and not a part of another."""
         label = channel.metadata.get("reem.ship", "")
         value = self._decoded(channel, data)
         if label == "numpy":
             size, summary = NumpyShip().describe(value)
-            return Stored(label, path, at, size, summary, summary.partition("[")[0], value.shape)
-        return Stored(label, path, at, len(value) if isinstance(value, bytes) else len(data), label)
+            return Reference(label, path, at, size, summary, summary.partition("[")[0], value.shape)
+        return Reference(label, path, at, len(value) if isinstance(value, bytes) else len(data), label)
 
     def _decoded(self, channel: Channel, data: bytes) -> Any:
         schema = self._container.schemas.get(channel.schema_id)
         label, channels = channel.metadata.get("reem.ship", ""), channel.metadata.get("reem.channels", "")
         return decode(schema.name if schema else "", channels, label, data, self._ships)
 
-    def value(self, it: Stored) -> Any:
+    def value(self, it: Reference) -> Any:
         """Return the value that something stands for; raises DamagedRecording."""
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
@@ -271,12 +271,12 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
     def _news_channels(self, path: Path) -> list[int]:
         return [channel for stream in self._concerning(path) for channel in stream.channels]
 
-    def _concerning(self, path: Path) -> list[Stream]:
+    def _concerning(self, path: Path) -> list[RecordedStream]:
         """Return the streams with news on what is at, above or below a path."""
         streams = self.names.get(str(path[0]), []) if path else self.streams
         return [it for it in streams if it.role in NEWS and related(it.path, path)]
 
-    def updates(self, after: int, until: int, patterns: Sequence[Pattern]) -> Iterator[tuple[Ref, Stream, Any]]:
+    def updates(self, after: int, until: int, patterns: Sequence[Pattern]) -> Iterator[tuple[Ref, RecordedStream, Any]]:
         """Yield all news that patterns name between two instants; what is damaged is skipped."""
         streams = [
             it for it in self.streams if it.role in NEWS and any(pattern.concerns(it.path) for pattern in patterns)
@@ -321,7 +321,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
                 last = value
                 yield refs[0].time, repeats, value
 
-    def gaps(self) -> Iterator[tuple[Ref, Stream, int | None]]:
+    def gaps(self) -> Iterator[tuple[Ref, RecordedStream, int | None]]:
         """Yield where updates were lost, and how many."""
         # A gap says how many were lost if their publisher's numbers told it.
         channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.GAP]
@@ -331,7 +331,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
                 missed = orjson.loads(message.data)["missed"] if message is not None else None
             yield ref, self._of_channel[ref.channel], missed if type(missed) is int else None
 
-    def skips(self) -> Iterator[tuple[Ref, Stream]]:
+    def skips(self) -> Iterator[tuple[Ref, RecordedStream]]:
         """Yield the updates whose values could not be had any more."""
         channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.SKIP]
         for ref in self._timeline.between(channels, -1, 2**63 - 1):
@@ -346,7 +346,7 @@ class RecordedPast(Past[tuple[Ref, Stream]]):
         """Return how much each channel has; see `Timeline.totals`."""
         return self._timeline.totals(progress)
 
-    def channels(self) -> Iterator[tuple[Channel, Stream | None, str]]:
+    def channels(self) -> Iterator[tuple[Channel, RecordedStream | None, str]]:
         """Yield the channels, what they are for (None for none of REEM's), and the names of their schemas."""
         for channel in list(self._container.channels.values()):  # reading an index may find more of them
             schema = self._container.schemas.get(channel.schema_id)
@@ -383,7 +383,7 @@ def _place(metadata: Mapping[str, str]) -> tuple[Path, Role, Kind] | None:
     return tuple(path), role, kind
 
 
-def _anchor(path: Path, streams: Iterable[Stream]) -> Path:
+def _anchor(path: Path, streams: Iterable[RecordedStream]) -> Path:
     """Return the part of `path` that never moves: up to an index from the end, or a list that lost an item."""
     lists = [it.path[:-1] for it in streams if it.role == Role.DELETE and isinstance(it.path[-1], int)]
     lists += [path[:place] for place, key in enumerate(path) if isinstance(key, int) and key < 0]

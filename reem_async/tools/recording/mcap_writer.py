@@ -109,7 +109,7 @@ class _Chunk:
         self.put(*pieces)
 
 
-class Writer:
+class McapWriter:
     """Writes one file. Belongs to one thread.
 
     Args:

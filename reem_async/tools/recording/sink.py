@@ -23,8 +23,8 @@ import orjson
 from ...errors import BadValue
 from ...plan.paths import Path, show
 from .errors import RecordingFailed
-from .layout import Document, Encoded, schema_bytes, topic_of
-from .mcap_writer import COMPRESSIONS, Writer
+from .layout import EncodedMessage, JsonMessage, schema_bytes, topic_of
+from .mcap_writer import COMPRESSIONS, McapWriter
 from .output import Output
 from .roles import Kind, Role
 
@@ -71,7 +71,7 @@ class Sink:
             raise BadValue(f"compression {compression!r:.60} is none of {', '.join(COMPRESSIONS)}")
         self.output = Output(path, overwrite=overwrite)
         try:
-            self._writer = Writer(self.output, compression, f"reem/{metadata.get('version', '')}")
+            self._writer = McapWriter(self.output, compression, f"reem/{metadata.get('version', '')}")
             self._writer.add_metadata("reem", dict(metadata))
             self.output.flush()
         except OSError as error:
@@ -90,7 +90,7 @@ class Sink:
         self._closed_at = time.monotonic()
         self._open = 0
 
-    def json(self, path: Path, role: Role, kind: Kind, document: Document, stamp: tuple[int, int, int]) -> int:
+    def json(self, path: Path, role: Role, kind: Kind, document: JsonMessage, stamp: tuple[int, int, int]) -> int:
         """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
         found = signature(document.tree) if role == Role.UPDATE else OPEN
         key = path, role, kind, document.wrapped, found
@@ -121,7 +121,7 @@ class Sink:
         return channel
 
     def part(
-        self, path: Path, role: Role, kind: Kind, label: str, encoded: Encoded, stamp: tuple[int, int, int]
+        self, path: Path, role: Role, kind: Kind, label: str, encoded: EncodedMessage, stamp: tuple[int, int, int]
     ) -> int:
         """Write a protobuf message; returns its bytes."""
         key = path, role, kind, label, encoded.schema, encoded.channels
@@ -135,7 +135,7 @@ class Sink:
 
     def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
         """Write figures on the recording itself."""
-        document = Document(dict(figures), wrapped=False)
+        document = JsonMessage(dict(figures), wrapped=False)
         if "statistics" not in self._channels:
             schema = self._schema("reem.stats", "jsonschema", signature(document.tree))
             self._channels["statistics"] = self._register(STATISTICS, "json", schema, {})

@@ -1,7 +1,7 @@
 """Recorded trees: values that have a message of their own, and what a key held after one update more.
 
-Arrays, bytes, long lists of numbers and custom types are represented by `Stored`, which says what they are and where in
-the file to find them. So a tree can be looked at, kept and written again without touching a single array.
+In a tree, a `Reference` represents an array, bytes, a long list of numbers or a value of a custom type. It has the type
+and the place in the file. So a tree can be looked at, kept and written again without touching a single array.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LOST = "lost"
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class Reference:
     """A value in a message of its own.
 
     Attributes:
@@ -102,7 +102,7 @@ class NotWritten(Exception):
     """What was read before of an attachment never reached the file: it has to be read again."""
 
 
-Store = Callable[[str, Path, Any], Stored]
+Store = Callable[[str, Path, Any], Reference]
 """Writes a value (its label, its full path, itself) as a message and returns what stands for it."""
 
 
@@ -112,7 +112,7 @@ def is_inline(array: np.ndarray[Any, Any], longest: int = LONGEST_INLINE) -> boo
 
 
 def extract(value: Any, path: Path, store: Store, longest: int = LONGEST_INLINE) -> Any:
-    """Return `value`, at the full `path`, with everything that gets a message of its own replaced by `Stored`.
+    """Return `value`, at the full `path`, with everything that gets a message of its own replaced by `Reference`.
 
     Containers in which nothing was replaced are shared with `value`.
 
@@ -142,7 +142,7 @@ def extract(value: Any, path: Path, store: Store, longest: int = LONGEST_INLINE)
     return store(label, path, value)
 
 
-_PLAIN = frozenset({str, int, float, bool, type(None), Stored})
+_PLAIN = frozenset({str, int, float, bool, type(None), Reference})
 
 
 def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
@@ -155,19 +155,19 @@ def _numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
     return None
 
 
-def resolve(tree: Any, load: Callable[[Stored], Any]) -> Any:
-    """Return a copy of `tree` with every `Stored` replaced by what `load` makes of it.
+def resolve(tree: Any, load: Callable[[Reference], Any]) -> Any:
+    """Return a copy of `tree` with every `Reference` replaced by what `load` makes of it.
 
     What it makes MISSING of is left out, as in `mapped`.
     """
-    return mapped(tree, lambda it: load(it) if type(it) is Stored else it)
+    return mapped(tree, lambda it: load(it) if type(it) is Reference else it)
 
 
-def opened(tree: Any, path: Path, load: Callable[[Stored], Any]) -> Any:
+def opened(tree: Any, path: Path, load: Callable[[Reference], Any]) -> Any:
     """Return `tree` with the long list on the way to `path`, if there is one, as the list that `load` makes of it."""
     it = tree
     for depth, key in enumerate(path):
-        if type(it) is Stored:
+        if type(it) is Reference:
             return replaced(tree, path[:depth], load(it)) if it.label == "list" else tree
         it = get(it, (key,))
     return tree
@@ -243,7 +243,7 @@ def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:
     if any(len(pattern.rest) < len(path) for pattern in wanted):
         return tree
     # The items keep their places, also those of a long list that has a message of its own.
-    if wanted and (type(tree) in (list, Unreadable) or (type(tree) is Stored and tree.label in ("list", LOST))):
+    if wanted and (type(tree) in (list, Unreadable) or (type(tree) is Reference and tree.label in ("list", LOST))):
         return tree
     if type(tree) is not dict or not wanted:
         return MISSING

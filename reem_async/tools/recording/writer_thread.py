@@ -23,10 +23,10 @@ from ...plan.trees import MISSING, CannotApply, get, replaced, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent
-from .layout import WRAPPER, Document, encode, to_json
+from .layout import WRAPPER, JsonMessage, encode, to_json
 from .roles import Kind, Role
 from .sink import FullError, Sink
-from .stored import LOST, NotWritten, Stored, Unchanged, differing, extract, opened, planted, pruned, without
+from .stored import LOST, NotWritten, Reference, Unchanged, differing, extract, opened, planted, pruned, without
 
 logger = logging.getLogger("reem.recording")
 
@@ -283,9 +283,9 @@ class WriterThread:
                 self._keep(name, replaced(before, rest, tree))
             except CannotApply:  # the server has refused it too, or an update is missing here
                 self._fall_behind(name)
-        lost = type(tree) is Stored and tree.label == LOST
+        lost = type(tree) is Reference and tree.label == LOST
         # Else its message is the update.
-        if type(tree) is not Stored or lost or type(it.value) in (Stored, Unchanged):
+        if type(tree) is not Reference or lost or type(it.value) in (Reference, Unchanged):
             try:
                 self._count(self._sink.json(it.path, Role.UPDATE, it.kind, to_json(tree), it.stamp))
             except FullError:
@@ -309,7 +309,7 @@ class WriterThread:
         self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
 
     def _event(self, it: Operation, text: dict[str, Any]) -> None:
-        self._count(self._sink.json(it.path, it.role, it.kind, Document(text, wrapped=False), it.stamp))
+        self._count(self._sink.json(it.path, it.role, it.kind, JsonMessage(text, wrapped=False), it.stamp))
 
     def _write_state(self, it: Operation) -> None:
         name = str(it.path[0])
@@ -358,28 +358,28 @@ class WriterThread:
         document = to_json(tree)
         if not document.wrapped:
             notes = {key: document.tree.pop(key) for key in ("$ship",) if key in document.tree}
-            document = Document({WRAPPER: document.tree, **notes}, wrapped=True)
+            document = JsonMessage({WRAPPER: document.tree, **notes}, wrapped=True)
         document.tree["key"] = str(it.path[0])
         self._count(self._sink.json(it.path, it.role, Kind.READ, document, it.stamp))
 
     def _extracted(self, it: Operation, before: Any = None) -> Any:
         """Return the value with everything long written as a message of its own, unless `before` has it unchanged."""
 
-        def store(label: str, path: Path, value: Any) -> Stored:
+        def store(label: str, path: Path, value: Any) -> Reference:
             data, label = self._packed(label, value)
             # A state that was read again: what has not changed need not be written again.
             old = get(before, path[len(it.path) :]) if it.role in (Role.STATE, Role.STORED) else None
             if data is None:
                 why = value.reason if type(value) is Unreadable else f"{type(value).__name__}, not recorded"
-                lost = Stored(LOST, path, it.stamp[0], 0, why)
+                lost = Reference(LOST, path, it.stamp[0], 0, why)
                 # Counted once, not at each read.
-                if type(old) is Stored and (old.label, old.summary) == (LOST, lost.summary):
+                if type(old) is Reference and (old.label, old.summary) == (LOST, lost.summary):
                     return old
                 self.counts.lose(path)
                 return lost
             content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", data)
             stored = _described(label, path, it.stamp[0], data, content)
-            if type(old) is Stored and _is_same(stored, old):
+            if type(old) is Reference and _is_same(stored, old):
                 return old
             if stored.numbers is None:
                 self._recent.add(content)
@@ -390,7 +390,7 @@ class WriterThread:
                 self._count(self._sink.part(path, role, it.kind, label, encoded, it.stamp))
             except FullError:
                 self._lose_for_good(path)
-                return Stored(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
+                return Reference(LOST, path, it.stamp[0], 0, f"{stored.summary}, not recorded: too many paths")
             return stored
 
         return extract(it.value, it.path, store)
@@ -410,12 +410,12 @@ class WriterThread:
         self.counts.bytes += size
 
 
-def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Stored:
+def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Reference:
     if isinstance(data, np.ndarray):
         size, summary = _NUMPY.describe(data)
         numbers = data if label == "list" else None
-        return Stored(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
-    return Stored(label, path, at, len(data), label, content=content)
+        return Reference(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
+    return Reference(label, path, at, len(data), label, content=content)
 
 
 def _as_state(it: Operation) -> Operation:
@@ -423,11 +423,11 @@ def _as_state(it: Operation) -> Operation:
     return it._replace(role=Role.STATE, kind=Kind.READ)
 
 
-def _as_list(it: Stored) -> Any:
+def _as_list(it: Reference) -> Any:
     return it if it.numbers is None else it.numbers.tolist()
 
 
-def _is_same(one: Stored, other: Stored) -> bool:
+def _is_same(one: Reference, other: Reference) -> bool:
     if one.content is None or other.content is None or one.label != other.label:
         return False
     return one.content.digest() == other.content.digest()
