@@ -68,13 +68,10 @@ class RefusedRequest(Exception):
 
 
 def reply(content: Any, status: int = 200) -> Response:
-    """Return a JSON response."""
     return Response(orjson.dumps(content), status, media_type="application/json")
 
 
 def answered(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Request], Awaitable[Response]]:
-    """Return a handler whose errors become answers."""
-
     async def answer(request: Request) -> Response:
         try:
             return await handler(request)
@@ -88,7 +85,6 @@ def answered(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Req
 
 
 def path_in(request: Request) -> Path:
-    """Return the path asked for."""
     return path_of(request.query_params.get("path", ""))
 
 
@@ -105,7 +101,6 @@ def value_path_in(request: Request) -> Path:
 
 
 def at_of(request: Request) -> float | None:
-    """Return the instant asked for, None for now."""
     return number_of(request, "at")
 
 
@@ -203,7 +198,6 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        """Return the routes below /api, but those of arrays and events."""
         asked = {
             "tree": self.tree,
             "series": self.series,
@@ -243,11 +237,9 @@ class Api:
         return changed, {path[:end] for path in changed for end in range(1, len(path))}
 
     def span(self) -> dict[str, Any]:
-        """Return the span of time that can be shown."""
         return dict(self._source.status()._asdict())
 
     async def node(self, request: Request) -> Response:
-        """Return what is at a path, and the text of a string."""
         path, at = path_in(request), at_of(request)
         (node,) = await self._source.nodes([path], at) if path else [Node((), "dict")]
         if node is None:
@@ -264,7 +256,6 @@ class Api:
         return reply(answer)
 
     async def series(self, request: Request) -> Response:
-        """Return the number, or list of numbers, at a path over a span of time."""
         status = self._source.status()
         start, end = number_of(request, "start"), number_of(request, "end")
         start = status.start if start is None else start
@@ -272,7 +263,6 @@ class Api:
         return reply({"start": start, "end": status.end if end is None else end, **_thinned(found)._asdict()})
 
     async def step(self, request: Request) -> Response:
-        """Return the instant of the next or previous change."""
         at = number_of(request, "at")
         if at is None:
             raise BadValue("at= is missing")
@@ -289,7 +279,6 @@ class Api:
         return reply({"start": status.start, "end": status.end, "counts": counts, "pictures": pictures})
 
     async def search(self, request: Request) -> Response:
-        """Return paths that have a text in them."""
         text = request.query_params.get("q", "").strip()[:200]
         at = at_of(request)
         paths = await self._source.search(text, at, _MOST_FOUND) if text else []
@@ -380,7 +369,6 @@ class Events:
         self._clients = 0
 
     def routes(self) -> list[Route]:
-        """Return the route below /api."""
         return [Route("/events", answered(self.events), methods=["GET"])]
 
     async def events(self, request: Request) -> Response:

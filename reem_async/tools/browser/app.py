@@ -55,7 +55,6 @@ _HEADERS = {
 
 
 def new_token() -> str:
-    """Return a token that cannot be guessed."""
     return secrets.token_urlsafe(24)
 
 
@@ -105,7 +104,6 @@ class Guard:
         self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or hand it on."""
         # There are no websockets here.
         if scope["type"] != "http":
             await (self._app(scope, receive, send) if scope["type"] == "lifespan" else _close(send))
@@ -324,7 +322,6 @@ class _Pages:
         self._files = files
 
     async def root(self, request: Request) -> Response:
-        """Return the page with the tree."""
         return self._page()
 
     async def view(self, request: Request) -> Response:
@@ -349,7 +346,6 @@ class _Pages:
         )
 
     async def static(self, request: Request) -> Response:
-        """Return one of the known files."""
         name = request.path_params["name"]
         content = self._files.get(name)
         if content is None or name == "page.html":

@@ -325,7 +325,6 @@ class Arrays:
         self._turns: anyio.CapacityLimiter | None = None
 
     def routes(self) -> list[Route]:
-        """Return the routes below /api."""
         asked = {
             "image": self.image,
             "table": self.table,
@@ -420,7 +419,6 @@ class Arrays:
         return reply({**table(plane, row, column, rows, columns), **said})
 
     async def line(self, request: Request) -> Response:
-        """Return a part of an array as lines."""
         array, said = await self._array(request)
         plane = part(array, _slice(request, array, 2))
         return reply({**await self._do(plane.nbytes, lambda: line(plane)), **said})
@@ -457,7 +455,6 @@ class Arrays:
 
 
 def _when(sample: Sample) -> dict[str, float | None]:
-    """Return how old a sample is."""
     return {"late": sample.late, "age": sample.age}
 
 
@@ -467,7 +464,6 @@ def picture_type(value: Any) -> str | None:
 
 
 def _array_of(value: list[Any], path: Path) -> np.ndarray[Any, Any]:
-    """Return a list of numbers as an array."""
     try:
         array = np.array(value)
     except ValueError:

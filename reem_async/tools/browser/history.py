@@ -35,7 +35,6 @@ class BufferClock:
         self._ahead = time.time() - time.monotonic()
 
     def now(self) -> float:
-        """Return the seconds since 1970."""
         # In this order: whatever takes a while between the two looks makes the difference less, and is not taken.
         self._ahead = max(self._ahead, time.time() - time.monotonic())
         return time.monotonic() + self._ahead
@@ -334,7 +333,6 @@ class History:
         return self._lines.keys()
 
     def knows(self, name: str) -> bool:
-        """Return whether anything is known of a key."""
         return name in self._lines
 
     def is_whole(self, name: str) -> bool:

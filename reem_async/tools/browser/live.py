@@ -74,12 +74,10 @@ class LiveSource:
         await self._follower.start()
 
     async def close(self) -> None:
-        """Stop following and close the interface. Idempotent."""
         await self._follower.close()
         await self.interface.close()
 
     def status(self) -> Status:
-        """Return the span of the buffer, and whether the server answers."""
         notes = ["the buffer is full: it reaches back less far than asked for"] if self.history.dropped else []
         if self._follower.skipped:
             notes.append(f"{self._follower.skipped} updates came too fast to be kept")
@@ -91,7 +89,6 @@ class LiveSource:
         )
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
-        """Return Python that reads a path, for both fronts."""
         return snippets(path, self.interface.session.options.url, self.interface.namespace)
 
     # --- the tree
@@ -255,11 +252,9 @@ class LiveSource:
         return differing(await self.changes(since, until, most), before, after, most)
 
     async def step(self, at: float, forward: bool, path: Path) -> float | None:
-        """Return the instant of the next or previous change; from the buffer."""
         return self.history.step(at, forward, path)
 
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        """Return how many changes there were in parts of a span; from the buffer."""
         return counted(self.history.times(path), start, end, bins)
 
     async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:

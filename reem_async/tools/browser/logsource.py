@@ -85,11 +85,9 @@ class LogSource:
         """Nothing is to be done."""
 
     async def close(self) -> None:
-        """Close the file. Idempotent."""
         self.log.close()
 
     def status(self) -> Status:
-        """Return the span of the recording."""
         notes = [] if self.log.indexed else ["the recording was not ended properly"]
         if self.log.damaged:
             notes.append(f"{self.log.damaged} damaged records are skipped")
@@ -97,7 +95,6 @@ class LogSource:
         return Status(start, end, "", "; ".join(notes))
 
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
-        """Return Python that reads a path from the recording."""
         code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path.resolve())!r})\n"
         when = "log.end" if at is None else repr(at)
         return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
@@ -108,7 +105,6 @@ class LogSource:
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
     def _state(self, at: float) -> dict[str, Any]:
-        """Return the trees of all keys at an instant; the last few are kept."""
         if at not in self._states:
             self._states[at] = {name: tree_of_outline(it) for name, it in self.log.outline_at(at).items()}
             while len(self._states) > _CACHED:
@@ -120,7 +116,6 @@ class LogSource:
         return self.log.end + _ROUNDING if at is None else at
 
     async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
-        """Return what was at each path."""
         return await self._do(lambda: [self._node(path, self._when(at)) for path in paths])
 
     def _node(self, path: Path, at: float) -> Node | None:
@@ -131,7 +126,6 @@ class LogSource:
         return node_of(path, value).stamped(self.log.last_news(path, at), rate)
 
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
-        """Return some of what was directly below a path."""
         return await self._do(lambda: self._children(path, start, count, self._when(at)))
 
     def _children(self, path: Path, start: int, count: int, at: float) -> Page:
@@ -148,11 +142,9 @@ class LogSource:
         return Sample(await self._do(lambda: self.log.value_at(path, self._when(at))))
 
     async def changes(self, since: float, until: float, most: int) -> list[Path]:
-        """Return which paths were updated."""
         return sorted(await self._do(lambda: self.log.changes(since, until)), key=show)[:most]
 
     async def differing(self, since: float, until: float, most: int) -> set[Path]:
-        """Return which paths have another value at one instant than at another."""
         return await self._do(lambda: self._differing(since, until, most))
 
     def _differing(self, since: float, until: float, most: int) -> set[Path]:
@@ -161,7 +153,6 @@ class LogSource:
         return differing(paths, lambda name: before.get(name, MISSING), lambda name: after.get(name, MISSING), most)
 
     async def step(self, at: float, forward: bool, path: Path) -> float | None:
-        """Return the instant of the next or previous change."""
         return await self._do(lambda: self._step(at, forward, path))
 
     def _step(self, at: float, forward: bool, path: Path) -> float | None:
@@ -172,7 +163,6 @@ class LogSource:
         return float(times[place]) + _ROUNDING if 0 <= place < len(times) else None
 
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        """Return how many changes there were in parts of a span."""
         return await self._do(lambda: counted(self._times.concerning(path), start, end, bins))
 
     async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
@@ -180,7 +170,6 @@ class LogSource:
         return []
 
     async def series(self, path: Path, start: float, end: float) -> Series:
-        """Return numbers over time."""
         return await self._do(lambda: numbers_in(self._samples(path, start, end)))
 
     def _samples(self, path: Path, start: float, end: float) -> Iterable[tuple[float, Any]]:
@@ -193,7 +182,6 @@ class LogSource:
             yield from self.log[path].values(start, end)
 
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
-        """Return paths with `text` in them, top-level keys first."""
         return await self._do(lambda: self._search(text.lower(), self._state(self._when(at)), most))
 
     def _search(self, needle: str, state: dict[str, Any], most: int) -> list[Path]:
@@ -207,5 +195,4 @@ class LogSource:
         return inner
 
     async def write(self, path: Path, value: Any) -> None:
-        """Raise ReadOnly."""
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")

@@ -71,7 +71,6 @@ class Node:
         return replace(self, time=when, rate=rate, shared=shared)
 
     def as_json(self) -> dict[str, Any]:
-        """Return what the page is sent."""
         key = self.path[-1] if self.path else ""
         return {
             "address": address(self.path),

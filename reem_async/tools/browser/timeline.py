@@ -53,8 +53,6 @@ class Kept(NamedTuple):
 
 
 class ChangeIndex:
-    """The numbers of changes by their paths."""
-
     __slots__ = ("_numbers",)
 
     def __init__(self) -> None:
@@ -181,7 +179,6 @@ class BufferedPast(Past[int]):
         return self._state(self.upto(when))
 
     def _state(self, count: int) -> Any:
-        """Return the tree after the first `count` changes."""
         return self.at((self._name,), self._gone + count - 1)
 
     def _path(self, change: int) -> Path:

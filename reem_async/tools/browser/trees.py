@@ -117,7 +117,6 @@ def tree_of(text: bytes, name: str) -> Any:
 
 
 def tree_of_outline(it: Outline) -> Any:
-    """Return the tree that an outline describes."""
     if it.kind == "dict":
         return {str(child.path[-1]): tree_of_outline(child) for child in it.children}
     if it.kind == "list":

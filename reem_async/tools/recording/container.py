@@ -74,7 +74,6 @@ class Message:
 
 
 def _unpacked(source: Source, info: ChunkInfo) -> bytes | None:
-    """Return the content of a chunk, None if it is damaged."""
     if info.bare:
         return source.read(info.offset, info.length)
     body = source.read(info.offset + HEAD.size, info.length - HEAD.size)
@@ -140,7 +139,6 @@ class _Scan:
         self._size = source.size
 
     def run(self, footer: Footer | None, progress: Progress | None) -> None:
-        """Read the file."""
         position = bare = len(MAGIC)  # since where there have been messages outside of chunks
         while position + HEAD.size <= self._size:
             opcode, length = HEAD.unpack(self._source.peek(position, HEAD.size))
@@ -279,7 +277,6 @@ class Container:
         return scan.contents
 
     def close(self) -> None:
-        """Close the file. Idempotent."""
         with self._lock:
             self._cache.clear()
             self._indexes.clear()

@@ -121,7 +121,6 @@ def export(
 
 
 def check_format(kind: str) -> None:
-    """Raise BadValue if there is no such format."""
     if kind not in FORMATS:
         raise BadValue(f"{kind!r} is none of {', '.join(FORMATS)}")
 

@@ -57,7 +57,6 @@ class JsonMessage(NamedTuple):
 
     @property
     def text(self) -> bytes:
-        """The JSON text."""
         return orjson.dumps(self.tree)
 
 

@@ -250,7 +250,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         return -1 if newest is None else newest[0].time
 
     def changes(self, after: int, until: int) -> set[Path]:
-        """Return the paths with news between two instants."""
         found = self._timeline.channels_between(after, until)
         streams = [self._of_channel[channel] for channel in found if channel in self._of_channel]
         return {stream.path for stream in streams if stream.role in NEWS}
@@ -260,7 +259,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         return self._timeline.times(self._news_channels(path))
 
     def news_count(self, path: Path, after: int, until: int) -> int:
-        """Return how much news there was on a path between two instants."""
         return sum(1 for _ in self._timeline.between(self._news_channels(path), after, until))
 
     def last_news(self, path: Path, until: int) -> int | None:

@@ -134,14 +134,12 @@ class McapWriter:
         output.write(_MAGIC + _record(Header("", library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Enter a schema; returns its number."""
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
         self._schemas.append(schema)
         self._chunk.put(_record(schema))
         return schema.id
 
     def register_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        """Enter a channel; returns its number."""
         channel = Channel(
             id=len(self._channels) + 1, topic=topic, message_encoding=encoding, schema_id=schema, metadata=metadata
         )

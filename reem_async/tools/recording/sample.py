@@ -104,12 +104,10 @@ class Sampler:
         self.failed = 0
 
     def start(self) -> None:
-        """Begin to read."""
         begin = asyncio.get_running_loop().time()
         self._tasks = [asyncio.create_task(self._follow(each, begin)) for each in self._samples]
 
     async def stop(self) -> None:
-        """Stop reading. Idempotent."""
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)

@@ -134,7 +134,6 @@ class Sink:
         return self._message(channel, encoded.pieces, stamp)
 
     def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
-        """Write figures on the recording itself."""
         document = JsonMessage(dict(figures), wrapped=False)
         if "statistics" not in self._channels:
             schema = self._schema("reem.stats", "jsonschema", signature(document.tree))

@@ -73,7 +73,6 @@ class Counts:
         self.by_path: collections.Counter[str] = collections.Counter()
 
     def drop(self, path: Path, number: int = 1) -> None:
-        """Count updates that did not fit into the queue."""
         self.dropped += number
         self._by_path(path, number)
 
@@ -136,7 +135,6 @@ class WriterThread:
         self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
 
     def start(self) -> None:
-        """Begin to write."""
         self._thread.start()
 
     @property
@@ -265,7 +263,6 @@ class WriterThread:
         self._lacking.add(name)
 
     def _keep(self, name: str, tree: Any) -> None:
-        """Note what a key holds."""
         if tree is MISSING:
             self._trees.pop(name, None)  # programs may publish under ever new names
         else:
