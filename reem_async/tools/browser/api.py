@@ -346,17 +346,17 @@ _PAUSE = 0.1
 _QUIET = 1.0
 """Seconds after which something is sent though nothing changed: the page knows by it that all is well."""
 
-# Paths that are named; beyond, the page is told only that there are more and looks at all it shows.
+# Paths that are named; if there are more, the event says only that, and the page reads all it shows.
 _MOST_PATHS = 100
-# Pages that are told of changes at the same time, each over a connection that stays open.
+# Pages that receive events at the same time, each over a connection that stays open.
 _MOST_CLIENTS = 64
 
 
 class Events:
     """Tells pages what changed in a source.
 
-    Each page is told which paths changed since it was last told, however long that took: a slow page
-    is told less often, and nothing piles up for it.
+    Each event has the paths that changed since the event before, however long ago that was. A slow page gets fewer
+    events, and nothing piles up for it.
 
     Args:
         source: What is shown.

@@ -1,4 +1,4 @@
-"""The application: who may ask, the pages and files, and the server that runs it on a port until Ctrl-C."""
+"""The application: access checks, the pages and files, and the server that runs it on a port until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from .arrays import Arrays, disposition, file_of
 from .pictures import Preview
 from .source import NotKept, Source, visible
 
-# Who may ask: the Host header, the token, where a request comes from, and what answers carry.
+# Access checks: the Host header, the token, where a request comes from, and what answers carry.
 
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
@@ -121,7 +121,7 @@ class Guard:
         await (refusal or self._app)(scope, receive, send_safely)
 
     def _refusal(self, scope: Scope) -> Response | None:
-        # In order: what costs most if it is let through first, then who is asking, then whether he may.
+        # First the check of what costs most, then of where the request comes from, then of its token.
         headers = Headers(scope=scope)
         if len(scope["query_string"]) + len(scope["path"]) > _LONGEST_URL:
             return PlainTextResponse("This address is too long.\n", 414)
@@ -140,7 +140,7 @@ class Guard:
         return host in self._hosts or (self._addresses and _is_address(host))
 
     def _unknown(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return what to answer to somebody whose cookie is not right."""
+        """Return the answer to a request without the right cookie; None if the cookie is right."""
         query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
         offered = dict(query).get("token")
         if offered is not None and self._fits(offered) and scope["method"] == "GET":
@@ -242,7 +242,7 @@ def listen(host: str, port: int) -> socket.socket:
         try:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind(place)
-            sock.listen(128)  # whoever connects from now on is served, if a little later
+            sock.listen(128)  # connections from now on are served, if a little later
         except OSError:
             sock.close()
             raise

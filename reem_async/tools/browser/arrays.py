@@ -34,7 +34,7 @@ from .trees import Leaf, leaf_of
 MOST_ROWS, MOST_COLUMNS = 200, 64
 # Of a line: about as many as a screen has pixels.
 _POINTS = 1000
-# Curves in one plot: of more columns nobody can tell one from the other.
+# Curves in one plot: more of them cannot be told apart.
 _MOST_CURVES = 16
 # Numbers that histograms and statistics look at; of larger arrays an even selection.
 _SAMPLE = 4_000_000

@@ -90,7 +90,7 @@ class Frames:
                 yield from line
 
     def forget(self, start: float, is_there: Callable[[Path], bool]) -> None:
-        """Let go of what is older than `start` and what nobody can see: of each path one frame before it is shown."""
+        """Drop what is older than `start`, but for the last frame of each path before it, which is shown."""
         for path in list(self._lines):
             line = self._lines[path]
             # One frame before the start stays: it is what was there at the start.
@@ -304,7 +304,7 @@ class History:
             self._fold(count)
 
     def _shed(self) -> None:
-        """Let go of the arrays of states that nobody can move the slider to any more."""
+        """Drop the arrays of states that the slider does not reach any more."""
         while self._heavy:
             self._bytes -= self._lines[self._heavy.pop()].strip()
 

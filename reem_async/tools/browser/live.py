@@ -26,7 +26,7 @@ _LARGEST = 1 << 28
 """Bytes of arrays up to which a value is read for a page."""
 
 _SHARED_SECONDS = 0.2
-"""How long one reading of a large value serves all who ask."""
+"""How long one reading of a large value serves all requests."""
 
 _SHORT = 128
 """Bytes of a value up to which it is read to be drawn."""
@@ -46,7 +46,7 @@ _AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
 class LiveSource:
     """What a server holds, and what it held in the last seconds.
 
-    Sees every update that is published, and what is only stored, by whomever, a moment after the server has said that a
+    Sees every update that is published. Sees what any client only stores a moment after the server has said that a
     key was changed: some hundredths of a second, half a second for a key that is published all the time, and as long as
     8 MB a second of documents take. Keys that are new and only stored are found within a second. A server that does not
     tell, for want of the right to CLIENT TRACKING, is looked at once a second: arrays that are overwritten by others of
@@ -196,12 +196,12 @@ class LiveSource:
             # One reading of a camera serves all panes and pages that ask at the same time.
             self._shared[key] = asyncio.create_task(self._read_new(path))
             self._shared[key].add_done_callback(lambda done: self._let_go(key, done))
-        # Who goes away must not break off the reading for the others.
+        # A cancelled request must not end the reading for the others.
         return await asyncio.shield(self._shared[key])
 
     def _let_go(self, key: str, done: asyncio.Task[Any]) -> None:
         if not done.cancelled():
-            # Looked at, so that asyncio does not complain if nobody waits for it any more.
+            # Retrieved, so that asyncio does not complain if no request waits for it any more.
             done.exception()
         asyncio.get_running_loop().call_later(_SHARED_SECONDS, self._shared.pop, key, None)
 

@@ -142,7 +142,7 @@ async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[byt
     for keys, path in zip(documents, paths, strict=True):
         commands += [("GET", keys.last), get_command(keys, path[1:]), ("GET", keys.last)]
     replies = await _ask(session, commands)
-    # Who may not read the notes has none of them.
+    # Without the right to read notes there are none.
     notes = [None if isinstance(reply, Exception) else reply for reply in replies]
     # The note before and after the text: if they are equal, that update is in it, and no later one.
     return [

@@ -133,7 +133,7 @@ class BufferedPast(Past[int]):
 
     def add(self, change: BufferedChange) -> None:
         """Append a change; times never go back."""
-        # Numbers only grow; what was folded into the base keeps its number, so indexes need not be made anew.
+        # Numbers only grow; what was folded into the base keeps its number, so indexes stay valid.
         number = self._gone + len(self.changes)
         self.text = None
         self.changes.append(change)

@@ -139,7 +139,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 def identical(one: Any, other: Any) -> bool:
-    """Return whether two trees are known to be equal, bit by bit; nobody knows of an array that is not here."""
+    """Return whether two trees are known to be equal, bit by bit; an array that is not here is not known."""
     contents = [{path: _bits(it) for path, it in walk(tree, ()) if isinstance(it, _SHIPPED)} for tree in (one, other)]
     return same(one, other) and contents[0] == contents[1] and None not in contents[0].values()
 

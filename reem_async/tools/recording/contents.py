@@ -18,7 +18,7 @@ from ...concurrency.scheduling import give_way
 # Long work in slices. The thread yields after each, so that recorded programs are not slowed down.
 
 
-# 64 KiB: about 50 us of compression, so that whoever waits for the processor waits no longer.
+# 64 KiB: about 50 us of compression, so that other threads wait for the processor no longer.
 _SLICE = 1 << 16
 
 
@@ -63,7 +63,7 @@ class Content:
     """The bytes of one value, later only a digest of them.
 
     Args:
-        head, body: The bytes; nobody changes them.
+        head, body: The bytes; they must not change.
 
     Attributes:
         size: How many bytes of memory are kept for it.

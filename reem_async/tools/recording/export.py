@@ -112,7 +112,7 @@ def export(
             part.finish()
         finally:
             part.close()
-    except FileExistsError as error:  # somebody has made it meanwhile
+    except FileExistsError as error:  # another program has created it in the meantime
         raise BadValue(str(error)) from None
     except OSError as error:
         file = str(log.path if error.filename == str(log.path) else target)

@@ -27,7 +27,7 @@ from .roles import Role
 from .stored import LOST, Reference, pruned, resolve
 from .times import Instant, nanoseconds, seconds
 
-# Whole keys as they were at some instant: who goes through time, or draws a slider, asks for neighbours again and
+# Whole keys as they were at some instant: a slider, or a walk through time, asks for neighbours again and
 # again.
 _CACHED_TREES = 256
 _END = 2**63 - 1
@@ -46,7 +46,7 @@ class LogUpdate:
         deleted: What was there is gone.
         published: When it was published, in seconds since 1970 on the publisher's clock; `time` if it was not.
         sequence: Its number among its publisher's updates of the top-level key; 0 if it was not published.
-        kind: "pub" if it was published; "stored" if somebody changed what is stored and published nothing: what that
+        kind: "pub" if it was published; "stored" if a client changed what is stored and published nothing: what that
             led to, at the instant at which it was found; "kvs" if it was sampled, or found when the key was read:
             what is left of an update that was changed before it could be read, or what a server that does not tell
             of stored changes had at a keyframe.

@@ -128,7 +128,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             loaded = self._load(ref, stream)
         except BadData:
             label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
-            if label in ("", "list"):  # it has places of its own, and nobody could tell whether something was there
+            if label in ("", "list"):  # it has places of its own: whether something was there is unknown
                 raise
             return Reference(label, stream.path, ref.time, 0, label)
         if loaded is None:

@@ -58,7 +58,7 @@ _Stream = tuple[bytes, Callable[[Any], bytes], Callable[[], bytes]]
 
 
 def _zstd(size: int) -> _Stream:
-    # The size is told beforehand: readers then know how much memory they need.
+    # The size comes first: readers then know how much memory they need.
     stream = zstandard.ZstdCompressor(level=1).compressobj(size=size)
     return b"", stream.compress, stream.flush
 
@@ -150,7 +150,7 @@ class McapWriter:
     def add_message(self, channel: int, log_time: int, pieces: list[Any], publish_time: int, number: int) -> int:
         """Put a message into the chunk, and close that if it is large enough; returns its bytes. Times are in ns.
 
-        Pieces are bytes, or views of bytes that nobody changes.
+        Pieces are bytes, or views of bytes that do not change.
         """
         size = sum(map(len, pieces))
         head = _MESSAGE.pack(

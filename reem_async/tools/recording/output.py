@@ -15,7 +15,7 @@ from .contents import slices
 
 
 class FileGone(OSError):
-    """Somebody else has deleted, replaced or changed the file; what was written to it is not there any more."""
+    """Another program has deleted, replaced or changed the file; what was written to it is lost."""
 
 
 class Output:
@@ -45,7 +45,7 @@ class Output:
                 self._part = PartFile(path, replace=True)
                 self._file = self._part.descriptor
             else:
-                # O_EXCL makes two recorders that begin at once agree on who has the name; the lock is for those that
+                # O_EXCL gives the name to one of two recorders that begin at once; the lock is for those that
                 # come later.
                 flags = os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL)
                 self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -78,7 +78,7 @@ class Output:
         return self._part is not None
 
     def appear(self) -> None:
-        """Take the place of the file that is to be replaced. Whoever reads that goes on with it.
+        """Take the place of the file that is to be replaced. Programs that read that one go on with it.
 
         Raises:
             BadValue: It is being recorded by now, or the directory cannot be written.
@@ -130,12 +130,14 @@ class Output:
         if not self._is_regular:
             return
         status = os.fstat(self._file)
-        # Nobody tells a program that its open file was deleted: a look at each flush does.
+        # The system does not report that an open file was deleted, so each flush checks.
         if not status.st_nlink:
-            raise FileGone(errno.ENOENT, "it was deleted or replaced by somebody else while it was recorded")
+            raise FileGone(errno.ENOENT, "it was deleted or replaced by another program while it was recorded")
         if status.st_size != self._written:
             size = f"it has {status.st_size} bytes, {self._written} were written"
-            raise FileGone(errno.EIO, f"it was cut short or written to by somebody else while it was recorded: {size}")
+            raise FileGone(
+                errno.EIO, f"it was cut short or written to by another program while it was recorded: {size}"
+            )
 
     def close(self) -> None:
         """Close the file; if it has not appeared yet, it is removed. Idempotent."""

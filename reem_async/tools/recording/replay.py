@@ -158,7 +158,7 @@ class Replayer:
     async def step(self) -> LogUpdate | None:
         """Publish the next update, whatever its time, and return it; the first call publishes the start too.
 
-        Returns None at the end (the call after it begins anew, with `loop` at once).
+        Returns None at the end (the next call starts again, with `loop` at once).
         """
         while True:
             if self._updates is None:

@@ -26,7 +26,7 @@ class Role(StrEnum):
     # What waits to be written besides, and is something else, or nothing, in the file.
 
     STORED = "stored"
-    """The whole key, of which somebody has changed something and published nothing; in the file, of what differs, an
+    """The whole key, of which a client has changed something and published nothing; in the file, of what differs, an
     update or a deletion."""
     SAMPLE = "sample"
     """What was read at a path in turn; in the file an update or a deletion."""
@@ -47,6 +47,6 @@ class Kind(StrEnum):
 
     PUBLISHED = "pub"
     STORED = "stored"
-    """Somebody changed what is stored, and published nothing."""
+    """A client changed what is stored, and published nothing."""
     READ = "kvs"
-    """It was sampled or read from the server: nobody knows who wrote it."""
+    """It was sampled or read from the server: its writer is unknown."""

@@ -173,14 +173,14 @@ def opened(tree: Any, path: Path, load: Callable[[Reference], Any]) -> Any:
     return tree
 
 
-# Items: an index that somebody made up must not make a list of millions.
+# Items: a made-up index must not make a list of millions.
 _LONGEST_PADDING = 10_000
 
 
 def planted(tree: Any, path: Path, value: Any) -> Any:
     """Return `tree` with `value` at `path`, making the parents that are not there.
 
-    For what was sampled: only this path was looked at, so nobody knows what is around it. Missing items of
+    For what was sampled: only this path was looked at, so what is around it is unknown. Missing items of
     a list before it are None.
     """
     if not path:

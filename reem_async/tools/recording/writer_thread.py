@@ -1,6 +1,6 @@
 """The thread that writes: takes what was received from a bounded queue, and keeps the tree as it was recorded.
 
-Nothing waits for it. What does not fit into the queue is dropped and counted, and the key is read anew.
+Nothing waits for it. What does not fit into the queue is dropped and counted, and the key is read again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Operation(NamedTuple):
     Attributes:
         role: What it says.
         path: The full path.
-        value: What is there now; for a gap, how many updates were lost, None if nobody knows.
+        value: What is there now; for a gap, how many updates were lost, None if unknown.
         stamp: Log time and publish time in ns, and a number.
         kind: Where it came from.
     """
@@ -77,7 +77,7 @@ class Counts:
         self._by_path(path, number)
 
     def skip(self, path: Path, number: int = 1) -> None:
-        """Count updates that were announced, and of which nobody can tell any more what they wrote."""
+        """Count updates that were announced, and whose values cannot be known any more."""
         self.skipped += number
         self._by_path(path, number)
 
@@ -104,8 +104,8 @@ class WriterThread:
     Attributes:
         counts: What was written and what was not.
         failure: Why writing ended, None while it goes on.
-        behind: Keys of which the tree kept here is not what the server has; whoever reads them anew takes them out.
-        stored: Keys of which something was written that was only stored; whoever takes note takes them out.
+        behind: Keys of which the tree kept here is not what the server has; the recorder reads and removes them.
+        stored: Keys of which something was written that was only stored; the recorder removes them.
     """
 
     def __init__(self, sink: Sink, ships: Ships, limit: int, patterns: Sequence[Pattern] = ()) -> None:
@@ -416,7 +416,7 @@ def _described(label: str, path: Path, at: int, data: Any, content: Content) -> 
 
 
 def _as_state(it: Operation) -> Operation:
-    """Return what is there now as something of which nobody knows who wrote it."""
+    """Return what is there now as read from the server: its writer is unknown."""
     return it._replace(role=Role.STATE, kind=Kind.READ)
 
 
