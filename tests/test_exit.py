@@ -47,6 +47,7 @@ for space, key in spaces[:2]:
     calls = reem.CallbackSubscriber(key, space.interface, lambda data, updated_path: None)
     calls.listen()
     watch = reem.KeyValueStore(space.interface)[key].watch()
+    next(watch)  # from here on it only waits, and uses no connection of this thread
     threading.Thread(target=list, args=[watch], daemon=True).start()
 {after}
 """

@@ -114,15 +114,21 @@ def test_a_predicate_sees_each_published_state(mirrored, pspace, key):
     pspace[key()] = {"pressed": False}
     it = mirrored((key(),))
 
-    def press():
-        time.sleep(0.01)
-        pspace[key()]["pressed"] = True
-        pspace[key()]["pressed"] = False
-
     for _ in range(20):
+        waits = threading.Event()
+
+        def press(waits=waits):
+            waits.wait(10)
+            pspace[key()]["pressed"] = True
+            pspace[key()]["pressed"] = False
+
+        def pressed(value, waits=waits):
+            waits.set()
+            return value["pressed"]
+
         thread = threading.Thread(target=press)
         thread.start()
-        assert it.until(lambda value: value["pressed"])["pressed"] is True
+        assert it.until(pressed)["pressed"] is True
         thread.join()
         it.until(lambda value: not value["pressed"])
 

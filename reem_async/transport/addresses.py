@@ -30,9 +30,11 @@ def settings_of(host: Any) -> dict[str, Any]:
         return _host_and_port(host)
     if not host.startswith(_SCHEMES):
         raise BadValue(f"the URL of a server begins with one of {', '.join(_SCHEMES)}")
-    _check_url(host)
     try:
+        _check_url(host)
         settings: dict[str, Any] = {**parse_url(host)}
+    except BadValue:  # it names the part that is wrong
+        raise
     except ValueError:  # its text may hold a part of the password
         raise BadValue(
             "the URL of the server is wrong; write it like redis://user:password@host:6379/0, special characters "
