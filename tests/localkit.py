@@ -361,8 +361,8 @@ STEPS = {
     "in the middle of writing": lambda: setattr(segment, "np", Numpy()),
     "written and locked": lambda: killing(segment.Segment, "_write"),
     "in the slot": lambda: killing(path.LocalPath, "put"),
-    "told early, not stored": lambda: killing(publish._Setting, "_tell_near"),
-    "not stored": lambda: killing(publish._Setting, "share"),
+    "told early, not stored": lambda: killing(publish.ValueAnnouncement, "_notify_host"),
+    "not stored": lambda: killing(publish.ValueAnnouncement, "share"),
     "stored": lambda: None,
 }
 """Where a publisher ends; of its memory each publisher makes an own one."""
