@@ -19,7 +19,7 @@ from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
-from reem_async.transport.blocking import BlockingTransport
+from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
 from reem_async.transport.composite import NewTransport
 from reem_async.transport.state import State, StateChange, StateChanges
 
@@ -143,6 +143,7 @@ def _end_loops() -> None:
     for each in list(_interfaces):
         each._background.stop()
         each._closing.detach()  # it would keep a ship, and with it all that the ship's module has
+    keep_open_at_exit()
 
 
 def _is_left_over() -> bool:

@@ -59,6 +59,8 @@ ENDS = {  # what runs before the import of REEM, and at the end of the program
     "a log handler": ("logging.getLogger().addHandler(Handler())", ""),
     "__del__ of a global": ("at_end = AtEnd()", ""),
     "__del__ of a cycle": ("at_end = AtEnd(cycle=True)", ""),
+    "__del__ of a global made last": ("", "at_end = AtEnd()"),
+    "__del__ of a cycle made last": ("", "at_end = AtEnd(cycle=True)"),
     "a generator": ("", "at_end = generator(); next(at_end)"),
     "a thread that outlives the main one": (
         "", "threading.Thread(target=lambda: (threading.main_thread().join(), last())).start()",
@@ -66,7 +68,7 @@ ENDS = {  # what runs before the import of REEM, and at the end of the program
     "sys.exit": ("atexit.register(last)", "sys.exit(0)"),
     "an interface that was closed for others": ("atexit.register(last)", "reem.RedisInterface(url).close()"),
 }  # fmt: skip
-AFTER_MODULES = ("__del__ of a global", "__del__ of a cycle", "a generator")
+AFTER_MODULES = [end for end in ENDS if end.startswith("__del__") or end == "a generator"]
 
 
 @pytest.mark.parametrize("end", ENDS)

@@ -15,7 +15,7 @@ from conftest import aeventually, same_bits
 
 import reem_async
 from reem_async import Unreadable
-from reem_async.errors import BadData
+from reem_async.errors import BadData, BadType
 from reem_async.plain.documents import MARK
 from reem_async.plan.trees import MISSING
 from reem_async.server import EmbeddedServer
@@ -294,6 +294,11 @@ def test_an_unreadable_value_raises_when_it_is_used(use):
     """With the place and the reason."""
     with pytest.raises(BadData, match=r"b\.image: gone"):
         USES[use](Unreadable("b.image", "b.image: gone"))
+
+
+async def test_an_unreadable_value_is_refused_where_a_copy_of_what_was_followed_is_stored(ainterface, key):
+    with pytest.raises(BadType, match="could not be read; leave it out"):
+        await reem_async.KeyValueStore(ainterface)[key()].write({"image": Unreadable("b.image", "gone")})
 
 
 @pytest.mark.parametrize("same", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])

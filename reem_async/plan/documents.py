@@ -344,6 +344,7 @@ def _remedy(value: Any) -> str:
     import uuid
 
     remedies: tuple[tuple[Any, str], ...] = (
+        (placeholders.Unreadable, "it could not be read; leave it out, or store a value in its place"),
         (enum.Enum, "store its .value or .name"),
         ((set, frozenset), "use a list, such as sorted(value)"),
         (complex, "use [value.real, value.imag] or a numpy array"),

@@ -14,7 +14,9 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextvars import ContextVar
 from functools import partial
+from typing import Any
 
 import redis.exceptions
 
@@ -30,7 +32,7 @@ from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallRead
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 
-__all__ = ["BlockingTransport"]
+__all__ = ["BlockingTransport", "keep_open_at_exit"]
 
 _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
@@ -52,6 +54,7 @@ class _Line:
 
     def __init__(self, options: Options, states: States, lines: list[weakref.ref[_Line]]) -> None:
         self._states, self._lines = states, lines
+        self._is_kept = False
         self._connection = options.blocking_connection()
         try:
             self._connection.connect()
@@ -221,9 +224,27 @@ class _Line:
         self._connection.disconnect()
         self._out.close()
 
+    def kept_open(self) -> tuple[Any, ...]:
+        """Return what has to be kept for the connection to stay open, also when this object is finalized."""
+        self._is_kept = True
+        return self._connection, self._socket, self._out
+
     def __del__(self) -> None:  # an interrupted call may have kept it from being given back
-        if hasattr(self, "_out"):
+        if hasattr(self, "_out") and not self._is_kept:
             self._out.close()
+
+
+_kept: ContextVar[list[Any]] = ContextVar("_kept")
+
+
+def keep_open_at_exit() -> None:
+    """Keep the idle connections of this process open until it ends, for the calls of `__del__`.
+
+    Python finalizes all modules and their objects as one heap of garbage, in any order: it would close a connection
+    before it calls the `__del__` that sends the last command over it. The context of the main thread outlives that.
+    """
+    transports = [transport for reference in list(_all) if (transport := reference()) is not None]
+    _kept.set([line.kept_open() for transport in transports for line in list(transport._idle)])
 
 
 class BlockingTransport:
