@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from typing import Any
-from urllib.parse import parse_qsl, urlsplit, urlunsplit
+from urllib.parse import SplitResult, parse_qsl, urlsplit, urlunsplit
 
 import redis.asyncio
 from redis.asyncio.connection import parse_url
@@ -64,10 +64,7 @@ def _check_url(url: str) -> None:
     Raises:
         BadValue: There is one. The message never quotes user and password.
     """
-    try:
-        parts = urlsplit(url)
-    except ValueError:  # half an IPv6 address; the text may hold a part of the password
-        raise BadValue("the URL of the server is wrong; write it like redis://user:password@host:6379/0") from None
+    parts = _split(url)
     login, _, place = parts.netloc.rpartition("@")
     problem, form = "", f"{parts.scheme}://{'user:password@' if login else ''}host:6379/0"
     if parts.scheme == "unix":
@@ -87,13 +84,21 @@ def _check_url(url: str) -> None:
         problem = f"{place!r} is not a host with a port"
     if "#" in url.rpartition("@")[2]:
         problem = "it has a fragment (#...)"
-    databases = [value for name, value in parse_qsl(parts.query) if name == "db"]
+    databases = [value for name, value in parse_qsl(parts.query, keep_blank_values=True) if name == "db"]
     if any(not re.fullmatch("[0-9]+", value) for value in databases):
         problem = f"db={databases[0]!r} is not the number of a database"
-    elif parts.scheme != "unix" and databases and parts.path.strip("/") not in ("", databases[0]):
+    elif len({*databases, parts.path.strip("/") if parts.scheme != "unix" else ""} - {""}) > 1:
         problem = "it names two databases"
     if problem:
         raise BadValue(f"the URL of the server is wrong: {problem}; write it like {form}")
+
+
+def _split(url: str) -> SplitResult:
+    """Return the parts of a URL; raise BadValue for one with half an IPv6 address, and never quote it."""
+    try:
+        return urlsplit(url)
+    except ValueError:
+        raise BadValue("the URL of the server is wrong: an IPv6 address is written like redis://[::1]:6379/0") from None
 
 
 def address_of(url: str, port: int) -> tuple[str, int]:
@@ -108,15 +113,17 @@ def listed(url: str, example: str) -> list[str]:
     Raises:
         BadValue: No host, or a port that is no number; never quotes the URL, which may hold a password.
     """
-    parts = urlsplit(url)
+    parts = _split(url)
     if parts.fragment:
         raise BadValue(f"the URL has a fragment (#...); write it like {example}")
     # From the right: a password may contain an @.
     login, at, hosts = parts.netloc.rpartition("@")
+    if "," in login.partition("@")[2]:
+        raise BadValue(f"the URL has a user for each host; one user has all hosts, write it like {example}")
     urls = []
     for each in hosts.split(","):
-        one = urlsplit(f"//{each}")
         try:
+            one = urlsplit(f"//{each}")
             sound = bool(one.hostname) and (one.port is None or one.port > 0)
         except ValueError:
             sound = False
