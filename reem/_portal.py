@@ -25,12 +25,14 @@ try:
 except ImportError:
     uvloop = None  # type: ignore[assignment]
 
-__all__ = ["LastPortal", "Portal", "finish"]
+__all__ = ["LastPortal", "Portal", "Threads", "finish"]
 
 Result = TypeVar("Result")
 
 _LONGEST_LAST = 2.0
 """Seconds for what a loop runs before its end: more than the core waits for tasks that are slow to end."""
+_LONGEST_END = 1.0
+"""Seconds to wait for a thread, which ends at its next look at the interface that is closed."""
 _LONGEST_STOP = 3.0
 """Seconds to wait for the loop's thread, in which a ship of a user's own may be at work."""
 
@@ -249,3 +251,33 @@ class LastPortal:
 
     def stop(self, last: Callable[[], Coroutine[Any, Any, None]] | None = None) -> None:
         """Return: the loop has ended with the call."""
+
+
+class Threads:
+    """The background threads of one interface. They are daemons: a program that ends does not wait for them."""
+
+    def __init__(self) -> None:
+        self._running: set[threading.Thread] = set()
+
+    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> None:
+        """Run a coroutine of the core, which does all its waiting in system calls."""
+        thread = threading.Thread(target=self._run, args=(coroutine,), name=name, daemon=True)
+        self._running.add(thread)
+        try:
+            thread.start()
+        except Exception:  # there are too many threads, or the interpreter is ending: nothing is to wait for this one
+            self._running.discard(thread)
+            coroutine.close()
+            raise
+
+    def _run(self, coroutine: Coroutine[Any, Any, Any]) -> None:
+        try:
+            finish(coroutine)
+        finally:
+            self._running.discard(threading.current_thread())
+
+    async def end(self) -> None:
+        """Wait until all have ended, but for the one that asks for it; the interface is closed before."""
+        for thread in list(self._running):
+            if thread is not threading.current_thread():
+                thread.join(_LONGEST_END)

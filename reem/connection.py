@@ -23,8 +23,7 @@ from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
 from reem_async.transport.composite import NewTransport
 from reem_async.transport.state import State, StateChange, StateChanges
 
-from ._portal import LastPortal, Portal, finish
-from ._threads import Threads
+from ._portal import LastPortal, Portal, Threads, finish
 from ._twin import documented_by
 
 __all__ = [  # noqa: F822 - all but RedisInterface stood here in REEM 0.1.x, and old programs import it from here

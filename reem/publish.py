@@ -6,8 +6,7 @@ from typing import Any
 
 from reem_async.store import publish as core
 
-from .accessor import PublishAccessor
-from .low_level import Publisher
+from .accessor import PublishAccessor, Publisher
 from .store import KeyValueStore
 
 __all__ = ["PublishSpace", "Publisher"]

@@ -10,9 +10,8 @@ from reem_async.errors import RedisError, ReemError
 from reem_async.store import store as core
 
 from ._twin import documented_by
-from .accessor import Accessor
+from .accessor import Accessor, Reader, Writer
 from .connection import RedisInterface
-from .low_level import Reader, Writer
 from .subscribe import PatternWatch
 
 __all__ = ["KeyValueStore", "Reader", "Writer"]
