@@ -15,11 +15,9 @@ from test_cli import REEM, CommandLine
 
 import reem as blocking
 from reem_async.pubsub.monitor import Event
-from reem_async.tools.cli.board import Board
 from reem_async.tools.cli.output import json_text
-from reem_async.tools.cli.picture import Picture
+from reem_async.tools.cli.top import ALL, Board, Window, table
 from reem_async.tools.cli.values import preview
-from reem_async.tools.cli.windows import ALL, Window
 
 
 @pytest.fixture
@@ -87,17 +85,17 @@ def test_who_takes_over_is_one_publisher():
 )
 def test_the_table_fits_any_terminal(columns, lines, titles):
     """Numbers are whole, names are cut, and that two publish one key stands there however many keys there are."""
-    board = Board(ALL, 100, lambda path: path[:1])
+    board = Board(ALL, 100)
     for number in range(25 * 4):
         publisher = "b" if number % 8 == 3 else "a"  # key 03 has two
         name = f"sensor_with_a_rather_long_name_{number % 25:02}" if number % 25 != 3 else "k03"
         now = time.time() + number / 1000
-        board.take(Event((name, "x"), 1, False, 25_000, now, now, publisher, 1), None)
-    board.take(Event(("k03",), 1, False, 25_000, now, now, "b", 2), None)
-    board.take(Event(("k03",), 1, False, 25_000, now, now, "a", 2), None)
+        board.take(Event((name, "x"), 1, False, 25_000, now, now, publisher, 1))
+    board.take(Event(("k03",), 1, False, 25_000, now, now, "b", 2))
+    board.take(Event(("k03",), 1, False, 25_000, now, now, "a", 2))
     screen = io.StringIO()
     console = Console(file=screen, width=columns, height=lines, color_system=None)
-    console.print(Picture(board, "", console)._drawn())
+    console.print(table(board, "", columns, lines))
     shown = screen.getvalue().rstrip("\n").split("\n")
     assert " ".join(shown[0].split()) == titles
     assert len(shown) < lines

@@ -142,11 +142,10 @@ async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> As
 async def _publishers(interface: RedisInterface) -> Finding:
     """Listen for a moment whether any key is published by two at once."""
     from reem_async.errors import RedisError, ReemError
-    from reem_async.tools.cli.board import Board
     from reem_async.tools.cli.following import follow
-    from reem_async.tools.cli.windows import ALL
+    from reem_async.tools.cli.top import ALL, Board
 
-    board = Board(ALL, 1000, lambda path: path[:1])
+    board = Board(ALL)
     try:
         heard = await follow(interface, (), board.take, seconds=_LISTENS)
     except (ReemError, RedisError) as error:

@@ -1,0 +1,492 @@
+"""`reem top`, and its views `hz`, `bw` and `delay`: measured from notices, without fetching what they announce."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import textwrap
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from statistics import fmean, pstdev
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from reem_async.tools.cli.following import Ending, follow
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url, WindowLength
+from reem_async.tools.cli.output import cut, emit, emit_json, is_terminal, note, size_text, typed
+from reem_async.tools.cli.running import run
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.pubsub.monitor import Event
+
+__all__ = [
+    "ALL",
+    "BANDWIDTH",
+    "DELAY",
+    "RATE",
+    "Board",
+    "View",
+    "Window",
+    "bw",
+    "delay",
+    "hz",
+    "spread",
+    "table",
+    "top",
+]
+
+_WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
+_DRAW_SECONDS = 0.25  # people can read numbers that change four times a second
+_MOST_PATHS = 10_000  # that are kept: a program may publish under ever new names
+_MOST_PUBLISHERS = 16  # of one path that are remembered; the one that was silent longest goes first
+_PUBLISHER_SECONDS = 10.0  # of silence, while others publish, after which a publisher has ended
+_STALE_SECONDS = 2.0  # of silence after which a row is dimmed
+_SHORTEST_PATH = 12  # characters of a path that are kept before columns are left out for it
+_BETWEEN = 2  # blanks between two columns
+
+
+class Window:
+    """The last `length` updates of one path.
+
+    Attributes:
+        total: How many updates there were in all.
+        lost: How many were lost on the way.
+    """
+
+    def __init__(self, length: int) -> None:
+        self.total = 0
+        self.lost = 0
+        self.received: deque[float] = deque(maxlen=length)
+        self.delays: deque[float] = deque(maxlen=length)
+        self.sizes: deque[int] = deque(maxlen=length)
+        self._publishers: dict[str, list[float]] = {}  # the times of the first and the last update of each
+        self._last_local = 0.0
+
+    def add(self, event: Event) -> None:
+        self.total += 1
+        self.lost += event.missed
+        self.received.append(event.received)
+        self.delays.append(event.received - event.time)
+        self.sizes.append(event.size)
+        if event.local:
+            self._last_local = event.received
+        times = self._publishers.setdefault(event.publisher, [event.received, event.received])
+        times[1] = event.received
+        if len(self._publishers) > _MOST_PUBLISHERS:
+            del self._publishers[min(self._publishers, key=lambda name: self._publishers[name][1])]
+
+    @property
+    def publishers(self) -> int:
+        """How many publish at the same time; a program that was restarted, and so has a new id, counts once."""
+        if not self._publishers:
+            return 0
+        # Publishers that were active after the newest one began run beside it. The newest one replaced the others.
+        newest = max(first for first, _ in self._publishers.values())
+        since = max(newest, self.received[-1] - _PUBLISHER_SECONDS)
+        return sum(last >= since for _, last in self._publishers.values()) or 1
+
+    @property
+    def local(self) -> bool:
+        """Whether programs on a publisher's host could take one of the last updates from its memory."""
+        return bool(self._last_local) and self._last_local >= self.received[-1] - _PUBLISHER_SECONDS
+
+    @property
+    def age(self) -> float:
+        """Seconds since the last update was received."""
+        return max(time.time() - self.received[-1], 0.0) if self.received else 0.0
+
+    @property
+    def _duration(self) -> float:
+        return self.received[-1] - self.received[0] if self.received else 0.0
+
+    def rate(self) -> float | None:
+        """Updates a second; None of fewer than two."""
+        # n updates have n - 1 intervals between them.
+        return (len(self.received) - 1) / self._duration if self._duration > 0 else None
+
+    def bandwidth(self) -> float | None:
+        """Bytes a second; None of fewer than two updates."""
+        # The bytes of the first update came at the beginning of the span, all others within it.
+        return (sum(self.sizes) - self.sizes[0]) / self._duration if self._duration > 0 else None
+
+    def intervals(self) -> list[float]:
+        """Seconds between updates."""
+        return [later - earlier for earlier, later in pairwise(self.received)]
+
+
+class Spread(NamedTuple):
+    """Mean, least, greatest and standard deviation."""
+
+    mean: float
+    min: float
+    max: float
+    std: float
+
+
+def spread(values: Sequence[float]) -> Spread | None:
+    """Return how `values` are spread; None if there is none."""
+    return Spread(fmean(values), min(values), max(values), pstdev(values)) if values else None
+
+
+class View(NamedTuple):
+    """What one of the commands shows of a window.
+
+    Attributes:
+        headers: Of the columns after the path; the last ones may be left out on a narrow terminal.
+        cells: The text in these columns.
+        data: The same for programs.
+        remark: What one should know to read it.
+    """
+
+    headers: tuple[str, ...]
+    cells: Callable[[Window], tuple[str, ...]]
+    data: Callable[[Window], dict[str, Any]]
+    remark: str = ""
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1000:.2f}"
+
+
+def _hertz(window: Window) -> str:
+    rate = window.rate()
+    return "-" if rate is None else f"{rate:.2f}"
+
+
+def _bandwidth(window: Window) -> str:
+    rate = window.bandwidth()
+    return "-" if rate is None else f"{size_text(rate)}/s"
+
+
+def _spread_cells(values: Sequence[float], text: Callable[[float], str]) -> tuple[str, ...]:
+    it = spread(values)
+    return tuple(map(text, it)) if it else ("-",) * 4
+
+
+def _spread_data(values: Sequence[float]) -> dict[str, float] | None:
+    it = spread(values)
+    return it._asdict() if it else None
+
+
+def _mean_delay(window: Window) -> float:
+    return fmean(window.delays) if window.delays else 0.0
+
+
+RATE = View(
+    ("Hz", "mean ms", "min ms", "max ms", "std ms"),
+    lambda window: (_hertz(window), *_spread_cells(window.intervals(), _ms)),
+    lambda window: {"hz": window.rate(), "interval_s": _spread_data(window.intervals())},
+)
+BANDWIDTH = View(
+    ("bytes/s", "mean", "min", "max", "std"),
+    lambda window: (_bandwidth(window), *_spread_cells(window.sizes, size_text)),
+    lambda window: {"bytes_per_s": window.bandwidth(), "bytes": _spread_data(window.sizes)},
+    "of values as they are published; += and append() do not say their size and count as 0 bytes",
+)
+DELAY = View(
+    ("mean ms", "min ms", "max ms", "std ms"),
+    lambda window: _spread_cells(window.delays, _ms),
+    lambda window: {"delay_s": _spread_data(window.delays)},
+    "received here minus published there: if these are two machines, the difference of their clocks is in it",
+)
+ALL = View(
+    ("Hz", "bytes/s", "delay ms", "age s", "publishers", "shared"),
+    lambda window: (
+        _hertz(window),
+        _bandwidth(window),
+        _ms(_mean_delay(window)),
+        f"{window.age:.1f}",
+        f"{window.publishers}{' !' * (window.publishers > 1)}",
+        "yes" if window.local else "-",
+    ),
+    lambda window: {
+        "hz": window.rate(),
+        "bytes_per_s": window.bandwidth(),
+        "delay_s": _mean_delay(window),
+        "age_s": window.age,
+        "publishers": window.publishers,
+        "local": window.local,
+    },
+    "delay: mean, from publishing to receiving; between machines their clocks' difference is in it; "
+    "shared: programs on the publisher's host take its arrays from shared memory",
+)
+
+
+class Board:
+    """The windows of all paths that were updated.
+
+    Args:
+        view: What is shown of them.
+        length: How many updates of a path count.
+
+    Attributes:
+        windows: By path; in the view of `reem top` by top-level key.
+    """
+
+    def __init__(self, view: View, length: int = _WINDOW) -> None:
+        self.view = view
+        self.windows: dict[str, Window] = {}
+        self._length = length
+        self._reported: dict[str, int] = {}
+
+    def take(self, event: Event, _: Ending | None = None) -> None:
+        """Enter an update."""
+        path = event.path[:1] if self.view is ALL else event.path
+        shown = typed(path) + " (stored)" * event.stored
+        if shown in self.windows or len(self.windows) < _MOST_PATHS:
+            self.windows.setdefault(shown, Window(self._length)).add(event)
+
+    def rows(self) -> list[tuple[str, Window]]:
+        return sorted(self.windows.items(), key=lambda row: row[0])
+
+    def report(self, *, as_json: bool, final: bool = False) -> None:
+        """Print a line for each path with new updates; at the end, for each."""
+        for path, window in self.rows():
+            if not final and self._reported.get(path) == window.total:
+                continue
+            self._reported[path] = window.total
+            if as_json:
+                numbers = {"updates": window.total, "window": len(window.received), "lost": window.lost}
+                emit_json({"path": path, **self.view.data(window), **numbers, "time": time.time(), "final": final})
+            else:
+                cells = zip(_titles(self.view), _cells(self.view, window), strict=True)
+                emit(f"{path}: " + ", ".join([f"{title} {cell}" for title, cell in cells]))
+        sys.stdout.flush()
+
+    def doubled(self) -> dict[str, int]:
+        """Return the paths that several programs publish at the same time, and how many they are."""
+        return {path: it.publishers for path, it in self.rows() if it.publishers > 1}
+
+    def warnings(self) -> list[str]:
+        return [
+            f"{path} is published by {count} interfaces at once: each overwrites what the others wrote"
+            for path, count in self.doubled().items()
+        ]
+
+
+def _titles(view: View) -> tuple[str, ...]:
+    return (*view.headers, "updates", "lost")
+
+
+def _cells(view: View, window: Window) -> tuple[str, ...]:
+    return (*view.cells(window), str(window.total), str(window.lost))
+
+
+def table(board: Board, waiting: str, width: int, height: int) -> Group:
+    """Return the board as a table that fits into a terminal of this size; without updates, the line `waiting`."""
+    if not board.windows:
+        return Group(Text(f"{waiting} (q or Ctrl-C ends)", style="dim"))
+    rows = board.rows()
+    notes = [_line(line, "dim") for line in _wrapped(board.view.remark, width, height // 4)]
+    if board.view is ALL and (doubled := board.doubled()):
+        notes.insert(0, _line(f"! several publishers, each overwrites the others: {', '.join(doubled)}", "yellow"))
+    # One line is the table's head, and one is left for the cursor. What lies lower is cut off.
+    room = height - 2 - len(notes)
+    if len(rows) > room:
+        shown = max(room - 1, 1)
+        notes.insert(0, _line(f"… {len(rows) - shown} more paths; give a pattern to see them", "dim"))
+        rows = rows[:shown]
+    titles = ("path", *_titles(board.view))
+    cells = [(path, *_cells(board.view, window)) for path, window in rows]
+    kept, room = _fitting([titles, *cells], width)
+    drawn = Table(box=None, pad_edge=False, header_style="bold", padding=(0, _BETWEEN, 0, 0))
+    drawn.add_column(titles[0], no_wrap=True, style="bold")
+    for place in kept:
+        drawn.add_column(titles[place], justify="right", no_wrap=True)
+    for (_, window), row in zip(rows, cells, strict=True):
+        texts = [Text(cut(row[0], room)), *(Text(row[place]) for place in kept)]
+        if window.lost:
+            texts[-1].stylize("red")
+        if board.view is ALL and window.publishers > 1:
+            texts[0].stylize("yellow")
+        drawn.add_row(*texts, style="dim" if window.age > _STALE_SECONDS else "")
+    return Group(drawn, *notes)
+
+
+def _wrapped(remark: str, width: int, most: int) -> list[str]:
+    lines = textwrap.wrap(remark, max(width, 20))
+    return lines if len(lines) <= most else [remark]  # cut: the rows come first
+
+
+def _line(text: str, style: str) -> Text:
+    return Text(text, style=style, no_wrap=True, overflow="ellipsis")
+
+
+def _fitting(rows: list[tuple[str, ...]], width: int) -> tuple[list[int], int]:
+    """Return which columns there is room for beside the path, and the width of the path."""
+    longest, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    kept = list(range(1, len(widths) + 1))
+    while True:
+        room = width - sum([widths[place - 1] + _BETWEEN for place in kept])
+        if room >= min(longest, _SHORTEST_PATH) or len(kept) <= 2:
+            return kept, max(room, 1)
+        del kept[-2]  # the last one, how many were lost, stays
+
+
+@contextmanager
+def _drawing(board: Board, waiting: str) -> Iterator[Callable[[Ending | None], None]]:
+    """Give what draws the board in place; the last state stays on the screen."""
+    console = Console()
+    with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
+
+        def draw(_: Ending | None = None) -> None:
+            live.update(table(board, waiting, console.width, console.height), refresh=True)
+
+        draw()
+        yield draw
+        draw()
+
+
+@contextmanager
+def _ended_by_q() -> Iterator[None]:
+    """Cancel this task when `q` is typed, if this program may read from the terminal."""
+    if not sys.stdin.isatty() or sys.platform == "win32" or os.tcgetpgrp(fd := sys.stdin.fileno()) != os.getpgrp():
+        yield
+        return
+    import termios
+    import tty
+
+    task, loop, before = asyncio.current_task(), asyncio.get_running_loop(), termios.tcgetattr(fd)
+
+    def on_key() -> None:
+        if b"q" in os.read(fd, 64).lower() and task is not None:
+            task.cancel()
+
+    tty.setcbreak(fd)  # keys come at once and are not shown; Ctrl-C stays a signal
+    loop.add_reader(fd, on_key)
+    try:
+        yield
+    finally:
+        loop.remove_reader(fd)
+        termios.tcsetattr(fd, termios.TCSADRAIN, before)
+
+
+Every = Annotated[
+    float | None,
+    typer.Option(
+        "--every",
+        min=0.1,
+        metavar="SECONDS",
+        show_default="1; with --timeout or --count one report, at the end",
+        help="Time between reports where the output is no terminal.",
+    ),
+]
+
+
+def _command(name: str, view: View, text: str, *, stored: bool = False) -> Callable[..., None]:
+    """Return the command that shows a view of updates, also of `stored` changes; `text` is its help."""
+
+    def command(
+        patterns: Patterns = None,
+        window: WindowLength = _WINDOW,
+        count: Count = None,
+        timeout: Timeout = None,
+        every: Every = None,
+        as_json: AsJson = False,
+        url: Url = DEFAULT_URL,
+        namespace: Namespace = "",
+    ) -> None:
+        board, wanted = Board(view, window), patterns or ()
+        # With an end (--timeout, --count) a script wants one report; without one, a report each second.
+        period = 1.0 if every is None and timeout is None and count is None else every
+
+        async def followed(interface: RedisInterface, period: float | None, tick: Callable[[Ending], None]) -> Ending:
+            return await follow(
+                interface, wanted, board.take, count=count, seconds=timeout, every=period, tick=tick, stored=stored
+            )
+
+        async def work(interface: RedisInterface) -> int:
+            if is_terminal() and not as_json:
+                waiting = f"waiting for updates of {', '.join(wanted) or 'any key'}"
+                with _ended_by_q(), _drawing(board, waiting) as draw:
+                    ending = await followed(interface, _DRAW_SECONDS, draw)
+                return ending.tell()
+            ending = await followed(interface, period, lambda _: board.report(as_json=as_json))
+            board.report(as_json=as_json, final=True)
+            for line in board.warnings() if view is ALL else ():
+                note(f"warning: {line}")
+            if view.remark and not as_json:
+                note(view.remark)
+            return ending.tell()
+
+        run(name, work, url, namespace, live=True)
+
+    command.__name__, command.__doc__ = name, text
+    return command
+
+
+top = _command(
+    "top",
+    ALL,
+    """Show what is published: a live table of keys, until q or Ctrl-C (exit code 0).
+
+The columns of a top-level key: updates a second, bytes a second, delay, seconds since the last update, and how many
+programs publish it. A key with several publishers at once is marked, since each overwrites the other. "shared" says
+that large updates also go through shared memory, to programs on the publisher's host that asked for them. Nothing is
+fetched. Writes of a KeyValueStore do not count.
+
+Examples:
+    reem top
+    reem top 'cam_*' imu
+    reem top --timeout 5 --json
+""",
+)
+
+hz = _command(
+    "hz",
+    RATE,
+    """Measure how often paths are published or stored, until Ctrl-C (exit code 0).
+
+Updates a second, and the time between two: mean, least, greatest, standard deviation, of the last
+updates of each path. Large arrays are not fetched, so it costs the same for a number and an image. "lost"
+counts updates that did not arrive here. Plain writes have "(stored)" behind their path. They are detected at most
+1000 times a second, and several at once count as one.
+
+Examples:
+    reem hz
+    reem hz raw_image --window 100
+    reem hz set_point --timeout 5 --json
+""",
+    stored=True,
+)
+
+bw = _command(
+    "bw",
+    BANDWIDTH,
+    """Measure how many bytes are published, until Ctrl-C (exit code 0).
+
+Bytes a second and bytes of one update: mean, least, greatest, of the last updates of each path.
+Nothing is fetched: each notice says the size of its value. += and append() do not, and count as 0.
+
+Examples:
+    reem bw
+    reem bw 'cam_*'
+    reem bw raw_image --count 300 --json
+""",
+)
+
+delay = _command(
+    "delay",
+    DELAY,
+    """Measure the time from publishing to receiving, until Ctrl-C (exit code 0).
+
+The time at which a notice is received here, minus the time that its publisher wrote into it, of
+the last updates of each path. Both clocks matter: between two machines it also shows how far they
+are apart, and may be negative; see `reem doctor`. Fetching a large value is not in it.
+
+Examples:
+    reem delay
+    reem delay raw_image set_point
+    reem delay set_point --timeout 5 --json
+""",
+)
