@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 import reem as blocking
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli import build, lazy
+from reem_async.tools.cli import build, commands
 from reem_async.tools.cli.commands import COMMANDS
 
 REEM = str(pathlib.Path(sys.executable).parent / "reem")
@@ -146,7 +146,7 @@ def test_help_has_every_command_under_its_heading_with_examples():
         assert f" {entry.name} " in run.stdout
         thing = getattr(importlib.import_module(entry.full_module), entry.attribute)
         if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
-            said = lazy.help_text(thing.__doc__)
+            said = commands.help_text(thing.__doc__)
             assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])
             assert "[bold]Examples:[/bold]\n" in said
             assert f"    reem {entry.name}" in said
@@ -161,20 +161,20 @@ def test_help_needs_none_of_the_commands():
     code += "print([name for name in sys.modules if name.startswith('reem_async.tools.cli')])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
     loaded = run.stdout.splitlines()[-1]
-    light = ["", ".commands", ".lazy", ".version"]
+    light = ["", ".commands"]
     assert loaded == str([f"reem_async.tools.cli{name}" for name in light])
 
 
 @pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
 def test_each_command_can_be_parsed(entry):
     """Its options and arguments make sense to the library that parses them."""
-    command = lazy.command_of(entry)
+    command = commands.command_of(entry)
     assert command.name == entry.name
     assert command.help
 
 
 def test_paragraphs_are_joined_and_indented_lines_are_kept():
-    said = lazy.help_text(
+    said = commands.help_text(
         "One\n    two.\n\n    Three\n    four.\n\n    Examples:\n        reem ls\n        reem tree\n    "
     )
     assert said == "One two.\n\nThree four.\n\n[bold]Examples:[/bold]\n    reem ls\n    reem tree"

@@ -26,10 +26,10 @@ from reem_async.tools.recording import open_log
 
 APP = """
 import typer
-from reem_async.tools.cli import log, play, record
+from reem_async.tools.cli import log, record
 app = typer.Typer(pretty_exceptions_enable=False)
 app.command()(record.record)
-app.command()(play.play)
+app.command()(log.play)
 app.add_typer(log.app, name="log")
 app()
 """

@@ -32,7 +32,7 @@ from reem_async.tools.snapshots.plans import KeyContent
 
 MAIN = """
 from reem_async.tools.cli.commands import Entry
-from reem_async.tools.cli.lazy import command_of
+from reem_async.tools.cli.commands import command_of
 command_of(Entry("snapshot", "snapshot", "app", "", ""))(prog_name="reem snapshot")
 """
 REEM = [sys.executable, "-W", "error", "-c", MAIN]  # not -X dev: asyncio would tell of each slow step

@@ -16,7 +16,7 @@ from examples.custom_ship import Scan, ScanShip
 from reem import NumpyShip
 from reem_async.errors import BadValue
 from reem_async.tools.cli import build
-from reem_async.tools.cli.wording import _WORDS, in_words
+from reem_async.tools.cli.running import _WORDS, in_words
 
 APART = ("tools/cli", "tools/browser", "tools/notebook.py")  # themselves, addresses of the page, HTML
 CORE = [

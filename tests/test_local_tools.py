@@ -21,7 +21,7 @@ import reem_async
 from reem_async.local.host import reason_against
 from reem_async.pubsub.monitor import Event, Monitor
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli import sharing
+from reem_async.tools.cli import doctor
 from reem_async.tools.cli.checks import OK, UNKNOWN, WARN
 from reem_async.tools.cli.following import follow
 from reem_async.tools.cli.top import ALL, Window
@@ -55,25 +55,25 @@ def test_doctor_has_another_process_look_into_memory(server_url):
     row = local_finding(server_url)
     assert row["status"] == OK
     assert f"between programs of user {os.geteuid()}" in row["message"]
-    assert ("in this container" in row["message"]) == sharing.is_contained()
+    assert ("in this container" in row["message"]) == doctor.is_contained()
 
 
 @only_where_there_is
 async def test_doctor_notices_that_others_cannot_look(monkeypatch):
     """Whatever the reason: here it is given a process that looks at another file."""
-    monkeypatch.setattr(sharing, "_LOOK", sharing._LOOK.replace("sys.argv[1:]", "[*sys.argv[1:3], 1, 0, 1]"))
-    assert "cannot open the memory" in await sharing.unseen_by_another()
-    monkeypatch.setattr(sharing, "_LOOK", "raise SystemExit(7)")
-    assert "ended with 7" in await sharing.unseen_by_another()
+    monkeypatch.setattr(doctor, "_LOOK", doctor._LOOK.replace("sys.argv[1:]", "[*sys.argv[1:3], 1, 0, 1]"))
+    assert "cannot open the memory" in await doctor.unseen_by_another()
+    monkeypatch.setattr(doctor, "_LOOK", "raise SystemExit(7)")
+    assert "ended with 7" in await doctor.unseen_by_another()
 
 
 def test_doctor_says_why_there_is_none(monkeypatch):
     monkeypatch.setattr(sys, "platform", "linux")
-    found = sharing.found("no shared memory is to be had here: [Errno 1] Operation not permitted")
+    found = doctor.shared_memory("no shared memory is to be had here: [Errno 1] Operation not permitted")
     assert found.status == WARN
     assert "not permitted; large values go through the server" in found.message
     monkeypatch.setattr(sys, "platform", "darwin")
-    assert sharing.found("only Linux has what it takes").status == OK
+    assert doctor.shared_memory("only Linux has what it takes").status == OK
 
 
 @pytest.mark.long

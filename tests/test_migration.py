@@ -22,7 +22,7 @@ from reem_async import migration
 from reem_async.errors import BadData, BadType, NotAllowed, ServerMissing
 from reem_async.legacy.values import array_of
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli.naming import ship_named
+from reem_async.tools.cli.options import ship_named
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reem_async.tools.cli.bar import progress_bar
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
-from reem_async.tools.cli.output import clean, columns, emit, emit_json, note
-from reem_async.tools.cli.running import FAILED, prepared, run
-from reem_async.tools.cli.wording import in_words
+from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar
+from reem_async.tools.cli.running import FAILED, in_words, prepared, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface

@@ -60,16 +60,15 @@ def build() -> typer.Typer:
     import rich  # noqa: F401 - needed only later, by the command; said at once if it is missing
     import typer
 
-    from reem_async.tools.cli import lazy, version
-    from reem_async.tools.cli.commands import COMMANDS
+    from reem_async.tools.cli.commands import COMMANDS, group_of, root
 
     # Pretty tracebacks are off: they show the values of variables, and one is a password.
     app = typer.Typer(
-        cls=lazy.group_of(COMMANDS),
+        cls=group_of(COMMANDS),
         no_args_is_help=True,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    app.callback()(version.root)
+    app.callback()(root)
     return app

@@ -11,11 +11,6 @@ from typing import NamedTuple
 
 from reem_async.tools.cli.output import size_text
 
-__all__ = [
-    "FAIL", "OK", "UNKNOWN", "WARN", "Facts", "Finding", "clock", "eviction", "is_loopback", "json_support", "latency",
-    "memory", "not_allowed", "old_data", "persistence", "subscribers", "version", "who",
-]  # fmt: skip
-
 
 class Status(StrEnum):
     """How one check went, worst last but for what could not be looked at."""

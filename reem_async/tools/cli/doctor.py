@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import re
 import secrets
 import sys
@@ -10,26 +11,29 @@ import textwrap
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from importlib import metadata
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
 
 import typer
 
 from reem_async._installation import CURE, original_reem
+from reem_async.errors import BadKey, RedisError, ReemError
+from reem_async.plan.attachments import orphans, remove_orphans
+from reem_async.plan.paths import check_top_key, parse_suffix
+from reem_async.plan.sizes import STAGED
+from reem_async.session import Session
 from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
 from reem_async.tools.cli.output import clean, emit, emit_json, is_terminal, styled, width
-from reem_async.tools.cli.running import FAILED, guarded, interface_to
-from reem_async.tools.cli.sharing import local
-from reem_async.tools.cli.wording import for_users
+from reem_async.tools.cli.running import FAILED, for_users, guarded, interface_to
+from reem_async.transport import scanned
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.plan.keys import Keys
     from reem_async.session import Session
     from reem_async.transport import Transport
-
-__all__ = ["doctor"]
+    from reem_async.transport.aio import AsyncTransport
 
 # Enough for a 99th percentile that is not the slowest one alone.
 _ROUND_TRIPS = 200
@@ -130,7 +134,7 @@ async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> As
         yield "", await _old_data(interface)
         yield "", await _orphans(interface, clean=clean)
         yield "", await _publishers(interface)
-        yield "", await local(interface)
+        yield "", await _sharing(interface)
     except RedisError as error:
         yield "", Finding("server", FAIL, for_users(error))
     finally:
@@ -234,7 +238,6 @@ async def _old_data(interface: RedisInterface) -> Finding:
 async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
     """Count the arrays that no document refers to, on all servers, and `clean` removes them."""
     from reem_async.errors import RedisError
-    from reem_async.tools.cli.orphans import find_orphans
 
     try:
         found = await find_orphans(interface.session, remove=clean)
@@ -360,3 +363,169 @@ def _needed(extra: str) -> list[str]:
     marked = re.compile(rf"""extra\s*==\s*["']{extra}["']""")
     names = [re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in lines if marked.search(line)]
     return sorted(name for name in names if name != "reem-async")
+
+
+_FIRST_NAMESPACE = 0xEFFFFFFC
+"""The inode of a machine's own process numbers (PROC_PID_INIT_INO of <linux/proc_ns.h>): a container has another."""
+
+_LOOK = """
+import sys
+from reem_async.local.reader import LocalReader
+from reem_async.plan.notices import Slot
+view = LocalReader().view(Slot("", *map(int, sys.argv[1:])), 1)
+sys.exit(0 if view is not None and bytes(view) == b"R" else 3)
+"""
+"""What another process runs to look into the memory of this one."""
+_UNSEEN = 3
+_PATIENCE = 20.0
+"""Seconds for a Python that imports numpy on a slow machine."""
+
+
+async def _sharing(interface: RedisInterface) -> Finding:
+    """Find out how large values get from one program of this machine to another; starts one, for a moment."""
+    from reem_async.errors import RedisError
+    from reem_async.local.host import reason_against
+
+    reason = reason_against() or await unseen_by_another()
+    if reason:
+        return shared_memory(reason)
+    try:
+        usual, near = await _subscribed(interface)
+    except RedisError as error:
+        return Finding("local", UNKNOWN, f"the server cannot be asked: {for_users(error)}")
+    if isinstance(usual, Exception):
+        return Finding("local", UNKNOWN, "this user may not follow updates, through memory or otherwise")
+    refusal = for_users(near) if isinstance(near, Exception) else ""
+    return shared_memory("", refusal, contained=is_contained())
+
+
+def shared_memory(reason: str, refusal: str = "", *, contained: bool = False) -> Finding:
+    """Return what to say of it.
+
+    Args:
+        reason: Why memory cannot be shared here, empty if it can.
+        refusal: What the server says to who asks for the channel by which such programs find each other.
+        contained: This is a container whose processes have numbers of their own.
+    """
+    otherwise = "large values go through the server"
+    if reason:
+        # Elsewhere than on Linux there is nothing that anybody could mend.
+        status = WARN if sys.platform == "linux" else OK
+        remedy = "allow memfd_create, and /proc of the user's own processes" if status == WARN else ""
+        return Finding("local", status, f"no shared memory: {reason}; {otherwise}", remedy)
+    if refusal:
+        remedy = "allow the channels &{...}:notices@* beside &{...}:notices, as deploy/users.acl does"
+        return Finding("local", WARN, f"no shared memory: {refusal}; {otherwise}", remedy)
+    where = "in this container (start them with one PID namespace to join them)" if contained else "on this machine"
+    text = f"large values go through shared memory between programs of user {os.geteuid()} {where}"
+    return Finding("local", OK, f"{text}, to all others through the server")
+
+
+def is_contained() -> bool:
+    """Return whether processes have numbers here that they do not have outside, as in most containers."""
+    try:
+        return os.stat("/proc/self/ns/pid").st_ino != _FIRST_NAMESPACE
+    except OSError:
+        return False
+
+
+async def unseen_by_another() -> str:
+    """Return why another process of this user cannot look into the memory of this one; empty if it can."""
+    from reem_async.local.segment import Segment
+
+    segment = Segment(1)
+    number, stamp = segment.put([b"R"], [1]) or (0, 0)
+    place = os.getpid(), segment.descriptor, segment.inode, number, stamp
+    # -P: not what lies in the folder in which the user happens to be.
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-P", "-c", _LOOK, *map(str, place), stderr=asyncio.subprocess.DEVNULL
+    )
+    try:
+        async with asyncio.timeout(_PATIENCE):
+            code = await process.wait()
+    except TimeoutError:
+        process.kill()
+        code = await process.wait()
+    if code == _UNSEEN:
+        return "another process of this user cannot open the memory of this one (hidepid, or a security module?)"
+    return f"a process that was to try it ended with {code}" if code else ""
+
+
+async def _subscribed(interface: RedisInterface) -> tuple[Any, Any]:
+    """Return what the server replies to a subscription to a key's usual channel, and to that of this machine."""
+    session = interface.session
+    keys = session.keys(f"reem-doctor-{secrets.token_hex(4)}")
+    node = cast("AsyncTransport", await session.transport.owner(keys.channel.encode()))
+    subscribe = "SSUBSCRIBE" if session.transport.sharded else "SUBSCRIBE"
+    wire = await node.listen(lambda _: None, lambda *_: None)
+    try:
+        usual, near = await wire.roundtrip([(subscribe, keys.channel), (subscribe, session.local.channel(keys))])
+    finally:
+        await wire.close()
+    return usual, near
+
+
+# What carries the tag of a top-level key: {foo}:ships, {foo}.bar.image.
+_TAGGED = re.compile(r"\{([^{}]*)\}(.*)", re.DOTALL)
+_REGISTRY = ":ships"
+
+
+class Orphans(NamedTuple):
+    """What was found.
+
+    Attributes:
+        counts: How many ships' keys no document refers to, by top-level key.
+        unknown: The top-level keys of which this is not known, and why.
+    """
+
+    counts: dict[str, int]
+    unknown: dict[str, Exception]
+
+
+async def find_orphans(session: Session, *, remove: bool = False) -> Orphans:
+    """Find the ships' keys in a session's namespace that no document refers to; `remove` them.
+
+    One round trip for about 1000 keys of the server, and one for each top-level key with arrays; two more for each key
+    of which some are removed.
+
+    Raises:
+        ClusterNode: The server is one node of several.
+    """
+    counts, unknown = dict[str, int](), dict[str, Exception]()
+    for name, suffixes in sorted((await _tagged(session)).items()):
+        keys = session.keys(name)
+        try:
+            found = await session.run(orphans(keys, suffixes))
+            if found and remove:
+                found = await session.run(remove_orphans(keys, suffixes, session.cache))
+        # Of a damaged document, or without the right to read it, nobody knows what belongs to it.
+        except (ReemError, RedisError) as error:
+            unknown[name] = error
+        else:
+            counts |= {name: len(found)} if found else {}
+    return Orphans(counts, unknown)
+
+
+async def _tagged(session: Session) -> dict[str, list[bytes]]:
+    """Return the suffixes of the Redis keys that may be ships' keys, by top-level key."""
+    found: dict[str, set[bytes]] = {}
+    async for page in scanned(session.transport):
+        for name, suffix in filter(None, [_parted(bytes(key), session.namespace) for key in page]):
+            of_key = found.setdefault(name, set())
+            if suffix != _REGISTRY:  # it names ships' keys, but holds none
+                of_key.add(suffix.encode())
+    return {name: sorted(suffixes) for name, suffixes in found.items()}
+
+
+def _parted(key: bytes, namespace: str) -> tuple[str, str] | None:
+    """Return top-level key and suffix of what may be a ship's key or a registry; None for any other."""
+    try:
+        tagged = _TAGGED.fullmatch(key.decode())
+        if tagged is None or not tagged[1].startswith(namespace) or tagged[2].startswith(STAGED):
+            return None
+        name, suffix = check_top_key(tagged[1].removeprefix(namespace)), tagged[2]
+        if suffix != _REGISTRY:
+            parse_suffix(suffix)
+    except (BadKey, UnicodeDecodeError):
+        return None
+    return name, suffix

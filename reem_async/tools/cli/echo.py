@@ -25,15 +25,12 @@ from reem_async.tools.cli.output import (
     typed,
     width,
 )
-from reem_async.tools.cli.running import run
-from reem_async.tools.cli.wording import for_users
+from reem_async.tools.cli.running import for_users, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.plan.paths import Path, Pattern
     from reem_async.pubsub.monitor import Event
-
-__all__ = ["echo"]
 
 
 def echo(
@@ -107,7 +104,7 @@ async def _kind(interface: RedisInterface, path: Path) -> str:
     """Return what is at a path now, arrays as type and shape: one round trip, in which none is fetched."""
     from reem_async.errors import RedisError, ReemError
     from reem_async.store.catalog import outline
-    from reem_async.tools.cli.outlines import as_data, describe
+    from reem_async.tools.cli.listing import as_data, describe
 
     try:
         node = await outline(interface, path)

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from reem_async.pubsub.monitor import Event, Monitor
     from reem_async.pubsub.pattern_watch import PatternWatch
 
-__all__ = ["Ending", "follow"]
-
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
 

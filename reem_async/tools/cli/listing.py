@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated
+import asyncio
+from collections.abc import AsyncIterator, Iterator
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.tools.cli.completion import complete_path
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
 from reem_async.tools.cli.output import (
+    clean,
     columns,
     cut,
     emit,
     emit_json,
     is_terminal,
+    json_text,
     note,
     size_text,
     styled,
     typed,
     width,
 )
-from reem_async.tools.cli.running import NOTHING, run
+from reem_async.tools.cli.running import NOTHING, for_users, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.store.catalog import Outline
-
-__all__ = ["ls", "tree"]
 
 # Entries that are drawn of one dict or list: lists of thousands of numbers would fill the screen.
 _MOST_CHILDREN = 50
@@ -58,15 +58,13 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
     """
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.tools.cli.outlines import as_json as for_programs
-        from reem_async.tools.cli.outlines import describe, found
 
         # All rows before the first is printed: the widths of the columns depend on them. JSON lines go out as they
         # come.
         rows = []
         async for node in found(interface, pattern):
             if as_json:
-                emit_json(for_programs(node, 0))
+                emit_json(outline_json(node, 0))
             rows.append((typed(node.path), node.kind, describe(node, 48), size_text(node.size)))
         if not as_json:
             columns(rows, ("bold", "cyan", "", "green"), right=frozenset({3}), shrink=(2, 0))
@@ -98,14 +96,12 @@ def tree(
     """
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.tools.cli.outlines import as_json as for_programs
-        from reem_async.tools.cli.outlines import found
 
         count = 0
         async for node in found(interface, pattern):
             count += 1
             if as_json:
-                emit_json(for_programs(node, depth))
+                emit_json(outline_json(node, depth))
                 continue
             for line in _drawn(node, typed(node.path), "", "", depth, None if whole else _MOST_CHILDREN):
                 emit(line)
@@ -133,8 +129,6 @@ def _drawn(node: Outline, name: str, lead: str, below: str, depth: int | None, m
         depth: How many levels below it are drawn, None for all.
         most: How many children of one node are drawn, None for all.
     """
-    from reem_async.tools.cli.outlines import describe
-
     # A list of plain values is one line, as people write it.
     inline = node.kind == "list" and all(child.plain for child in node.children)
     size = "" if node.plain or not node.size else size_text(node.size)
@@ -160,3 +154,108 @@ def _key(node: Outline) -> str:
     """Return the last element of a path as a user would type it."""
     key = node.path[-1]
     return f"[{key}]" if isinstance(key, int) else typed((key,))
+
+
+_AT_ONCE = 64  # round trips that are under way together
+
+
+async def found(interface: RedisInterface, pattern: str) -> AsyncIterator[Outline]:
+    """Yield the outlines of all that a pattern names, by name. One round trip for each top-level key.
+
+    Raises:
+        MissingKey: The pattern is a path, and nothing is there.
+    """
+    from reem_async.plan.paths import check_top_key, parse, parse_pattern
+    from reem_async.store.catalog import names, outline
+
+    # A plain path is asked for directly, and that nothing is there is an error; a pattern that finds nothing is none.
+    if not any(mark in pattern for mark in "*?"):
+        name, *_ = parse(pattern) or ("",)
+        check_top_key(name)
+        yield await outline(interface, parse(pattern))
+        return
+    wanted = parse_pattern(pattern)
+    tops = sorted([name async for name in names(interface, wanted.top)])
+    # In portions: a server with many keys is neither asked one by one nor for all at once.
+    for start in range(0, len(tops), _AT_ONCE):
+        for top in await asyncio.gather(*[_outline(interface, name) for name in tops[start : start + _AT_ONCE]]):
+            if top is not None:
+                for node in _matching(top, wanted, 1 + len(wanted.rest)):
+                    yield node
+
+
+async def _outline(interface: RedisInterface, name: str) -> Outline | None:
+    """Return what is under a top-level key; None if it is gone, kind "?" if REEM did not write it."""
+    from reem_async.errors import BadData, MissingKey, WrongKind
+    from reem_async.store.catalog import Outline, outline
+
+    try:
+        return await outline(interface, (name,))
+    except (MissingKey, WrongKind):
+        return None
+    except BadData as error:
+        return Outline((name,), "?", for_users(error))
+
+
+def _matching(node: Outline, wanted: Any, depth: int) -> Iterator[Outline]:
+    if not wanted.concerns(node.path):
+        return
+    if len(node.path) == depth:
+        yield node
+        return
+    for child in node.children:
+        yield from _matching(child, wanted, depth)
+
+
+def describe(node: Outline, limit: int) -> str:
+    """Return what is at a path in at most `limit` characters: the value, or what kind of thing it is."""
+    if node.plain:
+        return cut(json_text(node.value), limit)
+    if node.kind == "dict":
+        return _counted(node, "key") if node.children else "{}"
+    if node.kind != "list":
+        return cut(clean(node.summary or node.kind), limit)
+    if not node.children:
+        return "[]"
+    # The first hundred, cut to the line: a list may have a million items.
+    if all(child.plain for child in node.children):
+        values = ", ".join([json_text(child.value) for child in node.children[:100]])
+        return cut(f"[{values}]", max(limit - 16, 16)) + f"  {_counted(node, 'item')}"
+    return _counted(node, "item")
+
+
+def _counted(node: Outline, what: str) -> str:
+    count = len(node.children)
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def as_data(node: Outline) -> Any:
+    """Return the value with a text in place of each array and of bytes."""
+    if node.plain:
+        return node.value
+    if node.kind == "dict":
+        return {child.path[-1]: as_data(child) for child in node.children}
+    if node.kind == "list":
+        return [as_data(child) for child in node.children]
+    return f"<{node.summary or node.kind}, {size_text(node.size)}>"
+
+
+def outline_json(node: Outline, depth: int | None) -> dict[str, Any]:
+    """Return an outline for programs, children down to `depth` levels below."""
+    entry: dict[str, Any] = {"path": typed(node.path), "type": node.kind, "size": node.size}
+    if node.plain:
+        entry["value"] = node.value
+    elif node.kind in ("dict", "list"):
+        entry["length"] = len(node.children)
+        if depth is None or depth > 0:
+            entry["children"] = [outline_json(child, None if depth is None else depth - 1) for child in node.children]
+    else:
+        entry["summary"] = node.summary
+    return entry
+
+
+def below_arrays(node: Outline) -> int:
+    """Return the bytes of all that is not JSON at a path and below: arrays, bytes, custom types."""
+    if node.kind in ("dict", "list"):
+        return sum([below_arrays(child) for child in node.children])
+    return 0 if node.plain else node.size

@@ -1,19 +1,101 @@
-"""The options and arguments that commands share."""
+"""Options and arguments that commands share, and the shell completion of paths."""
 
 from __future__ import annotations
 
+import asyncio
+import os
+import sys
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from reem_async.tools.cli.completion import complete_path
 from reem_async.tools.cli.running import NOTHING, complain
 
-__all__ = [
-    "DEFAULT_URL", "AsJson", "Count", "Force", "Namespace", "PathArgument", "Patterns", "Publish", "Ships", "Text",
-    "Timeout", "Url", "Value", "WindowLength", "existing", "named_ships",
-]  # fmt: skip
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.ships.base import SpecialDatatypeShip
+
+_SECONDS = 1.0  # nobody waits longer for a completion
+# Names that are offered: a shell asks before it shows more than about a hundred.
+_MOST = 200
+_NEEDED = ("reem_async.store.catalog", "reem_async.store.store", "reem_async.tools.cli.running", "redis")
+
+
+def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return the paths that begin with what was typed, up to the next dot; nothing if the server cannot be asked."""
+    url = ctx.params.get("url") or os.environ.get("REEM_URL") or "localhost"
+    with suppress(Exception):  # a shell that completes is no place for messages
+        for module in _NEEDED:  # importing is not part of the time that a server has to answer
+            import_module(module)
+        return asyncio.run(asyncio.wait_for(_names(url, ctx.params.get("namespace") or "", incomplete), _SECONDS))
+    return []
+
+
+async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
+    from reem_async.tools.cli.running import interface_to
+
+    async with interface_to(url, namespace, _SECONDS) as interface:
+        outer = _begun(incomplete)
+        found = await (_below(interface, outer, incomplete) if outer else _top(interface, incomplete))
+        if len(found) != 1 or not await _goes_on(interface, found[0]):
+            return sorted(found)
+        # A shell puts a blank behind the only choice. With two it waits for more to be typed, such as the next dot.
+        return [found[0], f"{found[0]}."]
+
+
+async def _top(interface: RedisInterface, incomplete: str) -> list[str]:
+    """Return the top-level keys that go on as typed."""
+    from reem_async.store.catalog import names
+    from reem_async.tools.cli.output import typed
+
+    found: list[str] = []
+    async for name in names(interface, "*"):
+        shown = typed((name,))
+        if shown.startswith(incomplete):
+            found.append(shown)
+        # The rest of the keys is not asked for either: this may be a server with a million.
+        if len(found) >= _MOST:
+            break
+    return found
+
+
+async def _goes_on(interface: RedisInterface, path: str) -> bool:
+    """Return whether there are keys below a path."""
+    from reem_async.errors import ReemError
+    from reem_async.store.store import KeyValueStore
+
+    with suppress(ReemError):  # a list, an array, a number
+        return bool(await KeyValueStore(interface).at(path).keys())
+    return False
+
+
+def _begun(incomplete: str) -> tuple[str | int, ...]:
+    """Return the whole elements of a path before the one that is being typed; none at the top."""
+    from reem_async.plan.paths import parse
+
+    # The longest whole path in front of the last separator. Within a quoted key a separator is none, and what stands
+    # before it does not parse.
+    for end in range(len(incomplete), 0, -1):
+        if incomplete[end - 1] in ".[" and end > 1:
+            with suppress(ValueError):  # within a quoted key
+                return parse(incomplete[: end - 1])
+    return ()
+
+
+async def _below(interface: RedisInterface, outer: tuple[str | int, ...], incomplete: str) -> list[str]:
+    """Return the keys of the dict at `outer` that go on as typed; nothing of it is fetched."""
+    from reem_async.store.store import KeyValueStore
+    from reem_async.tools.cli.output import typed
+
+    place = KeyValueStore(interface)[str(outer[0])]
+    for element in outer[1:]:
+        place = place[element]
+    shown = [typed((*outer, key)) for key in await place.keys()]
+    return [each for each in shown if each.startswith(incomplete)][:_MOST]
+
 
 # localhost and not 127.0.0.1: it stands for the server's Unix socket, which is quicker.
 DEFAULT_URL = "redis://localhost:6379"
@@ -104,7 +186,36 @@ WindowLength = Annotated[
 def named_ships(names: list[str] | None) -> list[Any]:
     """Return the ships of an interface: those named by `--ship`, then the default ones."""
     from reem_async.ships.registry import default_ships
-    from reem_async.tools.cli.naming import ship_named
 
     # The user's own ships first, as in a program: they may take what the default ones would.
     return [*map(ship_named, names or ()), *default_ships()]
+
+
+def ship_named(text: str) -> SpecialDatatypeShip:
+    """Return the ship `MODULE:NAME`, a class that is made without arguments or a ship; imports the module.
+
+    Modules in the current directory are found, as they are by `python -m`.
+
+    Raises:
+        BadValue: There is none.
+        BadType: It is no ship.
+    """
+    from reem_async.errors import BadType, BadValue
+    from reem_async.plan.paths import shorten
+    from reem_async.ships.base import SpecialDatatypeShip
+
+    module, colon, name = text.partition(":")
+    if not (module and colon and name):
+        raise BadValue(f"{shorten(text)} does not name a ship; write it like my_ships:PoseShip")
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    try:
+        thing = import_module(module)
+        for part in name.split("."):
+            thing = getattr(thing, part)
+        ship = thing() if isinstance(thing, type) else thing
+    except Exception as error:  # whatever the user's module does when it is imported
+        raise BadValue(f"the ship {text} cannot be made: {type(error).__name__}: {error}") from error
+    if not isinstance(ship, SpecialDatatypeShip):
+        raise BadType(f"{text} is {shorten(ship)}, which is no SpecialDatatypeShip")
+    return ship

@@ -1,4 +1,4 @@
-"""What commands print: lines, columns, JSON; colours only on a terminal."""
+"""What commands print: lines, columns, JSON, a progress bar; colours only on a terminal."""
 
 from __future__ import annotations
 
@@ -7,17 +7,14 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import typer
 
 from reem_async.tools import jsontext
-
-__all__ = [
-    "clean", "columns", "cut", "emit", "emit_json", "is_terminal", "json_text", "note", "size_text", "styled", "typed",
-    "width", "write_over",
-]  # fmt: skip
 
 # What moves the cursor, changes colours or breaks lines: keys and values come from anywhere.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -146,3 +143,32 @@ def columns(
             text = styled(cell, style) if style else cell
             cells.append(blanks + text if place in right else text + blanks)
         emit("  ".join(cells).rstrip())
+
+
+@contextmanager
+def progress_bar(after: float = 1.0) -> Iterator[Callable[[str], Callable[[int, int], None]]]:
+    """Give what makes, of a word for what is being done, a function to tell how much is done and how much there is.
+
+    The bar begins `after` so many seconds, on a terminal only, and is gone at the end.
+    """
+    begun = time.monotonic()
+    with ExitStack() as stack:
+        # None until it takes so long that a bar is worth showing; then one.
+        bars: list[tuple[Any, Any]] = []
+
+        def tell(doing: str, done: int, total: int) -> None:
+            if not bars and time.monotonic() - begun >= after and sys.stderr.isatty():
+                bars.append(_begin(stack))
+            for bar, task in bars:
+                bar.update(task, description=doing, completed=done, total=max(total, 1))
+
+        yield lambda doing: lambda done, total: tell(doing, done, total)
+
+
+def _begin(stack: ExitStack) -> tuple[Any, Any]:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    parts = (TextColumn("{task.description:8}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    bar = stack.enter_context(Progress(*parts, console=Console(stderr=True), transient=True))
+    return bar, bar.add_task("")

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.tools.recording import Recorder, RecorderStatus
 
-__all__ = ["record"]
-
 # Seconds between two lines that say how it is getting on.
 _SHOWN_EVERY = 0.5
 

@@ -29,22 +29,6 @@ if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.pubsub.monitor import Event
 
-__all__ = [
-    "ALL",
-    "BANDWIDTH",
-    "DELAY",
-    "RATE",
-    "Board",
-    "View",
-    "Window",
-    "bw",
-    "delay",
-    "hz",
-    "spread",
-    "table",
-    "top",
-]
-
 _WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
 _DRAW_SECONDS = 0.25  # people can read numbers that change four times a second
 _MOST_PATHS = 10_000  # that are kept: a program may publish under ever new names

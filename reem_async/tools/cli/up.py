@@ -1,24 +1,103 @@
-"""`reem up`: a private server in the foreground."""
+"""`reem up`: a private server or cluster in the foreground."""
 
 from __future__ import annotations
 
 import asyncio
 import os
+import select
+import signal
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from types import FrameType
+from typing import Annotated, NoReturn
 
 import typer
 from rich.console import Console
 from rich.text import Text
 
-from reem_async.errors import LoginRefused, RedisError, ReemError
+from reem_async.errors import LoginRefused, RedisError, ReemError, ServerFailed, ServerMissing
+from reem_async.server.cluster import EmbeddedCluster
 from reem_async.server.embedded import EmbeddedServer
-from reem_async.tools.cli.foreground import LOOK_SECONDS, Stop, fail, print_rows
 from reem_async.tools.cli.options import existing
-from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, interface_to
-from reem_async.tools.cli.wording import for_users
+from reem_async.tools.cli.output import clean
+from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_users, interface_to
+
+LOOK_SECONDS = 0.5
+"""Seconds between looks whether the server is still there."""
+
+
+class Stop:
+    """Set by Ctrl-C, by SIGTERM, and when the terminal closes.
+
+    A pipe, not a `threading.Event`: a handler that runs while the main thread is inside of `Event.wait` would
+    wait for a lock that this very thread holds.
+    """
+
+    def __init__(self) -> None:
+        self._reader, self._writer = os.pipe()
+        # A handler must not block, not even when nobody reads the pipe any more.
+        os.set_blocking(self._writer, False)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, self._handle)
+
+    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+        with suppress(BlockingIOError):  # full: told often enough
+            os.write(self._writer, b"x")
+
+    def wait(self, seconds: float) -> bool:
+        """Return whether it was set, after so long at most."""
+        return bool(select.select([self._reader], [], [], seconds)[0])
+
+
+def print_rows(console: Console, rows: list[tuple[str, str]]) -> None:
+    """Print what there is to know, one fact a line."""
+    for label, value in rows:
+        # soft_wrap: a line to be copied stays one line, however narrow the terminal
+        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), clean(value)), soft_wrap=True)
+
+
+def fail(message: str) -> NoReturn:
+    """Say why on standard error and exit with code 1."""
+    lines = "\n".join(map(clean, message.split("\n")))
+    Console(stderr=True).print(Text.assemble(("reem up: ", "bold red"), lines), soft_wrap=True)
+    raise typer.Exit(1)
+
+
+def up_cluster(stop: Stop, *, plain: bool) -> None:
+    """Keep a cluster up until told to stop; a node that ends is told of, and the others go on."""
+    console = Console()
+    try:
+        with EmbeddedCluster(json=not plain) as cluster:
+            console.print(Text("REEM's cluster is up.", style="bold green"))
+            print_rows(console, _rows(cluster))
+            left = list(cluster.nodes)
+            while not stop.wait(LOOK_SECONDS):
+                for node in [node for node in left if node.ended()]:
+                    left.remove(node)
+                    console.print(f"The node on port {node.port} has ended; the others go on.")
+    except (ServerFailed, ServerMissing) as error:
+        fail(for_users(error))
+    with suppress(OSError):  # the terminal may have closed
+        console.print("Stopped. The data is gone.")
+
+
+def _rows(cluster: EmbeddedCluster) -> list[tuple[str, str]]:
+    """What there is to know of it."""
+    connect = f'KeyValueStore(RedisInterface("{cluster.url}"))'
+    half = len(cluster.nodes) // 2
+    nodes = [f"port {node.port}, process {node.pid}" for node in cluster.nodes]
+    return [
+        ("address", cluster.url),
+        *zip(["primaries", *[""] * (half - 1)], nodes[:half], strict=True),
+        *zip(["replicas", *[""] * (half - 1)], nodes[half:], strict=True),
+        ("documents", "by their JSON module" if cluster.json else "as text: the nodes have no JSON module"),
+        ("data", "in memory, gone when the cluster stops"),
+        ("blocking", f"from reem import KeyValueStore, RedisInterface; kvs = {connect}"),
+        ("asyncio", f"from reem_async import KeyValueStore, RedisInterface; kvs = {connect}"),
+        ("to stop", "Ctrl-C"),
+    ]
+
 
 DEFAULT_PORT = 6379
 
@@ -79,7 +158,6 @@ def up(
     if cluster:
         if any(given is not None for given in (port, directory, password_from_env, snapshot)):
             fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
-        from reem_async.tools.cli.up_cluster import up_cluster
 
         up_cluster(Stop(), plain=plain)
         return

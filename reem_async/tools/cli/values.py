@@ -1,19 +1,331 @@
-"""VALUE on the command line -> what is stored; what was read -> files and previews."""
+"""`reem get`, `set`, `del` and `pub`: one value, printed, stored, or in a file."""
 
 from __future__ import annotations
 
+import asyncio
 import json
+import signal
 import sys
+import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any, NoReturn
+from typing import IO, TYPE_CHECKING, Annotated, Any, NoReturn
 
-from reem_async.tools.cli.output import clean, json_text, size_text, typed
-from reem_async.tools.cli.running import USAGE, Refused
-from reem_async.tools.partfile import PartFile
+import typer
 
-__all__ = ["FILES", "parse_value", "preview", "save"]
+from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
+from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width, write_over
+from reem_async.tools.cli.running import NOTHING, USAGE, Refused, prepared, run
+from reem_async.tools.partfile import PartFile, there_already
+
+if TYPE_CHECKING:
+    from reem_async.connection import RedisInterface
+    from reem_async.errors import MissingKey
+    from reem_async.plan.paths import Path as KeyPath
+    from reem_async.store.accessor import Accessor
+    from reem_async.store.catalog import Outline
+
+_MOST_AS_TEXT = 200_000
+"""Bytes of arrays that are printed as JSON: one of uint8 is up to four of text."""
+
+_MOST_FOR_PREVIEW = 256_000_000
+"""Bytes of an array that is fetched only to show its corners."""
+
+
+def get(
+    path: PathArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="Write it to a file: .npy an array, .npz all arrays below, .json all, .png an image, .bin bytes.",
+        ),
+    ] = None,
+    force: Force = False,
+    raw: Annotated[bool, typer.Option("--raw", "-r", help="Print text as it is, without quotes.")] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print JSON in one line: arrays as lists, bytes in base64, NaN by name, times in ISO 8601.",
+        ),
+    ] = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Print a value, or write it to a file.
+
+    Plain values are printed as JSON. An array is shown as its type and range with its first and last
+    numbers; inside a dict, arrays are named and not fetched.
+
+    Exit code 3 if nothing is there. With --json, not more than 200 kB of arrays; use -o for more.
+
+    Examples:
+        reem get foo.bar.subkey
+        reem get robot.joints[0]     an element of a list or of an array
+        reem get robot.name --raw
+        reem get cam.image -o image.png
+        reem get pose --json | jq .x
+    """
+    if raw and (as_json or output):
+        raise typer.BadParameter("--raw goes neither with --json nor with -o")
+    if output is not None and output.suffix not in FILES:
+        raise typer.BadParameter(f"{output}: the name of a file ends in one of {', '.join(FILES)}")
+
+    async def work(interface: RedisInterface) -> None:
+        import numpy as np
+
+        from reem_async.errors import MissingKey
+        from reem_async.store.catalog import outline
+        from reem_async.store.store import KeyValueStore
+
+        if output is not None and output.exists() and not force:
+            raise there_already(output)
+        store = KeyValueStore(interface)
+        # First what it is, without arrays: then what is too large to be shown is not fetched.
+        try:
+            node = await outline(interface, store.at(path).full_path)
+        except MissingKey as missing:
+            item = await _item(interface, store.at(path).full_path, missing)
+            if output is not None:
+                note(save(item, output, path, replace=force))
+            else:
+                shown = isinstance(item, np.ndarray) and not as_json
+                emit(preview(item, width() if is_terminal() else 100) if shown else json_text(item))
+            return
+        if output is not None:
+            note(save(await store.get(path), output, path, replace=force))
+            return
+        if not as_json:
+            emit(await _shown(lambda: store.get(path), node, raw=raw))
+            return
+        _check_size(node)
+        emit(json_text(await store.get(path)))
+
+    run("get", work, url, namespace)
+
+
+async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -> Any:
+    """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
+    from reem_async.errors import MissingKey
+    from reem_async.plan.paths import show
+    from reem_async.store.catalog import outline
+    from reem_async.store.reader import DocumentReader
+
+    for end in range(len(path) - 1, 0, -1):
+        if not isinstance(path[end], int):
+            break
+        with suppress(MissingKey):
+            if (await outline(interface, path[:end])).kind != "numpy":
+                break
+            array = await DocumentReader(interface.session, path[0]).read(path[1:end])
+            try:
+                return array[path[end:]]
+            except IndexError as error:
+                raise Refused(f"{show(path)}: {error}", NOTHING) from None
+    raise missing
+
+
+async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
+    """Return a value for people; fetches it only if it is one array."""
+    from reem_async.tools.cli.listing import as_data
+
+    # For scripts: the text as it is, without quotes. A terminal is not sent what it would obey.
+    if raw and node.kind == "str":
+        text = str(node.value)
+        return "\n".join(map(clean, text.split("\n"))) if is_terminal() else text
+    if node.plain or node.kind in ("dict", "list"):
+        return json_text(as_data(node), pretty=True)
+    if node.size > _MOST_FOR_PREVIEW:
+        return f"{clean(node.summary)}, {size_text(node.size)}; too large to fetch only to show it: use -o FILE"
+    return preview(await fetch(), width() if is_terminal() else 100)
+
+
+def _check_size(node: Outline) -> None:
+    from reem_async.tools.cli.listing import below_arrays
+
+    size = below_arrays(node)
+    if size > _MOST_AS_TEXT:
+        raise Refused(
+            f"{typed(node.path)} has {size_text(size)} of arrays, too much to print as JSON; write it to a file: "
+            f"reem get '{typed(node.path)}' -o FILE.npz, or .json"
+        )
+
+
+def set_(
+    path: PathArgument,
+    value: Value,
+    is_text: Text = False,
+    publish: Publish = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Store a value.
+
+    The dict that holds it must be there: for foo.bar there must be a foo. Without --publish only
+    those see it who read; with it, subscribers are told.
+
+    Examples:
+        reem set speed 0.5
+        reem set robot '{"name": "left", "joints": [0, 0.5, 1]}'
+        reem set robot.name right --str
+        reem set robot.joints[0] -1.5 --publish
+        reem set map @map.npy
+        jq .config robot.json | reem set config -
+    """
+    parsed = prepared("set", lambda: parse_value(value, is_text=is_text))
+
+    async def work(interface: RedisInterface) -> None:
+        await _place(interface, path, publish).write(parsed)
+
+    run("set", work, url, namespace)
+
+
+def delete(
+    path: PathArgument,
+    publish: Publish = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", "-y", help="Do not ask; a terminal asks before all of a top-level key goes.")
+    ] = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Delete a value, with all that is below it.
+
+    Exit code 3 if nothing is there.
+
+    Examples:
+        reem del robot.name
+        reem del robot.joints[-1] --publish
+        reem del robot --yes
+    """
+
+    async def work(interface: RedisInterface) -> None:
+        place = _place(interface, path, publish)
+        # Only a whole top-level key, and only if somebody can answer: scripts have no terminal.
+        if len(place.full_path) == 1 and not yes and sys.stdin.isatty():
+            await _ask(interface, path)
+        await place.delete()
+
+    run("del", work, url, namespace)
+
+
+def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
+    from reem_async.store.publish import PublishSpace
+    from reem_async.store.store import KeyValueStore
+
+    return (PublishSpace if publish else KeyValueStore)(interface).at(path)
+
+
+async def _ask(interface: RedisInterface, path: str) -> None:
+    """Ask before a whole key goes; raises MissingKey, and Refused if the answer is no."""
+    from reem_async.store.catalog import outline
+    from reem_async.tools.cli.listing import describe
+
+    what = describe(await outline(interface, path), 60)
+    if not _agreed(f"Delete {clean(path)} ({what}) at {interface.hostname}?"):
+        raise Refused("nothing was deleted")
+
+
+def _agreed(question: str) -> bool:
+    """Ask; Ctrl-C ends the asking, which the event loop, standing still meanwhile, would not get to know of."""
+    pressed = []
+
+    def interrupted(*_: object) -> NoReturn:
+        pressed.append(True)
+        raise KeyboardInterrupt
+
+    # asyncio's handler would only set a flag for the event loop, which stands still while it is asked.
+    before = signal.signal(signal.SIGINT, interrupted)
+    try:
+        return typer.confirm(question, err=True)
+    except typer.Abort:
+        if pressed:
+            raise asyncio.CancelledError from None
+        return False  # the end of the input is no answer
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# Hz, with --count and no --rate.
+_RATE = 1.0
+# Seconds between two looks at how far it is.
+_SHOWN_EVERY = 0.5
+
+
+def pub(
+    path: PathArgument,
+    value: Value,
+    rate: Annotated[
+        float | None,
+        typer.Option("--rate", "-r", min=0.001, max=100_000, metavar="HZ", help="So often, until Ctrl-C or --count."),
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option("--count", "-n", min=1, metavar="N", help="So many times; at 1 Hz if there is no --rate."),
+    ] = None,
+    is_text: Text = False,
+    url: Url = DEFAULT_URL,
+    namespace: Namespace = "",
+) -> None:
+    """Publish a value, once or at a rate.
+
+    Stores it as `reem set` does, and tells subscribers. At a rate, an update that is late is not
+    made up for. The last line says how many there were, and the rate that was reached.
+
+    Examples:
+        reem pub set_point '{"speed": 0.5}'
+        reem pub set_point.speed 0.5 --rate 100
+        reem pub beep true --rate 2 --count 10
+        reem pub map @map.npy
+    """
+    parsed = prepared("pub", lambda: parse_value(value, is_text=is_text))
+    repeated = rate is not None or count is not None
+
+    async def work(interface: RedisInterface) -> None:
+        from reem_async.store.publish import PublishSpace
+
+        place = PublishSpace(interface).at(path)
+        if repeated:
+            until = "" if count else " until Ctrl-C"
+            await _repeat(place, parsed, rate or _RATE, count, f"publishing {path} at {rate or _RATE:g} Hz{until}")
+        else:
+            await place.write(parsed)
+
+    run("pub", work, url, namespace, live=repeated)
+
+
+async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, said: str) -> None:
+    """Publish `count` times, or until Ctrl-C; `said` is printed once the first one was taken."""
+    start, done, late = time.monotonic(), 0, 0
+    due, shown = start, start
+    try:
+        while done != count:
+            await place.write(value)
+            done += 1
+            if done == 1:
+                note(said)
+            if time.monotonic() > shown + _SHOWN_EVERY:
+                shown = time.monotonic()
+                write_over(f"{done} times in {shown - start:.1f} s, {(done - 1) / (shown - start):.1f} Hz")
+            if done == count:
+                break
+            # By the plan and not from now on, so that the rate is kept however long each call takes.
+            due += 1 / rate
+            now = time.monotonic()
+            if now > due + 1 / rate:  # more than one behind: go on from here
+                late, due = late + 1, now
+            await asyncio.sleep(max(due - now, 0))
+    except asyncio.CancelledError:  # Ctrl-C
+        pass
+    seconds = time.monotonic() - start
+    write_over("")
+    reached = f", {(done - 1) / seconds:.1f} Hz" if done > 1 and seconds > 0 else ""
+    note(f"published {done} times in {seconds:.1f} s{reached}" + (f", {late} times late" if late else ""))
 
 
 def parse_value(text: str, *, is_text: bool) -> Any:
