@@ -319,7 +319,7 @@ SELF_EXPLANATORY = (MissingKey, PathRefused, ConnectionLost, NotConnected)
 """Errors whose message says all: REEM's own frames and causes are left out of their tracebacks."""
 
 
-ALL_NODES = "connect with RedisInterface('redis+cluster://host:port,host:port')"
+ALL_NODES = "connect to redis+cluster://host:port,host:port"
 """What to do when connected to one node of several."""
 
 

@@ -365,7 +365,7 @@ def test_get_into_files(cli, kvs, tmp_path):
 def test_files_that_cannot_be_written_leave_nothing_behind(cli, kvs, tmp_path):
     (tmp_path / "old.npy").write_text("old")
     assert "give its path, or use .npz" in cli.error(1, "get", "foo", "-o", tmp_path / "old.npy", "--force")
-    assert "replace it with --force" in cli.error(2, "get", "foo", "-o", tmp_path / "old.npy")
+    assert "replace it with overwrite=True or --force" in cli.error(2, "get", "foo", "-o", tmp_path / "old.npy")
     assert "png takes uint8" in cli.error(1, "get", "cam_left", "-o", tmp_path / "x.png")
     assert "No such file or directory" in cli.error(1, "get", "foo", "-o", tmp_path / "no" / "x.json")
     assert ".npy, .npz, .json" in cli.error(2, "get", "foo", "-o", tmp_path / "x.doc")

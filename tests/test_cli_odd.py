@@ -121,7 +121,7 @@ def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(reem, kvs, tmp
         return write(*arguments)
 
     monkeypatch.setitem(FILES, ".npy", meanwhile)
-    assert "there already; choose another name, or replace it with --force" in reem.error(2, "get", "a", "-o", file)
+    assert "there already; choose another name, or replace it with" in reem.error(2, "get", "a", "-o", file)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"]
 
 

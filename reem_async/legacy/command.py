@@ -8,7 +8,7 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar
-from reem_async.tools.cli.running import FAILED, in_words, prepared, run
+from reem_async.tools.cli.running import FAILED, prepared, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -66,7 +66,7 @@ def _show(done: Migration, as_json: bool) -> None:
         if key.lost:
             note(f"{', '.join(key.lost)}: kept, but not in the document; REEM 0.1 may have forgotten it by mistake")
     for key in done.problems:
-        note(f"{key.name} is left as it is: {in_words(key.problem)}")
+        note(f"{key.name} is left as it is: {key.problem}")
     keys = f"{len(good)} key{'' if len(good) == 1 else 's'}"
     if not done.keys:
         emit("Nothing to do: no key was written by REEM 0.1 or older.")

@@ -383,7 +383,7 @@ def _array_remedy(value: Any) -> str:
 def _check_int(value: int, place: Path) -> int:
     if not _LOWEST <= value <= _HIGHEST:
         raise BadValue(
-            f"{show(place)}: the int {shorten(value)} is outside [-2**63, 2**64-1]; use str(value) or a float"
+            f"{show(place)}: the int {shorten(value)} is outside [-2**63, 2**64-1]; store it as text or as a float"
         )
     return value
 

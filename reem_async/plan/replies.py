@@ -33,7 +33,7 @@ from .keys import Keys
 from .paths import Path, show, to_jsonpath
 
 _REFUSALS: dict[str, tuple[type[Refused], str]] = {
-    "NOAUTH": (LoginRefused, "the server needs a password: RedisInterface(..., username=..., password=...)"),
+    "NOAUTH": (LoginRefused, "the server needs a password: username=, password=, or redis://user:password@host:port"),
     "WRONGPASS": (LoginRefused, "the server refused this user name and password; the login was not retried"),
     "NOPERM": (
         NotAllowed,
@@ -210,7 +210,7 @@ def diagnose(keys: Keys, path: Path, refusal: PathRefused | None) -> Plan:
 
 
 def out_of_range(keys: Keys, path: Path) -> PathRefused:
-    return PathRefused(f"{show(full(keys, path))}: the list index is out of range; use append() to make a list longer")
+    return PathRefused(f"{show(full(keys, path))}: the list index is out of range; a list only grows by appending")
 
 
 def type_name(reply: Reply) -> str | None:

@@ -156,7 +156,7 @@ class Ships:
         known = ", ".join(self._by_label) or "none"
         return BadData(
             f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "
-            "pass it in RedisInterface(ships=[...])"
+            "read it in a program that has this ship: RedisInterface(ships=[...])"
         )
 
 

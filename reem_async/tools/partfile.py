@@ -75,7 +75,9 @@ def is_locked(path: Path) -> bool:
 
 def there_already(path: Path) -> FileExistsError:
     """Return the error that says so, and what to do."""
-    return FileExistsError(f"{path} is there already; choose another name, or replace it with overwrite=True")
+    return FileExistsError(
+        f"{path} is there already; choose another name, or replace it with overwrite=True or --force"
+    )
 
 
 class PartFile:

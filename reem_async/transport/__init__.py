@@ -135,7 +135,8 @@ class Contention:
             raise Contended(
                 f"{document_of(commands)}: others kept writing to this top-level key for {self._limit:g} s, each time "
                 "between a look at it and the change; nothing was applied: write to it less often, give what is "
-                "written often a top-level key of its own, or give it longer with timeout="
+                "written often a top-level key of its own, or raise the timeout: "
+                "timeout=, or ?socket_timeout=SECONDS in the URL"
             )
 
     def waited(self, seconds: float) -> None:

@@ -109,10 +109,12 @@ class Options:
             # Its `driver_info` serves all later ones: making one imports, which fails once Python is shutting down.
             self.settings.setdefault("driver_info", self.blocking_connection().driver_info)
         except TypeError as error:
-            hint = "; TLS is asked for by rediss:// or ssl=True" if "ssl_" in str(error) and not self.tls else ""
-            raise BadType(f"RedisInterface: {error}; see redis-py's connection options{hint}") from None
+            hint = "; rediss:// turns TLS on" if "ssl_" in str(error) and not self.tls else ""
+            unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+            problem = f"there is no option {unknown[1]}" if unknown else error
+            raise BadType(f"{problem}; see redis-py's connection options{hint}") from None
         except (ValueError, redis.exceptions.RedisError) as error:
-            raise BadValue(f"RedisInterface: {error}; see redis-py's connection options") from None
+            raise BadValue(f"{error}; see redis-py's connection options") from None
         self._warn_of_listeners()
 
     def _check_tls(self) -> None:
@@ -137,13 +139,16 @@ class Options:
                 "rediss://",
             )
         elif self.settings.get("ssl_cert_reqs", "required") in ("none", ssl.CERT_NONE):
-            danger, remedy = "does not check who the server is", "ssl_ca_certs='ca.crt' instead of ssl_cert_reqs='none'"
+            danger, remedy = (
+                "does not check who the server is",
+                "the option ssl_ca_certs, not ssl_cert_reqs",
+            )
         else:
             return
         message = (
             f"the connection to {self.address} {danger}; use {remedy} (SECURITY.md says how), or, on a network that "
             "is the robot's own, silence this: "
-            "warnings.filterwarnings('ignore', category=reem.InsecureConnection)"
+            "warnings.filterwarnings('ignore', category=reem.InsecureConnection) or PYTHONWARNINGS=ignore::UserWarning"
         )
         if message not in _said:
             _said.add(message)
@@ -219,7 +224,7 @@ class Options:
             )
         return NotConnected(
             f"no server answers at {self.address} ({_shown(reason, text)}); start one with `reem up` or with "
-            f"compose.yaml, or pass the right address: RedisInterface('redis://host:port'){self._hint(reason)}"
+            f"compose.yaml, or give the right address, such as redis://host:port{self._hint(reason)}"
         )
 
     def unanswered(self, error: ConnectionLost) -> NotConnected:
@@ -326,7 +331,8 @@ def question_here(connection: Any, commands: Sequence[Command], check: Callable[
 
 
 _CERTIFICATE = (
-    "if it asks clients for certificates, pass ssl_certfile=... and ssl_keyfile=..., issued by an authority it trusts"
+    "if it asks clients for certificates, give one that it trusts, with its key: the options ssl_certfile and "
+    "ssl_keyfile (in the URL: ?ssl_certfile=FILE&ssl_keyfile=FILE)"
 )
 
 _said: set[str] = set()
@@ -374,7 +380,7 @@ def _tls_remedy(reason: ssl.SSLError) -> str:
             return f"{said.rstrip('.')}; connect by a name that is in the certificate, or issue one with this name"
         if "expired" in said or "not yet valid" in said:
             return f"the server's {said}; renew it, or set the clock right"
-        return f"the server's certificate is not trusted ({said}); pass ssl_ca_certs='ca.crt', its authority's"
+        return f"the server's certificate is not trusted ({said}); give its authority's: ?ssl_ca_certs=FILE"
     name = reason.reason or str(reason)
     if "WRONG_VERSION_NUMBER" in name or "PACKET_LENGTH" in name:
         return f"what answers there does not speak TLS ({name}); use redis:// or the TLS port"

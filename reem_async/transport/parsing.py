@@ -110,7 +110,7 @@ def _check_size(size: int, limit: int) -> None:
     if size > limit:
         raise redis.exceptions.InvalidResponse(
             f"a reply, or a string in it, of {size} bytes or more, where {limit} is the limit "
-            "(RedisInterface(..., largest_value=) sets it for a string)"
+            "(for a string, the option largest_value sets it; in a URL: ?largest_value=BYTES)"
         )
 
 

@@ -228,7 +228,7 @@ class Route:
             kind = TlsRefused if isinstance(problem, TlsRefused) else NotConnected
             raise kind(
                 f"the cluster did not take the call within {limit:g} s ({_reason(problem)}); "
-                "nothing was applied: call again, or give it longer with timeout="
+                "nothing was applied: call again, or raise the timeout: timeout=, or ?socket_timeout=SECONDS in the URL"
             )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from ...errors import BadValue
-from ..partfile import Lock, PartFile, is_locked, lock
+from ..partfile import Lock, PartFile, is_locked, lock, there_already
 from .contents import slices
 
 
@@ -54,7 +54,7 @@ class Output:
                     os.close(self._file)
                     raise self._taken()
         except FileExistsError:
-            raise BadValue(f"{path} is there already; choose another name, or replace it with overwrite=True") from None
+            raise BadValue(str(there_already(path))) from None
         except OSError as error:
             raise BadValue(f"{path} cannot be written: {error.strerror}") from None
         status = os.fstat(self._file)

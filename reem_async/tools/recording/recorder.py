@@ -139,7 +139,7 @@ class Recorder:
         self.fetching = asyncio.Semaphore(_FETCHES)
         self._samples = samples_of(sample)
         if not self.patterns and not self._samples:
-            raise BadValue("nothing to record: give a pattern such as '*', or sample=")
+            raise BadValue("nothing to record: give a pattern such as '*', or paths to sample")
         self._keyframe_seconds = keyframe
         self._keyframes = 0
         self._keys = RecordedKeys(self, self.patterns)

@@ -235,7 +235,7 @@ async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) 
         more = f" and {len(there) - 3} more" if len(there) > 3 else ""
         raise Conflict(
             f"{', '.join(map(repr, there[:3]))}{more}: on the server already; nothing was restored: replace=True "
-            "replaces them, into= gives what is restored other names"
+            "(--replace) replaces them, into= (--into) gives what is restored other names"
         )
 
 
