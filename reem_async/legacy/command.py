@@ -8,7 +8,7 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar
-from reem_async.tools.cli.running import FAILED, prepared, run
+from reem_async.tools.cli.running import FAILED, guarded, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -41,7 +41,8 @@ def migrate(
         reem migrate --yes
         reem migrate --yes --ship my_ships:PoseShip --url redis://robot.local:6379
     """
-    given = prepared("migrate", lambda: named_ships(ships))
+    with guarded("migrate"):
+        given = named_ships(ships)
 
     async def work(interface: RedisInterface) -> int:
         from reem_async.legacy.convert import migrate as convert

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
-from reem_async.tools.cli.running import USAGE, Refused, guarded, interface_to
+from reem_async.tools.cli.running import USAGE, Refused, interface_to, run_local
 
 if TYPE_CHECKING:
     from reem_async.server.embedded import EmbeddedServer
@@ -74,9 +74,7 @@ def browse(
         asyncio.run(_serve(source, host, port, allow_write, open_))
         return None
 
-    code = guarded("browse", work, live=True)
-    if code:
-        raise typer.Exit(code)
+    run_local("browse", work, live=True)
 
 
 def check_packages(log: Path | None) -> None:
@@ -184,9 +182,7 @@ def demo(
         reem demo
         reem demo --no-open     on a machine without a screen
     """
-    code = guarded("demo", lambda: _run(port, page_port, open_), live=True)
-    if code:
-        raise typer.Exit(code)
+    run_local("demo", lambda: _run(port, page_port, open_), live=True)
 
 
 def _run(port: int | None, page_port: int | None, open_: bool) -> None:

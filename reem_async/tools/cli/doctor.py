@@ -25,7 +25,7 @@ from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
 from reem_async.tools.cli.output import clean, emit, emit_json, is_terminal, styled, width
-from reem_async.tools.cli.running import FAILED, for_users, guarded, interface_to
+from reem_async.tools.cli.running import FAILED, for_users, interface_to, run_local
 from reem_async.transport import scanned
 
 if TYPE_CHECKING:
@@ -81,17 +81,15 @@ def doctor(
         reem doctor --url redis://robot.local:6379
         reem doctor --json | jq -r 'select(.status != "ok") | .message'
     """
-    failed = False
 
-    async def examine() -> None:
-        nonlocal failed
+    async def examine() -> int:
+        code = 0
         async for node, finding in _findings(url, namespace, write=not no_write, clean=clean):
-            failed |= finding.status == FAIL
             _show(node, finding, as_json)
+            code = FAILED if finding.status == FAIL else code
+        return code
 
-    code = guarded("doctor", lambda: asyncio.run(examine()))
-    if code or failed:
-        raise typer.Exit(code or FAILED)
+    run_local("doctor", lambda: asyncio.run(examine()))
 
 
 def _show(node: str, finding: Finding, as_json: bool) -> None:

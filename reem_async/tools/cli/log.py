@@ -20,7 +20,7 @@ from reem_async.errors import BadValue
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar, size_text, styled
 from reem_async.tools.cli.record import tools
-from reem_async.tools.cli.running import USAGE, Refused, guarded, run
+from reem_async.tools.cli.running import USAGE, Refused, run, run_local
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -237,13 +237,7 @@ def info(
                 _print(log, channels)
             return 1 if log.damaged else 0
 
-    _guard("log info", work)
-
-
-def _guard(name: str, work: Any) -> None:
-    code = guarded(name, work)
-    if code:
-        raise typer.Exit(code)
+    run_local("log info", work)
 
 
 def _summary(log: Log, channels: list[ChannelSummary]) -> dict[str, Any]:
@@ -387,7 +381,7 @@ def export(
             emit(clean(f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(size)}"))
         return 1 if result.unreadable else 0
 
-    _guard("log export", work)
+    run_local("log export", work)
 
 
 def _format(to: str | None, output: Path | None) -> str:

@@ -23,7 +23,7 @@ from reem_async.tools.cli.options import (
     named_ships,
 )
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
-from reem_async.tools.cli.running import Refused, prepared, run
+from reem_async.tools.cli.running import Refused, guarded, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -119,7 +119,9 @@ def record(
                     note(_nothing(wanted, recorder.status.failed))
         return 0
 
-    run("record", work, url, namespace, ships=prepared("record", lambda: named_ships(ships)))
+    with guarded("record"):
+        own = named_ships(ships)
+    run("record", work, url, namespace, ships=own)
 
 
 def _stand_back() -> None:
@@ -140,9 +142,8 @@ def _recorder(
 ) -> Recorder:
     if output == Path("-"):
         raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
-    kind = prepared("record", lambda: tools("Recorder"))
     # Refused here if the file is there already: nothing was sent for it yet.
-    recorder: Recorder = kind(
+    recorder: Recorder = tools("Recorder")(
         interface, patterns, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
     )
     return recorder

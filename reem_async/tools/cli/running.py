@@ -1,7 +1,6 @@
 """Running a command: one server, one event loop, errors as one line and an exit code.
 
-Exit codes: 0 done, 1 failed, 2 wrong usage (also a file that is there already, without --force), 3 nothing is there
-(also a file to read), 4 waited in vain (--timeout).
+Exit codes: 0 done, 1 failed, 2 usage error (or the file exists; use --force), 3 not found, 4 timed out (--timeout).
 Ctrl-C is how a live command is ended, so it exits with 0; any other command exits with 130.
 """
 
@@ -15,7 +14,7 @@ import sys
 import warnings
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -23,8 +22,6 @@ from reem_async.tools.cli.output import clean
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
-
-Result = TypeVar("Result")
 
 
 # Scripts depend on these numbers: the same in every command, listed in the README.
@@ -69,47 +66,49 @@ def run(
         live: The command goes on until Ctrl-C.
         ships: The interface's ships; None for the default ones.
     """
-    code = guarded(name, lambda: asyncio.run(_connected(work, url, namespace, ships)), live=live)
-    if code:
-        raise typer.Exit(code)
+    run_local(name, lambda: asyncio.run(_connected(work, url, namespace, ships)), live=live)
 
 
-def guarded(name: str, work: Callable[[], int | None], *, live: bool = False) -> int:
-    """Do `work` and return its exit code; errors that users can do something about become one line."""
+def run_local(name: str, work: Callable[[], int | None], *, live: bool = False) -> None:
+    """As `run`, for what needs no connection."""
+    with guarded(name, live=live):
+        if code := work():
+            sys.stdout.flush()
+            raise typer.Exit(code)
+
+
+@contextmanager
+def guarded(name: str, *, live: bool = False) -> Iterator[None]:
+    """End the command where the block fails: errors that users can do something about become one line.
+
+    Raises:
+        typer.Exit: The block failed, was interrupted, or could not print.
+    """
     from reem_async.errors import BadInput, MissingKey, RedisError, ReemError
 
     try:
-        with _warnings_in_words(name):
-            code = work() or 0
+        with _short_warnings(name):
+            yield
         # Here and not when the interpreter ends, so that a closed pipe is seen while it can still be handled.
         sys.stdout.flush()
+        return
     except (KeyboardInterrupt, asyncio.CancelledError):
-        return 0 if live else INTERRUPTED
-    except BrokenPipeError:  # `| head` has seen enough
-        _close_stdout()
-        return 0
+        code = 0 if live else INTERRUPTED
+    except BrokenPipeError:  # `| head` has read enough
+        code = 0
+        # The interpreter flushes when it ends: into nothing.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Refused as error:
-        return complain(name, str(error), error.code)
+        code = complain(name, str(error), error.code)
     # Before ReemError, whose subclass it is: that nothing is there is an answer, not a failure.
-    except MissingKey as error:
-        return complain(name, for_users(error), NOTHING)
+    except (MissingKey, FileNotFoundError) as error:
+        code = complain(name, for_users(error), NOTHING)
     except (BadInput, FileExistsError) as error:
-        return complain(name, for_users(error), USAGE)
-    except FileNotFoundError as error:
-        return complain(name, for_users(error), NOTHING)
+        code = complain(name, for_users(error), USAGE)
     except (ReemError, RedisError, OSError) as error:
-        return complain(name, for_users(error), FAILED)
-    return code
-
-
-def prepared(name: str, make: Callable[[], Result]) -> Result:
-    """Return what `make` returns; what goes wrong, a closed pipe too, ends the command before anything is sent."""
-    # A list, since the exit code takes the place of the return value.
-    result: list[Result] = []
-    code = guarded(name, lambda: result.append(make()))
-    if not result or code:
-        raise typer.Exit(code)
-    return result[0]
+        code = complain(name, for_users(error), FAILED)
+    raise typer.Exit(code)
 
 
 async def _connected(
@@ -132,10 +131,10 @@ def _hangup() -> list[signal.Signals]:
 
 
 def _cancel_on(signals: Sequence[signal.Signals]) -> None:
-    """Cancel this task, once, when a signal comes; the same signal again ends the process as ever, but for a hangup.
+    """Cancel this task when a signal comes. The same signal again ends the process, except for a hangup.
 
-    `asyncio.run` alone cancels within the handler of the signal, between any two steps of Python: thus also
-    after a reply's waiter was seen to wait and before it is told, which asyncio complains about at length.
+    `asyncio.run` alone cancels within the signal handler, between any two steps of Python, also within asyncio's own
+    code, which reports that at length.
     """
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
 
@@ -179,7 +178,7 @@ def complain(name: str, message: str, code: int) -> int:
 
 
 @contextmanager
-def _warnings_in_words(name: str) -> Iterator[None]:
+def _short_warnings(name: str) -> Iterator[None]:
     """Show warnings as one line each, without the place in the code that Python adds."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
@@ -189,12 +188,6 @@ def _warnings_in_words(name: str) -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = show
         yield
-
-
-def _close_stdout() -> None:
-    """Let the interpreter flush into nothing when it ends."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def for_users(error: Exception | Warning) -> str:

@@ -26,7 +26,7 @@ from reem_async.tools.cli.output import (
     size_text,
     styled,
 )
-from reem_async.tools.cli.running import FAILED, NOTHING, Refused, for_users, prepared, run
+from reem_async.tools.cli.running import FAILED, NOTHING, Refused, for_users, guarded, run, run_local
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -266,9 +266,7 @@ def list_(
       reem snapshot list --check /var/backups
       reem snapshot list before.zip
     """
-    code = prepared("snapshot list", lambda: listed(path, check, as_json))
-    if code:
-        raise typer.Exit(code)
+    run_local("snapshot list", lambda: listed(path, check, as_json))
 
 
 def restore(
@@ -291,7 +289,8 @@ def restore(
       reem snapshot restore --replace --match 'arm*' before.zip
       reem snapshot restore --into old_ before.zip
     """
-    prepared("snapshot restore", lambda: check_there(file))
+    with guarded("snapshot restore"):
+        check_there(file)
 
     async def work(interface: RedisInterface) -> None:
         from reem_async.tools.snapshots import describe

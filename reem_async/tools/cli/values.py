@@ -17,7 +17,7 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width, write_over
-from reem_async.tools.cli.running import NOTHING, USAGE, Refused, prepared, run
+from reem_async.tools.cli.running import NOTHING, USAGE, Refused, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
 
 if TYPE_CHECKING:
@@ -177,7 +177,8 @@ def set_(
         reem set map @map.npy
         jq .config robot.json | reem set config -
     """
-    parsed = prepared("set", lambda: parse_value(value, is_text=is_text))
+    with guarded("set"):
+        parsed = parse_value(value, is_text=is_text)
 
     async def work(interface: RedisInterface) -> None:
         await _place(interface, path, publish).write(parsed)
@@ -283,7 +284,8 @@ def pub(
         reem pub beep true --rate 2 --count 10
         reem pub map @map.npy
     """
-    parsed = prepared("pub", lambda: parse_value(value, is_text=is_text))
+    with guarded("pub"):
+        parsed = parse_value(value, is_text=is_text)
     repeated = rate is not None or count is not None
 
     async def work(interface: RedisInterface) -> None:
