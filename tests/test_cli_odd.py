@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import json
 import os
 import pty
@@ -18,7 +17,6 @@ import orjson
 import pytest
 import typer
 from conftest import assert_same
-from rich.console import Console
 from snapshotkit import servers  # noqa: F401 - a fixture
 from test_cli import REEM, CommandLine
 from typer.testing import CliRunner
@@ -30,9 +28,9 @@ from reem_async.plan.paths import parse
 from reem_async.tools.browser.arrays import file_of
 from reem_async.tools.cli import build
 from reem_async.tools.cli.echo import _moment
-from reem_async.tools.cli.output import json_text, typed
+from reem_async.tools.cli.output import facts_lines, json_text, typed
 from reem_async.tools.cli.running import Refused
-from reem_async.tools.cli.up import fail, print_rows
+from reem_async.tools.cli.up import fail
 from reem_async.tools.cli.values import FILES, parse_value, save
 from reem_async.tools.snapshots import described
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
@@ -266,9 +264,8 @@ def test_what_killed_runs_have_left_is_removed(tmp_path):
 
 
 def test_what_files_say_does_not_command_the_terminal(capsys):
-    file = io.StringIO()
-    print_rows(Console(file=file), [("snapshot", "under \x1b]0;pwned\x07")])
-    assert "\x1b]0" not in file.getvalue()
+    facts_lines([("snapshot", "under \x1b]0;pwned\x07")])
+    assert "\x1b]0" not in capsys.readouterr().out
     with pytest.raises(typer.Exit):
         fail("a value of \x1b[31mevil\nsecond line")
     errors = capsys.readouterr().err

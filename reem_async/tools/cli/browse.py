@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
+from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import USAGE, Refused, interface_to, run_local
 
 if TYPE_CHECKING:
@@ -143,15 +144,10 @@ def _address(host: str, port: int, token: str | None) -> str:
 
 
 def _tell(source: Source, address: str, alone: bool, allow_write: bool) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console()
-    console.print(Text.assemble(("REEM's browser is up", "bold green"), f", showing {source.title}"), soft_wrap=True)
-    who = "programs of this machine" if alone else "whoever has this address: it has a token in it"
+    emit(styled("REEM's browser is up", "green") + f", showing {clean(source.title)}")
+    who = "programs of this machine" if alone else "every program that has this address: it has a token in it"
     may = "look and write" if allow_write and source.writable else "look"
-    for label, value in (("address", address), ("open to", who), ("they may", may), ("to stop", "Ctrl-C")):
-        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value), soft_wrap=True)
+    facts_lines([("address", address), ("open to", who), ("they may", may), ("to stop", "Ctrl-C")])
 
 
 _PROGRAMS = ("arm", "camera", "controller")
@@ -273,22 +269,18 @@ async def _ended(running: list[subprocess.Popen[bytes]], page: Any) -> str:
 
 
 def _describe(port: int, address: str) -> None:
-    from rich.console import Console
-    from rich.text import Text
-
     python = shutil.which("python")
     is_ours = python is not None and os.path.samefile(os.path.dirname(python), os.path.dirname(sys.executable))
     where = "localhost" if port == _SERVER_PORT else f"localhost:{port}"
     url = "" if port == _SERVER_PORT else f" --url localhost:{port}"
-    console = Console(highlight=False, markup=False, soft_wrap=True)
-    console.print(Text("The demo is up", "bold green") + ": an arm, its camera and its controller, in three programs.")
-    for label, value in (("page", address), ("server", f"redis://localhost:{port}"), ("to stop", "Ctrl-C")):
-        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), value))
-    console.print(f"\nMove the goal: in another terminal, start {'python' if is_ours else sys.executable} and paste")
+    emit(f"{styled('The demo is up', 'green')}: an arm, its camera and its controller, in three programs.")
+    facts_lines([("page", address), ("server", f"redis://localhost:{port}"), ("to stop", "Ctrl-C")])
+    emit(f"\nMove the goal: in another terminal, start {'python' if is_ours else sys.executable} and paste")
     for line in (
         "from reem import KeyValueStore, RedisInterface",
         f'kvs = KeyValueStore(RedisInterface("{where}"))',
         'kvs["goal"] = {"x": -0.1, "y": -0.4}  # metres; the arm brings the ball there',
     ):
-        console.print(Text(f"  {line}", style="bold"))
-    console.print(f"\nOr look on: reem top{url}, reem echo controller{url}, reem record{url} -o run.mcap")
+        emit(f"  {styled(line, 'bold')}")
+    emit(f"\nOr look on: reem top{url}, reem echo controller{url}, reem record{url} -o run.mcap")
+    sys.stdout.flush()

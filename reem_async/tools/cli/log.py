@@ -18,7 +18,17 @@ import typer
 
 from reem_async.errors import BadValue
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
-from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar, size_text, styled
+from reem_async.tools.cli.output import (
+    clean,
+    columns,
+    emit,
+    emit_json,
+    note,
+    progress_bar,
+    size_text,
+    styled,
+    write_over,
+)
 from reem_async.tools.cli.record import tools
 from reem_async.tools.cli.running import USAGE, Refused, run, run_local
 
@@ -139,46 +149,27 @@ def _read_line() -> bytes:
 
 @contextlib.asynccontextmanager
 async def _progress(replayer: Replayer, as_json: bool) -> AsyncIterator[None]:
-    """Show a bar on a terminal, a line of JSON a second for scripts."""
-    task = asyncio.create_task(_report(replayer) if as_json else _draw(replayer))
+    """Show the progress: a line that is written over on a terminal, a line of JSON a second for scripts."""
+    task = asyncio.create_task(_show(replayer, as_json))
     try:
         yield
     finally:
-        # Before what became of it is said: the bar must not be drawn over that.
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+        write_over("")
 
 
-async def _report(replayer: Replayer) -> None:
+async def _show(replayer: Replayer, as_json: bool) -> None:
     while True:
-        await asyncio.sleep(1.0)
-        emit_json(_fields(replayer.status))
-
-
-async def _draw(replayer: Replayer) -> None:
-    # In a log the bar would be a line for each time that it is drawn.
-    if not sys.stderr.isatty():
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    columns = (TextColumn("{task.fields[clock]}"), BarColumn(None), TextColumn("{task.fields[text]}"))
-    # A recording of one instant has no length, which the bar divides by.
-    length = max(replayer.end - replayer.start, 1e-9)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=length, clock="", text="")
-        while True:
-            status = replayer.status
-            done = status.position - replayer.start
-            lag = f"  {status.lag:.2f} s behind" if status.lag > _NOTICED_LAG else ""
-            rounds = f"  round {status.rounds + 1}" if status.rounds else ""
-            progress.update(
-                task,
-                completed=done,
-                clock=f"{done:.1f}/{length:.1f} s",
-                text=f"{status.published} published{rounds}{lag}",
-            )
-            await asyncio.sleep(0.1)
+        await asyncio.sleep(1.0 if as_json else 0.1)
+        status = replayer.status
+        if as_json:
+            emit_json(_fields(status))
+            continue
+        done, length = status.position - replayer.start, replayer.end - replayer.start
+        lag = f"  {status.lag:.2f} s behind" if status.lag > _NOTICED_LAG else ""
+        rounds = f"  round {status.rounds + 1}" if status.rounds else ""
+        write_over(f"{done:.1f}/{length:.1f} s  {status.published} published{rounds}{lag}")
 
 
 def _fields(status: ReplayStatus) -> dict[str, float]:

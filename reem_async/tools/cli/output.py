@@ -69,6 +69,13 @@ def write_over(text: str) -> None:
         sys.stderr.flush()
 
 
+def facts_lines(rows: Iterable[tuple[str, str]]) -> None:
+    """Print labels and values, one pair a line. A line to be copied stays one line, however narrow the terminal."""
+    for label, value in rows:
+        emit(f"  {styled(f'{label:10}', 'cyan')}{clean(value)}")
+    sys.stdout.flush()
+
+
 def json_text(value: Any, *, pretty: bool = False) -> str:
     """Return JSON that a terminal can be sent; `reem_async.tools.jsontext` says how each value is written."""
     return "\n".join(map(clean, jsontext.json_text(value, pretty=pretty).split("\n")))

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -105,7 +106,9 @@ def save(
       reem snapshot save --rdb -d /var/backups
     """
     _check_options(file, directory, match, rdb=rdb, periodic=every is not None or keep is not None)
-    saver = _Saver(file, directory or Path(), match, rdb=rdb, keep=keep, overwrite=force, as_json=as_json)
+    # A file that is named by time has a name that is free.
+    overwrite = force and file is not None
+    saver = _Saver(file, directory or Path(), match, rdb, keep, overwrite, as_json)
 
     async def work(interface: RedisInterface) -> int:
         return await (saver.once(interface) if every is None else saver.by_period(interface, every))
@@ -122,29 +125,17 @@ def _check_options(file: Path | None, directory: Path | None, match: str, *, rdb
         raise typer.BadParameter("--rdb saves all of the server: leave out --match")
 
 
+@dataclass
 class _Saver:
-    """Takes snapshots and says what it did."""
-
-    def __init__(
-        self,
-        file: Path | None,
-        directory: Path,
-        match: str,
-        *,
-        rdb: bool,
-        keep: int | None,
-        overwrite: bool,
-        as_json: bool,
-    ) -> None:
-        self._file = file
-        self._directory = directory
-        self._match = match
-        self._rdb = rdb
-        self._keep = keep
-        self._overwrite = overwrite and file is not None  # what is named by time has a name that is free
-        self._as_json = as_json
-        self._made: list[Path] = []
-        self._noted: set[str] = set()
+    file: Path | None
+    directory: Path
+    match: str
+    rdb: bool
+    keep: int | None
+    overwrite: bool
+    as_json: bool
+    made: list[Path] = field(default_factory=list)
+    noted: set[str] = field(default_factory=set)
 
     async def once(self, interface: RedisInterface, *, bar: bool = True) -> int:
         """Take one, delete what is too old, print a line; return the exit code."""
@@ -158,7 +149,7 @@ class _Saver:
         return FAILED if failed or it.unsaved else 0
 
     def _tell(self, it: Snapshot, gone: Sequence[Path], seconds: float) -> None:
-        if self._as_json:
+        if self.as_json:
             done = {"seconds": seconds, "deleted": [str(path) for path in gone]}
             emit_json({**facts(it), "doubt": it.doubt, **done})
             return
@@ -185,7 +176,7 @@ class _Saver:
                 except (ReemError, RedisError, OSError) as error:
                     # If the first one fails, the user is still there to mend it; later ones are tried again by
                     # themselves.
-                    if not self._made:
+                    if not self.made:
                         raise
                     note(f"reem snapshot save: not saved, next try in due time: {for_users(error)}")
                 # By the clock of the first one, so that the times do not drift; turns that a long save has missed are
@@ -202,40 +193,40 @@ class _Saver:
                 return await self._saved_as(interface, bar)
             except FileExistsError:
                 # Of one named by time: another program has begun one in the same second, and this gets the next number.
-                if self._file is not None:
+                if self.file is not None:
                     raise
 
     async def _saved_as(self, interface: RedisInterface, bar: bool) -> Snapshot:
         from reem_async.tools.snapshots import RdbUnavailable, save, save_rdb
 
-        if self._rdb:
+        if self.rdb:
             try:
-                return await save_rdb(interface, self._path("rdb"), overwrite=self._overwrite)
+                return await save_rdb(interface, self._path("rdb"), overwrite=self.overwrite)
             # Said once; the next ones by period try again, since rights may have changed.
             except RdbUnavailable as error:
                 self._note_once(
                     f"No RDB file: {for_users(error)}. A portable snapshot, of the keys of REEM, is taken instead."
                 )
-        with _progress(shown=bar and not self._as_json) as progress:
+        with _progress(shown=bar and not self.as_json) as progress:
             return await save(
-                interface, self._path("portable"), self._match, overwrite=self._overwrite, progress=progress
+                interface, self._path("portable"), self.match, overwrite=self.overwrite, progress=progress
             )
 
     def _path(self, kind: str) -> Path:
         from reem_async.tools.snapshots.files import new_name
 
-        return self._file or new_name(self._directory, kind, time.time(), auto=self._keep is not None)
+        return self.file or new_name(self.directory, kind, time.time(), auto=self.keep is not None)
 
     def _pruned(self, newest: Path) -> Pruned:
         from reem_async.tools.snapshots.files import Pruned, prune
 
-        self._made.append(newest)
+        self.made.append(newest)
         # Without --keep nothing is ever deleted, so there is nothing to remember.
-        if self._keep is None:
-            del self._made[:-1]
+        if self.keep is None:
+            del self.made[:-1]
             return Pruned([], [])
-        done = prune(self._made, self._keep)
-        del self._made[: -self._keep]
+        done = prune(self.made, self.keep)
+        del self.made[: -self.keep]
         return done
 
     def _note_foreign(self, it: Snapshot) -> None:
@@ -245,8 +236,8 @@ class _Saver:
             self._note_once(f"Left out, not REEM's: {names}{more}")
 
     def _note_once(self, text: str) -> None:
-        if text not in self._noted:
-            self._noted.add(text)
+        if text not in self.noted:
+            self.noted.add(text)
             note(text)
 
 

@@ -6,6 +6,7 @@ import asyncio
 import os
 import select
 import signal
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -13,14 +14,12 @@ from types import FrameType
 from typing import Annotated, NoReturn
 
 import typer
-from rich.console import Console
-from rich.text import Text
 
 from reem_async.errors import LoginRefused, RedisError, ReemError, ServerFailed, ServerMissing
 from reem_async.server.cluster import EmbeddedCluster
 from reem_async.server.embedded import EmbeddedServer
 from reem_async.tools.cli.options import existing
-from reem_async.tools.cli.output import clean
+from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_users, interface_to
 
 LOOK_SECONDS = 0.5
@@ -50,51 +49,46 @@ class Stop:
         return bool(select.select([self._reader], [], [], seconds)[0])
 
 
-def print_rows(console: Console, rows: list[tuple[str, str]]) -> None:
-    """Print what there is to know, one fact a line."""
-    for label, value in rows:
-        # soft_wrap: a line to be copied stays one line, however narrow the terminal
-        console.print(Text.assemble("  ", (f"{label:10}", "cyan"), clean(value)), soft_wrap=True)
-
-
 def fail(message: str) -> NoReturn:
-    """Say why on standard error and exit with code 1."""
-    lines = "\n".join(map(clean, message.split("\n")))
-    Console(stderr=True).print(Text.assemble(("reem up: ", "bold red"), lines), soft_wrap=True)
+    """Print the reason on standard error and exit with code 1."""
+    sys.stderr.write("reem up: " + "\n".join(map(clean, message.split("\n"))) + "\n")
     raise typer.Exit(1)
 
 
-def up_cluster(stop: Stop, *, plain: bool) -> None:
-    """Keep a cluster up until told to stop; a node that ends is told of, and the others go on."""
-    console = Console()
+def _up_cluster(*, plain: bool) -> None:
+    """Keep a cluster up until told to stop. The other nodes go on when one ends."""
+    stop = Stop()
     try:
         with EmbeddedCluster(json=not plain) as cluster:
-            console.print(Text("REEM's cluster is up.", style="bold green"))
-            print_rows(console, _rows(cluster))
+            emit(styled("REEM's cluster is up.", "green"))
+            half = len(cluster.nodes) // 2
+            nodes = [f"port {node.port}, process {node.pid}" for node in cluster.nodes]
+            labels = ["primaries", *[""] * (half - 1), "replicas", *[""] * (half - 1)]
+            facts_lines([("address", cluster.url), *zip(labels, nodes, strict=True)])
+            facts_lines(_use(cluster.url, json=cluster.json, data="in memory, gone when the cluster stops"))
             left = list(cluster.nodes)
             while not stop.wait(LOOK_SECONDS):
                 for node in [node for node in left if node.ended()]:
                     left.remove(node)
-                    console.print(f"The node on port {node.port} has ended; the others go on.")
+                    emit(f"The node on port {node.port} has ended; the others go on.")
+                    sys.stdout.flush()
     except (ServerFailed, ServerMissing) as error:
         fail(for_users(error))
     with suppress(OSError):  # the terminal may have closed
-        console.print("Stopped. The data is gone.")
+        emit("Stopped. The data is gone.")
+        sys.stdout.flush()
 
 
-def _rows(cluster: EmbeddedCluster) -> list[tuple[str, str]]:
-    """What there is to know of it."""
-    connect = f'KeyValueStore(RedisInterface("{cluster.url}"))'
-    half = len(cluster.nodes) // 2
-    nodes = [f"port {node.port}, process {node.pid}" for node in cluster.nodes]
+def _use(url: str, variable: str | None = None, *, json: bool, data: str) -> list[tuple[str, str]]:
+    """Return how documents and data are kept, and what a program does to connect."""
+    password = f', password=os.environ["{variable}"]' if variable else ""
+    imports = "import os; from" if variable else "from"
+    connect = f'import KeyValueStore, RedisInterface; kvs = KeyValueStore(RedisInterface("{url}"{password}))'
     return [
-        ("address", cluster.url),
-        *zip(["primaries", *[""] * (half - 1)], nodes[:half], strict=True),
-        *zip(["replicas", *[""] * (half - 1)], nodes[half:], strict=True),
-        ("documents", "by their JSON module" if cluster.json else "as text: the nodes have no JSON module"),
-        ("data", "in memory, gone when the cluster stops"),
-        ("blocking", f"from reem import KeyValueStore, RedisInterface; kvs = {connect}"),
-        ("asyncio", f"from reem_async import KeyValueStore, RedisInterface; kvs = {connect}"),
+        ("documents", "by the JSON module" if json else "as text: the server has no JSON module"),
+        ("data", data),
+        ("blocking", f"{imports} reem {connect}"),
+        ("asyncio", f"{imports} reem_async {connect}"),
         ("to stop", "Ctrl-C"),
     ]
 
@@ -158,8 +152,7 @@ def up(
     if cluster:
         if any(given is not None for given in (port, directory, password_from_env, snapshot)):
             fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
-
-        up_cluster(Stop(), plain=plain)
+        _up_cluster(plain=plain)
         return
     variable = _password_variable(password_from_env)
     if port is None:
@@ -182,7 +175,8 @@ def up(
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
     with suppress(OSError):  # the terminal may have closed
-        Console().print(f"Stopped. The data is {'kept' if directory else 'gone'}.")
+        emit(f"Stopped. The data is {'kept' if directory else 'gone'}.")
+        sys.stdout.flush()
 
 
 def _who_is_there(port: int) -> str:
@@ -216,33 +210,19 @@ def _password_variable(name: str | None) -> str | None:
 
 
 def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None, snapshot: Path | None) -> None:
-    password = f', password=os.environ["{variable}"]' if variable else ""
     # localhost and not 127.0.0.1: this way clients find the Unix socket, which is quicker.
     url = f"redis://localhost:{server.port}"
-    connect = f'KeyValueStore(RedisInterface("{url}"{password}))'
-    imports = "import os; from" if variable else "from"
-    console = Console()
-    console.print(Text("REEM's server is up.", style="bold green"), f"(process {server.pid})")
-    rows = [
-        *((("snapshot", _summary(snapshot)),) if snapshot else ()),
-        ("address", url),
-        ("socket", f"unix://{server.socket_path}"),
-        (
-            "password",
-            f"the value of {variable}" if variable else "none: any user of this machine can connect",
-        ),
-        ("documents", kept_as(server.json)),
-        ("data", f"{server.directory}, kept" if directory else "in memory, gone when the server stops"),
-        ("blocking", f"{imports} reem import KeyValueStore, RedisInterface; kvs = {connect}"),
-        ("asyncio", f"{imports} reem_async import KeyValueStore, RedisInterface; kvs = {connect}"),
-        ("to stop", "Ctrl-C"),
-    ]
-    print_rows(console, rows)
-
-
-def kept_as(json: bool) -> str:
-    """Return how a server keeps documents."""
-    return "by its JSON module" if json else "as text: the server has no JSON module"
+    emit(styled("REEM's server is up.", "green") + f" (process {server.pid})")
+    facts_lines(
+        [
+            *((("snapshot", _summary(snapshot)),) if snapshot else ()),
+            ("address", url),
+            ("socket", f"unix://{server.socket_path}"),
+            ("password", f"the value of {variable}" if variable else "none: any user of this machine can connect"),
+        ]
+    )
+    data = f"{server.directory}, kept" if directory else "in memory, gone when the server stops"
+    facts_lines(_use(url, variable, json=server.json, data=data))
 
 
 def _summary(path: Path) -> str:
