@@ -71,7 +71,7 @@ class Facts(NamedTuple):
 
 
 def not_allowed(check: str, command: str) -> Finding:
-    """Return the finding that nothing could be found out."""
+    """Return the finding that this user lacks a right."""
     rule = "+" + command.lower().replace(" ", "|")
     return Finding(check, UNKNOWN, f"this user may not run {command}", f"ask as an administrator, or allow {rule}")
 
@@ -83,7 +83,7 @@ def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
     name = facts.info.get("server_name", "redis")
     number = facts.info.get(f"{name}_version") or facts.info.get("redis_version", "?")
     hours = facts.number("uptime_in_seconds") / 3600
-    # Valkey tells its own version beside that of the Redis that it stands in for.
+    # Valkey reports its own version beside the version of Redis that it is compatible with.
     mode = facts.info.get("redis_mode") or facts.info.get("server_mode", "standalone")
     text = f"{name} {number} at {address}, {mode}, up for {hours:.1f} hours"
     if mode == "cluster" and not sharded:
@@ -103,7 +103,7 @@ def json_support(facts: Facts, *, plain: bool) -> Finding:
         if fields.get("name") == "ReJSON" and fields.get("ver", "").isdigit():
             number = int(fields["ver"])
             return Finding("json", OK, f"RedisJSON {number // 10000}.{number // 100 % 100}.{number % 100}")
-    return Finding("json", OK, "RedisJSON answers; its version is not told")
+    return Finding("json", OK, "RedisJSON answers; its version is unknown")
 
 
 def who(
@@ -196,7 +196,7 @@ def subscribers(facts: Facts) -> Finding:
     # All classes in one line: normal 0 0 0 replica 268435456 67108864 60 pubsub 33554432 8388608 60.
     words = facts.config.get("client-output-buffer-limit", "").split()
     if "pubsub" not in words or len(words) < words.index("pubsub") + 4:
-        return Finding("subscribers", UNKNOWN, "the server does not tell client-output-buffer-limit")
+        return Finding("subscribers", UNKNOWN, "the server does not report client-output-buffer-limit")
     start = words.index("pubsub") + 1
     hard, soft, seconds = map(int, words[start : start + 3])
     if not hard and not soft:

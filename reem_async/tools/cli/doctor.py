@@ -149,15 +149,15 @@ async def _publishers(interface: RedisInterface) -> Finding:
 
     board = Board(ALL)
     try:
-        heard = await follow(interface, (), board.take, seconds=_LISTENS)
+        ending = await follow(interface, (), board.take, seconds=_LISTENS)
     except (ReemError, RedisError) as error:
-        return Finding("publishers", UNKNOWN, f"the updates that are published cannot be heard: {for_users(error)}")
+        return Finding("publishers", UNKNOWN, f"published updates cannot be received: {for_users(error)}")
     doubled = board.warnings()
     if doubled:
         return Finding(
             "publishers", WARN, "; ".join(doubled), "end one of them, or give them other keys; `reem top` shows all"
         )
-    what = f"{heard.taken} updates of {len(board.windows)} keys in {_LISTENS:g} s, none of two publishers at once"
+    what = f"{ending.taken} updates of {len(board.windows)} keys in {_LISTENS:g} s, none of two publishers at once"
     return Finding("publishers", OK, what)
 
 
@@ -197,7 +197,7 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
             ("INFO",),
             ("CONFIG", "GET", "client-output-buffer-limit", "save"),
             ("ACL", "WHOAMI"),
-            ("JSON.GET",),  # refused, as what it is: that tells whether the server knows it
+            ("JSON.GET",),  # an error: it shows whether the server knows the command
         ]
     )
     facts = Facts(_info(info), _config(config))
@@ -245,7 +245,7 @@ async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
 
 
 async def _keys_at(session: Session, server: Transport) -> Keys:
-    """Return the names of a key that nobody has, and whose slot this server has."""
+    """Return the names of an unused key whose slot this server has."""
     for _ in range(_NAMES):
         keys = session.keys(f"reem-doctor-{secrets.token_hex(4)}")
         if await session.transport.owner(keys.document.encode()) is server:
@@ -277,7 +277,7 @@ async def _array_reads(server: Transport, keys: Keys) -> Finding:
     key = keys.tag + ".array"
     (stored,) = await server.roundtrip([("SET", key, bytes(_ARRAY_BYTES), "EX", "60")])
     if isinstance(stored, Exception):
-        return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "a user who may write can tell")
+        return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "run it as a user with the right to write")
     try:
         seconds = await _timed(server, ("GET", key), bulk=True)
     finally:
@@ -402,7 +402,7 @@ def shared_memory(reason: str, refusal: str = "", *, contained: bool = False) ->
 
     Args:
         reason: Why memory cannot be shared here, empty if it can.
-        refusal: What the server says to who asks for the channel by which such programs find each other.
+        refusal: The error of the server for the channel by which such programs find each other.
         contained: This is a container whose processes have numbers of their own.
     """
     otherwise = "large values go through the server"
@@ -496,7 +496,7 @@ async def find_orphans(session: Session, *, remove: bool = False) -> Orphans:
             found = await session.run(orphans(keys, suffixes))
             if found and remove:
                 found = await session.run(remove_orphans(keys, suffixes, session.cache))
-        # Of a damaged document, or without the right to read it, nobody knows what belongs to it.
+        # Nothing is known of what belongs to a damaged document, or to one that this user may not read.
         except (ReemError, RedisError) as error:
             unknown[name] = error
         else:

@@ -48,12 +48,11 @@ def echo(
 ) -> None:
     """Print changes as they are published or stored, until Ctrl-C (exit code 0).
 
-    Every update that is published, with the time of the publisher's clock. What is only stored, by whomever, is marked
-    so and printed as what it led to, with the time at which it was found ("stored" in JSON): several changes in a
-    moment may be one line. Of a path that is asked for, only what is there is printed. Values over 16 KB do not
-    travel with the notice: their size is printed, and of arrays type and shape. Updates that were lost or
-    skipped are told in a line that begins with #; in JSON they are "missed", "gap" and "skipped". With --fetch, what
-    cannot be read has the reason in its place, in JSON as "error".
+    A published update has one line, with the time of the publisher's clock. Plain writes are marked as stored, with
+    the time at which they were found; several in a moment may share one line. Of an update of a whole dict, the part
+    at the given path is printed. Values over 16 KB do not travel with the notice: size, type and shape are printed.
+    Lines that begin with # report lost and skipped updates; in JSON they are "missed", "gap" and "skipped". With
+    --fetch, a value that cannot be read has the reason in its place, in JSON as "error".
 
     Examples:
         reem echo

@@ -22,7 +22,7 @@ _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
 
 _MOST_PATHS = 10_000
-"""Paths that are told apart for the last line: a program may publish under ever new names."""
+"""Paths that are counted for the last line: a program may publish under ever new names."""
 
 _NEVER = float("inf")
 
@@ -39,7 +39,7 @@ class Ending:
         seconds: How long it went on.
         paths: Where the updates were, the first 10,000.
         timed_out: The time was over before there was enough.
-        stored: What is only stored is heard, too.
+        stored: Plain writes are followed, too.
     """
 
     taken: int = 0
@@ -61,7 +61,7 @@ class Ending:
         if self.skipped:
             words.append(f"{self.skipped} skipped here, since they came too fast")
         if not self.taken and not self.stored:
-            words.append("only what a PublishSpace writes is heard, not what a KeyValueStore writes")
+            words.append("published updates only: writes of a KeyValueStore do not count")
         if sys.stderr.isatty():
             sys.stderr.write("\r")  # over the ^C that the terminal has shown
         note(", ".join(words))
@@ -137,7 +137,7 @@ async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: M
     try:
         await watch.listen()
     except ReemError as error:
-        note(f"what is only stored is not shown: {error}")
+        note(f"plain writes are not shown: {error}")
     task = asyncio.ensure_future(_hand_on(watch, monitor))
     try:
         yield

@@ -64,9 +64,9 @@ def play(
 ) -> None:
     """Publish a recording again, at the pace at which it was recorded.
 
-    First all that there was at the start is published, then every update in its turn, bit for bit.
-    If the server is slower than the pace, nothing is left out; how far it lags is said. What is damaged or was not
-    recorded is left out, but not what is beside it; it is counted, and the exit code is 1.
+    First the state at the start is published, then every update in its turn, bit for bit.
+    If the server is slower than the pace, nothing is left out, and the lag is reported. Damaged and unrecorded values
+    are left out and counted, and the exit code is 1.
 
     Examples:
         reem play run.mcap
@@ -287,7 +287,7 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
 
 
 def _role(each: ChannelSummary) -> str:
-    """Return what the messages of a channel are, and whether nobody has published them."""
+    """Return what the messages of a channel are, and whether they were only stored."""
     return f"{each.role} (stored)" if each.kind == "stored" else each.role
 
 

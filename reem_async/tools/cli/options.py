@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
     from reem_async.ships.base import SpecialDatatypeShip
 
-_SECONDS = 1.0  # nobody waits longer for a completion
+_SECONDS = 1.0  # longer than this, a completion only disturbs
 # Names that are offered: a shell asks before it shows more than about a hundred.
 _MOST = 200
 _NEEDED = ("reem_async.store.catalog", "reem_async.store.store", "reem_async.tools.cli.running", "redis")
@@ -157,7 +157,7 @@ Value = Annotated[
     ),
 ]
 Text = Annotated[bool, typer.Option("--str", help="VALUE is text, not JSON; - still reads the input.")]
-Publish = Annotated[bool, typer.Option("--publish", help="Tell subscribers, as a PublishSpace does.")]
+Publish = Annotated[bool, typer.Option("--publish", help="Notify subscribers, as a PublishSpace does.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it is there already.")]
 
 

@@ -53,7 +53,7 @@ def record(
     force: Force = False,
     ships: Ships = None,
     background: Annotated[
-        bool, typer.Option("--background", help="Take only processor time that nobody else wants.")
+        bool, typer.Option("--background", help="Use only idle processor time.")
     ] = False,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
@@ -61,21 +61,17 @@ def record(
 ) -> None:
     """Record what is published, and samples, into an MCAP file.
 
-    Everything that is published under the patterns is recorded, arrays too, bit for bit. What is only stored, by
-    whomever, is recorded a moment later as what it led to, and marked so: several changes in a moment are one.
-    Where the server does not tell of it (a user without the right +client|tracking) it is read at each keyframe.
-    With --sample paths are read as often as you like; with it and no pattern, only the samples are recorded.
-    Ctrl-C ends the recording and completes the file; if it is killed, all but the last second can be read.
+    Everything that is published under the patterns is recorded, arrays too, bit for bit. Plain writes are recorded a
+    moment later and marked as stored; several in a moment may be merged into one. A user without the right
+    +client|tracking gets them at each keyframe. With --sample, paths are read at given periods; without a pattern,
+    only the samples are recorded. Ctrl-C completes the file. If the recorder is killed, all but the last second can
+    be read. Unreadable values are marked in the file and counted. Values of a ship of your own need --ship.
 
-    What cannot be read is marked so in the file and counted; what is beside it is recorded. Values of a ship of your
-    own need that ship: --ship.
+    `recording into run.mcap` on standard error, or the first line of JSON, says that it has begun. The file holds
+    everything that is published from then on. Ctrl-C before that leaves no file; the exit code is 130.
 
-    Once it has begun it says so: `recording into run.mcap` on standard error, or with --json the first line of JSON.
-    What is published from then on is in the file. Ctrl-C before that leaves no file, and exits with 130.
-
-    The programs that are recorded come first. On the server's own machine it is read through its Unix socket,
-    if it has one: that costs it less than TCP. With --background they notice the recorder least, but where
-    they need every processor wholly, updates are missing from the recording; it says how many.
+    The recorder gives way to the programs that it records, and uses the server's Unix socket where there is one.
+    With --background it disturbs them least, but drops and counts updates if they use all processors.
 
     Examples:
         reem record -o run.mcap

@@ -95,9 +95,9 @@ def save(
 ) -> None:
     """Save the keys of REEM to a file, or all of the server with --rdb.
 
-    A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant, and any
-    user who may read the keys can take it. Redis keys that are not REEM's are counted and left alone.
-    Keys and arrays that cannot be read are left out and named, and the exit code is 1.
+    A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant. It only needs the
+    right to read. Redis keys that are not REEM's are counted and left alone. Keys and arrays that cannot be read are
+    left out and named, and the exit code is 1.
 
     Examples:
       reem snapshot save before.zip
@@ -171,7 +171,7 @@ class _Saver:
             while True:
                 try:
                     await self.once(interface, bar=False)
-                except BrokenPipeError:  # nobody reads any more
+                except BrokenPipeError:  # the reader of the output has ended
                     raise
                 except (ReemError, RedisError, OSError) as error:
                     # If the first one fails, the user is still there to mend it; later ones are tried again by
@@ -349,7 +349,7 @@ def _candidates(directory: Path) -> Iterator[Path]:
         try:
             sniff(file)
         except (BadData, OSError):
-            if dated(file) is None:  # somebody else's zip file
+            if dated(file) is None:  # a zip file of another program
                 continue
         yield file
 

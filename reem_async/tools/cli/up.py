@@ -35,13 +35,13 @@ class Stop:
 
     def __init__(self) -> None:
         self._reader, self._writer = os.pipe()
-        # A handler must not block, not even when nobody reads the pipe any more.
+        # A handler must not block, not even when the pipe is full.
         os.set_blocking(self._writer, False)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._handle)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        with suppress(BlockingIOError):  # full: told often enough
+        with suppress(BlockingIOError):  # full, so it is set already
             os.write(self._writer, b"x")
 
     def wait(self, seconds: float) -> bool:

@@ -166,8 +166,8 @@ def set_(
 ) -> None:
     """Store a value.
 
-    The dict that holds it must be there: for foo.bar there must be a foo. Without --publish only
-    those see it who read; with it, subscribers are told.
+    The dict that holds it must be there: for foo.bar there must be a foo. Subscribers are only
+    notified at once with --publish.
 
     Examples:
         reem set speed 0.5
@@ -207,7 +207,7 @@ def delete(
 
     async def work(interface: RedisInterface) -> None:
         place = _place(interface, path, publish)
-        # Only a whole top-level key, and only if somebody can answer: scripts have no terminal.
+        # Only for a whole top-level key, and only on a terminal: a script cannot answer.
         if len(place.full_path) == 1 and not yes and sys.stdin.isatty():
             await _ask(interface, path)
         await place.delete()
@@ -275,8 +275,8 @@ def pub(
 ) -> None:
     """Publish a value, once or at a rate.
 
-    Stores it as `reem set` does, and tells subscribers. At a rate, an update that is late is not
-    made up for. The last line says how many there were, and the rate that was reached.
+    Stores it as `reem set` does, and notifies subscribers. At a rate, late updates are not made up for. The last
+    line shows how many there were, and the rate that was reached.
 
     Examples:
         reem pub set_point '{"speed": 0.5}'
