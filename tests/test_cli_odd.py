@@ -29,7 +29,7 @@ from reem_async.tools.browser.arrays import file_of
 from reem_async.tools.cli import build
 from reem_async.tools.cli.echo import _moment
 from reem_async.tools.cli.output import facts_lines, json_text, typed
-from reem_async.tools.cli.running import Refused
+from reem_async.tools.cli.running import CommandFailed
 from reem_async.tools.cli.up import fail
 from reem_async.tools.cli.values import FILES, parse_value, save
 from reem_async.tools.snapshots import described
@@ -367,7 +367,7 @@ def test_an_update_of_an_odd_time_is_shown(clock):
 def test_values_from_files_that_are_none(tmp_path):
     text, array = tmp_path / "a.json", tmp_path / "a.npy"
     text.write_bytes(b'"\xff"')
-    with pytest.raises(Refused, match="not UTF-8"):
+    with pytest.raises(CommandFailed, match="not UTF-8"):
         parse_value(f"@{text}", is_text=False)
     for head in (
         "(((((",
@@ -377,7 +377,7 @@ def test_values_from_files_that_are_none(tmp_path):
     ):
         line = head.encode() + b"\n"
         array.write_bytes(b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line)
-        with pytest.raises(Refused, match=r"not an \.npy file of"):
+        with pytest.raises(CommandFailed, match=r"not an \.npy file of"):
             parse_value(f"@{array}", is_text=False)
 
 

@@ -18,7 +18,7 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled
-from reem_async.tools.cli.running import USAGE, Refused, interface_to, run_local
+from reem_async.tools.cli.running import USAGE, CommandFailed, interface_to, run_local
 
 if TYPE_CHECKING:
     from reem_async.server.embedded import EmbeddedServer
@@ -70,7 +70,7 @@ def browse(
     def work() -> int | None:
         check_packages(log)
         if log is not None and allow_write:
-            raise Refused("a recording is not changed: leave out --allow-write, or --log", USAGE)
+            raise CommandFailed("a recording is not changed: leave out --allow-write, or --log", USAGE)
         source = _source(url, namespace, log, buffer, memory, named_ships(ships))
         asyncio.run(_serve(source, host, port, allow_write, open_))
         return None
@@ -79,12 +79,12 @@ def browse(
 
 
 def check_packages(log: Path | None) -> None:
-    """Raise Refused if a package that the page needs is not installed."""
+    """Raise CommandFailed if a package that the page needs is not installed."""
     # Looked for before anything is imported, so that all that is missing is named at once.
     needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
     absent = [name for module, name in needed.items() if find_spec(module) is None]
     if absent:
-        raise Refused(f"needs {', '.join(absent)}: pip install 'reem-async[tools]'")
+        raise CommandFailed(f"needs {', '.join(absent)}: pip install 'reem-async[tools]'")
 
 
 def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: int, ships: list[Any]) -> Source:
@@ -251,7 +251,7 @@ async def _show(server_port: int, page_port: int | None, open_: bool, running: l
             open_page(address)
         await page.run_until_stopped()
         if watch.done():
-            raise Refused(f"the program `{watch.result()}` of the robot has ended by itself")
+            raise CommandFailed(f"the program `{watch.result()}` of the robot has ended by itself")
     finally:
         watch.cancel()
         sock.close()

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from reem_async.tools.cli.output import size_text
 
 
-class Status(StrEnum):
+class CheckStatus(StrEnum):
     """How one check went, worst last but for what could not be looked at."""
 
     OK = "ok"
@@ -21,7 +21,7 @@ class Status(StrEnum):
     UNKNOWN = "unknown"
 
 
-OK, WARN, FAIL, UNKNOWN = Status
+OK, WARN, FAIL, UNKNOWN = CheckStatus
 
 # Seconds, of the median. A wired network takes well under a millisecond, a good wireless one 2 to 4.
 _SLOW_READ = 0.005
@@ -48,7 +48,7 @@ class Finding(NamedTuple):
     """
 
     check: str
-    status: Status
+    status: CheckStatus
     message: str
     remedy: str = ""
 

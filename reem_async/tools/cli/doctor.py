@@ -277,7 +277,7 @@ async def _array_reads(server: Transport, keys: Keys) -> Finding:
     key = keys.tag + ".array"
     (stored,) = await server.roundtrip([("SET", key, bytes(_ARRAY_BYTES), "EX", "60")])
     if isinstance(stored, Exception):
-        return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "run it as a user with the right to write")
+        return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "run it as a user that can write")
     try:
         seconds = await _timed(server, ("GET", key), bulk=True)
     finally:

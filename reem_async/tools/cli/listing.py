@@ -12,6 +12,7 @@ from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url, co
 from reem_async.tools.cli.output import (
     clean,
     columns,
+    counted,
     cut,
     emit,
     emit_json,
@@ -212,7 +213,7 @@ def describe(node: Outline, limit: int) -> str:
     if node.plain:
         return cut(json_text(node.value), limit)
     if node.kind == "dict":
-        return _counted(node, "key") if node.children else "{}"
+        return counted(len(node.children), "key") if node.children else "{}"
     if node.kind != "list":
         return cut(clean(node.summary or node.kind), limit)
     if not node.children:
@@ -220,13 +221,8 @@ def describe(node: Outline, limit: int) -> str:
     # The first hundred, cut to the line: a list may have a million items.
     if all(child.plain for child in node.children):
         values = ", ".join([json_text(child.value) for child in node.children[:100]])
-        return cut(f"[{values}]", max(limit - 16, 16)) + f"  {_counted(node, 'item')}"
-    return _counted(node, "item")
-
-
-def _counted(node: Outline, what: str) -> str:
-    count = len(node.children)
-    return f"{count} {what}{'' if count == 1 else 's'}"
+        return cut(f"[{values}]", max(limit - 16, 16)) + f"  {counted(len(node.children), 'item')}"
+    return counted(len(node.children), "item")
 
 
 def as_data(node: Outline) -> Any:

@@ -30,7 +30,7 @@ from reem_async.tools.cli.output import (
     write_over,
 )
 from reem_async.tools.cli.record import tools
-from reem_async.tools.cli.running import USAGE, Refused, run, run_local
+from reem_async.tools.cli.running import USAGE, CommandFailed, run, run_local
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -104,7 +104,7 @@ def play(
 def _pair(text: str) -> tuple[str, str]:
     old, found, new = text.partition("=")
     if not found or not old or not new:
-        raise Refused(f"--remap {text} is not of the form OLD=NEW", USAGE)
+        raise CommandFailed(f"--remap {text} is not of the form OLD=NEW", USAGE)
     return old, new
 
 

@@ -97,6 +97,11 @@ def size_text(size: float) -> str:
     return f"{size:.1f} {_UNITS[-1]}"
 
 
+def counted(number: int, noun: str) -> str:
+    """Return "1 key", "2 keys"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
 def typed(path: Sequence[str | int]) -> str:
     """Return a full path as a user can type it, also where the top-level key has a dot: `["a.b"].c`."""
     return clean("".join(map(_element, path)).removeprefix("."))

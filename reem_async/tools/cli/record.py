@@ -23,7 +23,7 @@ from reem_async.tools.cli.options import (
     named_ships,
 )
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
-from reem_async.tools.cli.running import Refused, guarded, run
+from reem_async.tools.cli.running import CommandFailed, guarded, run
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -52,9 +52,7 @@ def record(
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Force = False,
     ships: Ships = None,
-    background: Annotated[
-        bool, typer.Option("--background", help="Use only idle processor time.")
-    ] = False,
+    background: Annotated[bool, typer.Option("--background", help="Use only idle processor time.")] = False,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -124,7 +122,7 @@ def _stand_back() -> None:
     try:
         stand_back()
     except (AttributeError, OSError) as error:
-        raise Refused(f"this system has nothing like --background ({error}); leave it out") from None
+        raise CommandFailed(f"this system has nothing like --background ({error}); leave it out") from None
 
 
 def _recorder(
@@ -138,7 +136,7 @@ def _recorder(
 ) -> Recorder:
     if output == Path("-"):
         raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
-    # Refused here if the file is there already: nothing was sent for it yet.
+    # CommandFailed here if the file is there already: nothing was sent for it yet.
     recorder: Recorder = tools("Recorder")(
         interface, patterns, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
     )
@@ -146,13 +144,13 @@ def _recorder(
 
 
 def tools(name: str) -> Any:
-    """Return a name of `reem_async.recording`; Refused if what that needs is not installed."""
+    """Return a name of `reem_async.recording`; CommandFailed if what that needs is not installed."""
     try:
         from reem_async.tools import recording
     except ModuleNotFoundError as error:
         if "reem-async[tools]" not in str(error):
             raise
-        raise Refused(str(error)) from None
+        raise CommandFailed(str(error)) from None
     return getattr(recording, name)
 
 

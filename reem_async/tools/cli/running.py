@@ -35,7 +35,7 @@ CALL_SECONDS = 5.0
 """How long a call may take: more than a program's second, since a person may sit behind a slow network."""
 
 
-class Refused(Exception):
+class CommandFailed(Exception):
     """A command cannot be done; the message says why and what to do.
 
     Attributes:
@@ -99,7 +99,7 @@ def guarded(name: str, *, live: bool = False) -> Iterator[None]:
         # The interpreter flushes when it ends: into nothing.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except Refused as error:
+    except CommandFailed as error:
         code = complain(name, str(error), error.code)
     # Before ReemError, whose subclass it is: that nothing is there is an answer, not a failure.
     except (MissingKey, FileNotFoundError) as error:

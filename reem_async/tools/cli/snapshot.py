@@ -19,6 +19,7 @@ from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, 
 from reem_async.tools.cli.output import (
     clean,
     columns,
+    counted,
     emit,
     emit_json,
     is_terminal,
@@ -27,7 +28,7 @@ from reem_async.tools.cli.output import (
     size_text,
     styled,
 )
-from reem_async.tools.cli.running import FAILED, NOTHING, Refused, for_users, guarded, run, run_local
+from reem_async.tools.cli.running import FAILED, NOTHING, CommandFailed, for_users, guarded, run, run_local
 
 if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
@@ -292,7 +293,7 @@ def restore(
         if as_json:
             emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
             return
-        emit(f"{number(len(done.names), 'key')} restored, {size_text(done.size)}")
+        emit(f"{counted(len(done.names), 'key')} restored, {size_text(done.size)}")
         saved = (await describe(file)).namespace
         if saved != namespace:
             note(f"They were saved under the namespace {saved!r} and are now under {namespace!r} (--namespace).")
@@ -314,7 +315,7 @@ for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
 def check_there(path: Path) -> None:
     """Refuse a path at which nothing is."""
     if not path.exists():
-        raise Refused(f"{path}: there is no such file", NOTHING)
+        raise CommandFailed(f"{path}: there is no such file", NOTHING)
 
 
 def listed(path: Path, check: bool, as_json: bool) -> int:
@@ -420,10 +421,5 @@ def _count(it: Snapshot) -> str:
 
 def content(it: Snapshot) -> str:
     """Return how many keys a snapshot has, and its size."""
-    keys = "" if it.count is None else f"{number(it.count, 'key' if it.kind == 'portable' else 'Redis key')}, "
+    keys = "" if it.count is None else f"{counted(it.count, 'key' if it.kind == 'portable' else 'Redis key')}, "
     return f"{keys}{size_text(it.size)}"
-
-
-def number(count: int, noun: str) -> str:
-    """Return "1 key", "2 keys"."""
-    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -17,7 +17,7 @@ import typer
 
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width, write_over
-from reem_async.tools.cli.running import NOTHING, USAGE, Refused, guarded, run
+from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -
             try:
                 return array[path[end:]]
             except IndexError as error:
-                raise Refused(f"{show(path)}: {error}", NOTHING) from None
+                raise CommandFailed(f"{show(path)}: {error}", NOTHING) from None
     raise missing
 
 
@@ -150,7 +150,7 @@ def _check_size(node: Outline) -> None:
 
     size = below_arrays(node)
     if size > _MOST_AS_TEXT:
-        raise Refused(
+        raise CommandFailed(
             f"{typed(node.path)} has {size_text(size)} of arrays, too much to print as JSON; write it to a file: "
             f"reem get '{typed(node.path)}' -o FILE.npz, or .json"
         )
@@ -223,13 +223,13 @@ def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
 
 
 async def _ask(interface: RedisInterface, path: str) -> None:
-    """Ask before a whole key goes; raises MissingKey, and Refused if the answer is no."""
+    """Ask before a whole key goes; raises MissingKey, and CommandFailed if the answer is no."""
     from reem_async.store.catalog import outline
     from reem_async.tools.cli.listing import describe
 
     what = describe(await outline(interface, path), 60)
     if not _agreed(f"Delete {clean(path)} ({what}) at {interface.hostname}?"):
-        raise Refused("nothing was deleted")
+        raise CommandFailed("nothing was deleted")
 
 
 def _agreed(question: str) -> bool:
@@ -334,11 +334,13 @@ def parse_value(text: str, *, is_text: bool) -> Any:
     """Return the value that VALUE stands for: JSON, `@file.json`, `@file.npy`, `-` for the standard input.
 
     Raises:
-        Refused: It is none of these; exit code 2.
+        CommandFailed: It is none of these; exit code 2.
     """
     # Unknown options arrive here as arguments (`takes_minus`), so that -1.5 can be a value: they are refused by hand.
     if text.startswith("-") and text != "-" and not text[1:2].isdigit():
-        raise Refused(f"there is no option {text.partition('=')[0]}; text that begins with - goes in '\"...\"'", USAGE)
+        raise CommandFailed(
+            f"there is no option {text.partition('=')[0]}; text that begins with - goes in '\"...\"'", USAGE
+        )
     if is_text:
         return _read(sys.stdin, "the standard input").removesuffix("\n") if text == "-" else text
     if text == "-":
@@ -352,20 +354,20 @@ def _read(file: IO[str], where: str) -> str:
     try:
         return file.read()
     except UnicodeDecodeError as error:
-        raise Refused(f"{where} is not UTF-8 text: {error}", USAGE) from None
+        raise CommandFailed(f"{where} is not UTF-8 text: {error}", USAGE) from None
 
 
 def _json(text: str, where: str) -> Any:
     def refuse(constant: str) -> NoReturn:
-        raise Refused(f"{where} has {constant}, which is not JSON; arrays in an .npy file may hold it", USAGE)
+        raise CommandFailed(f"{where} has {constant}, which is not JSON; arrays in an .npy file may hold it", USAGE)
 
     try:
         return json.loads(text, parse_constant=refuse)
     except ValueError as error:
         shown = text if len(text) <= 40 else text[:39] + "…"
-        raise Refused(f"{where}, {shown!r}, is not JSON ({error}); for text add --str", USAGE) from None
+        raise CommandFailed(f"{where}, {shown!r}, is not JSON ({error}); for text add --str", USAGE) from None
     except RecursionError:
-        raise Refused(f"{where} is nested too deep", USAGE) from None
+        raise CommandFailed(f"{where} is nested too deep", USAGE) from None
 
 
 def _from_file(path: Path) -> Any:
@@ -373,7 +375,7 @@ def _from_file(path: Path) -> Any:
         with path.open(encoding="utf-8") as file:
             return _json(_read(file, str(path)), str(path))
     if path.suffix != ".npy":
-        raise Refused(f"{path}: @ takes a .json or .npy file", USAGE)
+        raise CommandFailed(f"{path}: @ takes a .json or .npy file", USAGE)
     import numpy as np
 
     try:
@@ -381,7 +383,7 @@ def _from_file(path: Path) -> Any:
     except OSError:
         raise
     except Exception as error:  # anything may come of what stands at the beginning of the file
-        raise Refused(f"{path} is not an .npy file of plain data: {error}") from None
+        raise CommandFailed(f"{path} is not an .npy file of plain data: {error}") from None
 
 
 def preview(value: Any, columns: int) -> str:
@@ -420,7 +422,7 @@ def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
     """Write what was read at `where` to a file, whole or not at all; return what to say of it.
 
     Raises:
-        Refused: A file of this kind cannot hold it, or it cannot be written.
+        CommandFailed: A file of this kind cannot hold it, or it cannot be written.
         FileExistsError: There is a file of that name, and `replace` is False.
     """
     write = FILES[path.suffix]
@@ -435,7 +437,7 @@ def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
     except FileExistsError:
         raise
     except OSError as error:
-        raise Refused(f"{path} cannot be written: {error.strerror or error}") from None
+        raise CommandFailed(f"{path} cannot be written: {error.strerror or error}") from None
     return f"{path}: {said}"
 
 
@@ -454,7 +456,7 @@ def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
     arrays: dict[str, Any] = {}
     others = _collect(value, (), arrays)
     if not arrays:
-        raise Refused(f"{where} holds no array; use a .json file")
+        raise CommandFailed(f"{where} holds no array; use a .json file")
     # Uncompressed, as numpy.savez writes it: arrays hardly shrink.
     with zipfile.ZipFile(file, "w") as archive:  # numpy's own function takes some names for its arguments
         for name, array in arrays.items():
@@ -490,7 +492,7 @@ def _write_png(value: Any, file: IO[bytes], where: str) -> str:
     try:
         from PIL import Image
     except ModuleNotFoundError:
-        raise Refused("png needs pillow: pip install pillow; or use an .npy file") from None
+        raise CommandFailed("png needs pillow: pip install pillow; or use an .npy file") from None
     array = _array(value, where, "png")
     # Pillow takes grey pictures as two axes only.
     if array.ndim == 3 and array.shape[2] == 1:
@@ -500,7 +502,7 @@ def _write_png(value: Any, file: IO[bytes], where: str) -> str:
     grey = array.ndim == 2 and array.dtype in (np.uint8, np.uint16)
     colour = array.ndim == 3 and array.shape[2] in (3, 4) and array.dtype == np.uint8
     if not (grey or colour) or not array.size:
-        raise Refused(
+        raise CommandFailed(
             f"{where} is {array.dtype}[{','.join(map(str, array.shape))}]; png takes uint8 with 1, 3 or 4 channels, "
             "uint16 with one, or bool; use an .npy file"
         )
@@ -510,7 +512,7 @@ def _write_png(value: Any, file: IO[bytes], where: str) -> str:
 
 def _write_bytes(value: Any, file: IO[bytes], where: str) -> str:
     if not isinstance(value, bytes):
-        raise Refused(f"{where} is of type {type(value).__name__}; .bin takes bytes")
+        raise CommandFailed(f"{where} is of type {type(value).__name__}; .bin takes bytes")
     file.write(value)
     return f"{len(value)} bytes"
 
@@ -520,7 +522,7 @@ def _array(value: Any, where: str, kind: str) -> Any:
 
     if isinstance(value, np.ndarray):
         return value
-    raise Refused(
+    raise CommandFailed(
         f"{where} is of type {type(value).__name__}; {kind} takes an array: give its path, or use .npz or .json"
     )
 
