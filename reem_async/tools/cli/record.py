@@ -83,14 +83,22 @@ def record(
         from reem_async.transport.options import look_nearby
 
         # Before the recorder is made: threads that it starts inherit the scheduling.
-        if background:
-            _stand_back()
-        else:
-            come_second()
+        try:
+            if background:
+                stand_back()
+            else:
+                come_second()
+        except (AttributeError, OSError) as error:
+            raise CommandFailed(f"this system has nothing like --background ({error}); leave it out") from None
         # Frames of a megabyte come and go all the time; giving their pages back and asking for new ones costs more.
         keep_memory()
         look_nearby(interface.session.options)
-        recorder = _recorder(interface, wanted, output, sample, keyframe, compression, force)
+        if output == Path("-"):
+            raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
+        # Refused here if the file is there already: nothing was sent for it yet.
+        recorder: Recorder = tools("Recorder")(
+            interface, wanted, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
+        )
         # Whether there is a recording: Ctrl-C before that ends with 130 and leaves no file.
         begun = False
         try:
@@ -116,31 +124,6 @@ def record(
     with guarded("record"):
         own = named_ships(ships)
     run("record", work, url, namespace, ships=own)
-
-
-def _stand_back() -> None:
-    try:
-        stand_back()
-    except (AttributeError, OSError) as error:
-        raise CommandFailed(f"this system has nothing like --background ({error}); leave it out") from None
-
-
-def _recorder(
-    interface: RedisInterface,
-    patterns: list[str],
-    output: Path,
-    sample: Path | None,
-    keyframe: float,
-    compression: str,
-    force: bool,
-) -> Recorder:
-    if output == Path("-"):
-        raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
-    # CommandFailed here if the file is there already: nothing was sent for it yet.
-    recorder: Recorder = tools("Recorder")(
-        interface, patterns, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
-    )
-    return recorder
 
 
 def tools(name: str) -> Any:
