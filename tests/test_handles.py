@@ -338,7 +338,7 @@ def test_an_item_where_no_list_is_is_refused_with_what_is_there(request, kvs, ke
     for name, kind in (("d", "object"), ("s", "string"), ("n", "integer")):
         with pytest.raises(PathRefused, match=rf"\.{name} is of type {kind} and has no element 0"):
             place[name][0] = 1
-    with pytest.raises(PathRefused, match=r"the list index is out of range; use append\(\) to make a list longer$"):
+    with pytest.raises(PathRefused, match=r"the list index is out of range; a list only grows by appending$"):
         place["l"][1] = 1
     assert kvs[key()].read() == {"d": {"x": 1}, "s": "text", "n": 5, "l": [1]}
 
