@@ -185,7 +185,6 @@ def _worst_first(reports: Sequence[Sequence[tuple[str, Finding]]]) -> list[tuple
 
 
 async def _of_server(interface: RedisInterface, server: Transport, *, write: bool) -> AsyncIterator[Finding]:
-    """Yield what is found at one server."""
     from reem_async.errors import NoJsonSupport
 
     session, options = interface.session, server.options

@@ -120,16 +120,7 @@ def _nothing(pattern: str, interface: RedisInterface) -> int:
 
 
 def _drawn(node: Outline, name: str, lead: str, below: str, depth: int | None, most: int | None) -> Iterator[str]:
-    """Yield the lines of a tree.
-
-    Args:
-        node: What is drawn.
-        name: What it is called.
-        lead: What stands before it, and
-        below: what stands before what is below it.
-        depth: How many levels below it are drawn, None for all.
-        most: How many children of one node are drawn, None for all.
-    """
+    """Yield the lines of a tree: `lead` stands before the first one, `below` before those of its children."""
     # A list of plain values is one line, as people write it.
     inline = node.kind == "list" and all(child.plain for child in node.children)
     size = "" if node.plain or not node.size else size_text(node.size)

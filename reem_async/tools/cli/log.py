@@ -109,7 +109,6 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 async def _step(replayer: Replayer, log: Log, as_json: bool) -> None:
-    """Publish one update for each line of the input."""
     while True:
         update = await replayer.step()
         if update is None:
@@ -178,7 +177,6 @@ def _fields(status: ReplayStatus) -> dict[str, float]:
 
 
 def _end(status: ReplayStatus, file: Path, as_json: bool) -> None:
-    """Say what became of it."""
     if as_json:
         emit_json(_fields(status) | {"ended": True})
         return

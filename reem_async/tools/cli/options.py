@@ -63,7 +63,6 @@ async def _top(interface: RedisInterface, incomplete: str) -> list[str]:
 
 
 async def _goes_on(interface: RedisInterface, path: str) -> bool:
-    """Return whether there are keys below a path."""
     from reem_async.errors import ReemError
     from reem_async.store.store import KeyValueStore
 

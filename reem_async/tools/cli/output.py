@@ -28,7 +28,6 @@ def is_terminal() -> bool:
 
 
 def width() -> int:
-    """Return how many characters a line of the terminal has."""
     return shutil.get_terminal_size().columns
 
 
@@ -47,7 +46,6 @@ def clean(text: str) -> str:
 
 
 def cut(text: str, limit: int) -> str:
-    """Return `text`, cut to `limit` characters."""
     return text if len(text) <= limit else text[: max(limit - 1, 0)] + "…"
 
 
@@ -98,7 +96,6 @@ def size_text(size: float) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Return "1 key", "2 keys"."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 

@@ -173,7 +173,6 @@ def _nothing(patterns: list[str], failed: int) -> str:
 
 
 def _end(recorder: Recorder, as_json: bool) -> None:
-    """Say what became of it."""
     status = recorder.status
     write_over("")
     if as_json:

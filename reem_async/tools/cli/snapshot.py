@@ -303,7 +303,6 @@ def restore(
 
 @contextmanager
 def _progress(*, shown: bool) -> Iterator[Callable[[Progress], None] | None]:
-    """Give what draws a bar, if it is to be shown."""
     with progress_bar(after=0.0) as bar:
         yield (lambda progress: bar(progress.doing)(progress.done, progress.total)) if shown else None
 
@@ -420,6 +419,5 @@ def _count(it: Snapshot) -> str:
 
 
 def content(it: Snapshot) -> str:
-    """Return how many keys a snapshot has, and its size."""
     keys = "" if it.count is None else f"{counted(it.count, 'key' if it.kind == 'portable' else 'Redis key')}, "
     return f"{keys}{size_text(it.size)}"

@@ -109,8 +109,6 @@ class Window:
 
 
 class Spread(NamedTuple):
-    """Mean, least, greatest and standard deviation."""
-
     mean: float
     min: float
     max: float
@@ -224,7 +222,6 @@ class Board:
         self._reported: dict[str, int] = {}
 
     def take(self, event: Event, _: Ending | None = None) -> None:
-        """Enter an update."""
         path = event.path[:1] if self.view is ALL else event.path
         shown = typed(path) + " (stored)" * event.stored
         if shown in self.windows or len(self.windows) < _MOST_PATHS:

@@ -45,7 +45,6 @@ class Stop:
             os.write(self._writer, b"x")
 
     def wait(self, seconds: float) -> bool:
-        """Return whether it was set, after so long at most."""
         return bool(select.select([self._reader], [], [], seconds)[0])
 
 
