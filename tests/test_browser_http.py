@@ -20,10 +20,11 @@ from conftest import assert_same, eventually, python
 from PIL import Image
 
 import reem
+from reem_async.plan.trees import walk
 from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import listen
 from reem_async.tools.browser.arrays import file_of
-from reem_async.tools.browser.trees import Leaf, walk
+from reem_async.tools.browser.trees import Leaf
 
 
 @pytest.fixture(scope="module")

@@ -31,8 +31,7 @@ from ...errors import (
     WrongKind,
 )
 from ...plan.paths import Path, show
-from .addresses import address, path_of
-from .source import Node, NotKept, Series, Source, visible
+from .source import Node, NotKept, Series, Source, address, path_of, visible
 
 # Requests: parameters are checked, and errors become answers with the right status.
 

@@ -25,11 +25,10 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ...errors import BadKey, ServerFailed
-from .addresses import path_of
 from .api import Api, Events, answered, at_of
 from .arrays import Arrays, disposition, file_of
 from .pictures import Preview
-from .source import NotKept, Source, visible
+from .source import NotKept, Source, path_of, visible
 
 # Access checks: the Host header, the token, where a request comes from, and what answers carry.
 

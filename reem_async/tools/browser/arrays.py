@@ -21,10 +21,9 @@ from starlette.routing import Route
 from ...errors import BadType, BadValue
 from ...plan.paths import Path, show
 from ..jsontext import json_text
-from .addresses import address
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
 from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
-from .source import NotKept, Sample, Source, shown_text
+from .source import NotKept, Sample, Source, address, shown_text
 from .trees import Leaf, leaf_of
 
 # Tables, lines and histograms: as much of an array as a screen has room for.

@@ -17,7 +17,7 @@ from ...plan import Reply
 from ...plan.notices import note_of
 from ...plan.paths import Path, below
 from ...plan.placeholders import marked
-from ...plan.trees import MISSING, get
+from ...plan.trees import MISSING, changed, get, walk
 from ...pubsub.division import Division, Heard, divided_read
 from ...pubsub.gaps import GapDetector
 from ...pubsub.monitor import ANNOUNCED, Event
@@ -26,7 +26,7 @@ from ..recording.key_reader import fetch
 from .history import History
 from .partial_reads import noted_text
 from .timeline import PENDING
-from .trees import Leaf, changed, framed, identical, leaf_of, tree_of, walk
+from .trees import Leaf, framed, identical, leaf_of, tree_of
 
 _RECENT = 16
 """Updates that are known again if they come twice while something is read."""

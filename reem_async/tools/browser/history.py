@@ -13,10 +13,10 @@ from operator import attrgetter
 from typing import Any
 
 from ...plan.paths import Path, related
-from ...plan.trees import MISSING
+from ...plan.trees import MISSING, walk
 from .source import rate_span
 from .timeline import PENDING, UNKNOWN, BufferedChange, BufferedPast, Kept
-from .trees import Frame, Leaf, same, tree_of, walk, weight
+from .trees import Frame, Leaf, same, tree_of, weight
 
 # One clock for everything in the buffer, which is never set back.
 

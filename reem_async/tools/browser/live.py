@@ -10,17 +10,16 @@ from typing import Any
 from ...connection import RedisInterface
 from ...errors import BadType, ConnectionLost, MissingKey, NotConnected, ServerNotReady
 from ...plan.paths import Path, show
-from ...plan.trees import MISSING
+from ...plan.trees import MISSING, walk
 from ...store.catalog import outline
 from ...store.publish import PublishSpace
 from ...store.reader import DocumentReader
-from .addresses import address, snippets
 from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
-from .source import Node, NotKept, Page, Sample, Series, Status, counted, node_of, numbers_in
+from .source import Node, NotKept, Page, Sample, Series, Status, address, counted, node_of, numbers_in, snippets
 from .timeline import UNKNOWN
-from .trees import Frame, Leaf, differing, thawed, tree_of_outline, walk
+from .trees import Frame, Leaf, differing, thawed, tree_of_outline
 
 _LARGEST = 1 << 28
 """Bytes of arrays up to which a value is read for a page."""

@@ -14,11 +14,22 @@ import numpy as np
 
 from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, show
-from ...plan.trees import MISSING, get
+from ...plan.trees import MISSING, get, walk
 from ..recording.log import Log, open_log
-from .addresses import address
-from .source import Node, Page, Sample, Series, Status, counted, is_small_vector, node_of, numbers_in, rate_span
-from .trees import differing, tree_of_outline, walk
+from .source import (
+    Node,
+    Page,
+    Sample,
+    Series,
+    Status,
+    address,
+    counted,
+    is_small_vector,
+    node_of,
+    numbers_in,
+    rate_span,
+)
+from .trees import differing, tree_of_outline
 
 Result = TypeVar("Result")
 

@@ -15,8 +15,8 @@ from ...plan.keys import Keys
 from ...plan.paths import Path, to_jsonpath
 from ...plan.reads import count_in, entries_command, get_command
 from ...plan.replies import checked, type_name
+from ...plan.trees import is_addressable
 from ...session import Session
-from .addresses import is_addressable
 from .source import Node, node_of, shown_text
 from .trees import tree_of
 

@@ -19,18 +19,17 @@ from ...errors import BadData, RedisError, ReemError
 from ...plan import Reply
 from ...plan.paths import Path, below
 from ...plan.placeholders import Unreadable, marked
-from ...plan.trees import MISSING
+from ...plan.trees import MISSING, is_addressable, walk
 from ...pubsub.division import divided_reads
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
-from .addresses import is_addressable
 from .fetcher import Allowance, Fetcher, Readings, rebased
 from .history import History
 from .partial_reads import noted_texts
 from .timeline import PENDING
-from .trees import Leaf, same, tree_of, walk
+from .trees import Leaf, same, tree_of
 
 # Documents that are asked for in one round trip.
 _BATCH = 100

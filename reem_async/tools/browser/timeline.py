@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 from ...errors import BadData
 from ...plan.past import Past
 from ...plan.paths import Path, related
-from ...plan.trees import MISSING, get
-from .trees import changed, strip, tree_of, weight
+from ...plan.trees import MISSING, changed, get
+from .trees import strip, tree_of, weight
 
 PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
 """In place of a value that was announced, and is not known."""

@@ -13,9 +13,7 @@ import orjson
 from ...errors import BadData
 from ...plan.paths import Path
 from ...plan.placeholders import Unreadable, find, marked
-from ...plan.trees import MISSING, get, mapped
-from ...plan.trees import changed as changed
-from ...plan.trees import walk as walk
+from ...plan.trees import MISSING, get, mapped, walk
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
 from .pictures import preview_of
