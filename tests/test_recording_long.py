@@ -9,8 +9,8 @@ import pytest
 
 from reem_async.tools.recording import open_log
 from reem_async.tools.recording.container import Container
+from reem_async.tools.recording.format import Kind, Role
 from reem_async.tools.recording.layout import to_json
-from reem_async.tools.recording.roles import Kind, Role
 from reem_async.tools.recording.sink import Sink
 
 KEYS, CHUNKS = 20, 400

@@ -12,7 +12,7 @@ from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import default_ships
 from reem_async.tools.recording import Recorder, Replayer, open_log, sink
 from reem_async.tools.recording.export import export
-from reem_async.tools.recording.roles import Kind, Role
+from reem_async.tools.recording.format import Kind, Role
 
 
 class Sweep:

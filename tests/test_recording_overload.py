@@ -13,7 +13,7 @@ import reem_async
 from reem_async.concurrency.queues import BoundedQueue, Last
 from reem_async.plan.paths import parse_pattern
 from reem_async.tools.recording import Recorder, open_log
-from reem_async.tools.recording.roles import Kind, Role
+from reem_async.tools.recording.format import Kind, Role
 from reem_async.tools.recording.sink import Sink
 from reem_async.tools.recording.writer_thread import Operation, WriterThread
 

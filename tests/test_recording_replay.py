@@ -21,8 +21,8 @@ from reem_async.concurrency.queues import Every
 from reem_async.errors import BadInput, BadValue
 from reem_async.tools.recording import Recorder, Replayer, open_log
 from reem_async.tools.recording.export import FORMATS, export
+from reem_async.tools.recording.format import Kind, Role
 from reem_async.tools.recording.layout import encode, to_json
-from reem_async.tools.recording.roles import Kind, Role
 from reem_async.tools.recording.sink import Sink
 
 

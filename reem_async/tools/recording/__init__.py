@@ -12,7 +12,7 @@ Needs the extra `tools`.
 """
 
 try:
-    from .errors import DamagedRecording, RecordingFailed
+    from .format import DamagedRecording, RecordingFailed
     from .log import ArrayHandle, ChannelSummary, Log, LogPath, LogUpdate, open_log
     from .recorder import Recorder, RecorderStatus
     from .replay import Replayer, ReplayStatus

@@ -25,7 +25,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-from .errors import DamagedRecording
+from .format import DamagedRecording
 from .mcap_reader import (
     HEAD,
     MAGIC,

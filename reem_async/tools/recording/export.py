@@ -17,8 +17,8 @@ from ...errors import BadData, BadValue
 from ...plan.paths import Path, suffix
 from ...plan.trees import MISSING
 from ..partfile import PartFile, there_already
+from .format import Kind
 from .log import EXACT, Log, numbers
-from .roles import Kind
 from .stored import Reference, is_inline
 
 # Rows of a group in a Parquet file, and those that are in memory at once.

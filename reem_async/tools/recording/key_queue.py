@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 from ...plan.notices import ANNOUNCED
 from ...pubsub.division import Division, Heard, Phase
 from ...pubsub.gaps import GapDetector, Numbered
+from .format import Role
 from .order import Item, is_replaced, settled, skipped
-from .roles import Role
 
 _RECENT = 16
 """Updates that are known again if they come twice, where there may be thousands of keys."""

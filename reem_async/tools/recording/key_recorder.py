@@ -20,10 +20,10 @@ from ...plan.trees import MISSING
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
+from .format import Kind, Role
 from .key_queue import KeyQueue
 from .key_reader import Fetched, KeyReader
 from .order import Item
-from .roles import Kind, Role
 from .stored import pruned
 from .times import Arrivals, Clock, published
 from .writer_thread import Operation, WriterThread

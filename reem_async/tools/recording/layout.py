@@ -31,7 +31,7 @@ from ...plan.documents import nested_over
 from ...plan.paths import Path, shorten
 from ...ships.numpy import NumpyShip, flat
 from ...ships.registry import Ships
-from .errors import DamagedRecording
+from .format import DamagedRecording
 from .stored import Reference
 
 NOTES = "$ship"

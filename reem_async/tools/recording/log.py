@@ -22,8 +22,8 @@ from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.packing import CommandRecorder
 from .container import Container, Ref, Totals
+from .format import Role
 from .log_reader import RecordedPast, RecordedStream
-from .roles import Role
 from .stored import LOST, Reference, pruned, resolve
 from .times import Instant, nanoseconds, seconds
 

@@ -19,10 +19,9 @@ from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .container import Container, Progress, Ref, Timeline, Totals
-from .errors import DamagedRecording
+from .format import NEWS, DamagedRecording, Kind, Role
 from .layout import decode, from_json
 from .mcap_reader import Numbers
-from .roles import NEWS, Kind, Role
 from .sink import CHANNELS
 from .stored import LOST, Reference, applied, opened
 

@@ -14,7 +14,7 @@ from ...plan.copies import is_own, rest_of
 from ...plan.notices import ANNOUNCED
 from ...plan.paths import Path, below, has_index
 from ...plan.trees import MISSING, get
-from .roles import Role
+from .format import Role
 from .stored import carried
 from .times import AFTER
 

@@ -28,11 +28,10 @@ from ...pubsub.finder import find_regularly
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...session import Session
-from .errors import RecordingFailed
+from .format import RecordingFailed, Role
 from .key_recorder import KeyRecorder
 from .output import FileGone
 from .recorded_keys import RecordedKeys
-from .roles import Role
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import HURRIED, PATIENCE, Arrivals, Clock

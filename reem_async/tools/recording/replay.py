@@ -14,8 +14,8 @@ from ...plan.paths import Path, Pattern, check_top_key, has_index, parse, parse_
 from ...plan.trees import MISSING
 from ...plan.writes import make_parents
 from ...store.publish import PublishSpace
+from .format import Kind
 from .log import Log, LogUpdate
-from .roles import Kind
 from .times import Instant, nanoseconds, seconds
 
 

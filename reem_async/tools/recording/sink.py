@@ -22,11 +22,10 @@ import orjson
 
 from ...errors import BadValue
 from ...plan.paths import Path, show
-from .errors import RecordingFailed
+from .format import Kind, RecordingFailed, Role
 from .layout import EncodedMessage, JsonMessage, schema_bytes, topic_of
 from .mcap_writer import COMPRESSIONS, McapWriter
 from .output import Output
-from .roles import Kind, Role
 
 FORMAT = "1"
 FLUSH_SECONDS = 0.25

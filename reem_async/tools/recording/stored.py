@@ -16,7 +16,7 @@ from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, changed, difference, get, is_addressable, mapped, removed, replaced, same
 from .contents import Content
-from .roles import Kind, Role
+from .format import Kind, Role
 
 LONGEST_INLINE = 64
 """Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""

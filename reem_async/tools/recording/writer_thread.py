@@ -23,8 +23,8 @@ from ...plan.trees import MISSING, CannotApply, get, replaced, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content, Recent
+from .format import Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
-from .roles import Kind, Role
 from .sink import FullError, Sink
 from .stored import LOST, NotWritten, Reference, Unchanged, differing, extract, opened, planted, pruned, without
 

@@ -1,8 +1,21 @@
-"""What a message of a recording says, and where that came from. The texts are in the files: they never change."""
+"""What a message of a recording says and where it came from, and the errors of recordings.
+
+The texts of roles and kinds are in the files: they never change.
+"""
 
 from __future__ import annotations
 
 from enum import StrEnum
+
+from ...errors import BadData, ReemError
+
+
+class RecordingFailed(ReemError):
+    """The file could not be written any further (disk full, ...); what was written until then can be read."""
+
+
+class DamagedRecording(BadData):
+    """The file is not a recording of REEM, or the part asked for was damaged."""
 
 
 class Role(StrEnum):
