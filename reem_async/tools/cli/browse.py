@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 _PACKAGES = {"starlette": "starlette", "uvicorn": "uvicorn", "PIL": "pillow"}
 _MEGABYTE = 1 << 20
 
+_PROGRAMS = ("arm", "camera", "controller")
+_SERVER_PORT, _PAGE_PORT = 6379, 8080
+_END_SECONDS = 5.0
+
 
 def browse(
     url: Url = DEFAULT_URL,
@@ -148,11 +152,6 @@ def _tell(source: Source, address: str, alone: bool, allow_write: bool) -> None:
     who = "programs of this machine" if alone else "every program that has this address: it has a token in it"
     may = "look and write" if allow_write and source.writable else "look"
     facts_lines([("address", address), ("open to", who), ("they may", may), ("to stop", "Ctrl-C")])
-
-
-_PROGRAMS = ("arm", "camera", "controller")
-_SERVER_PORT, _PAGE_PORT = 6379, 8080
-_END_SECONDS = 5.0
 
 
 def demo(

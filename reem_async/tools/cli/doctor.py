@@ -52,6 +52,23 @@ _EXTRAS = {
 }
 _STYLES = {OK: ("✓", "green"), WARN: ("!", "yellow"), FAIL: ("✗", "red"), UNKNOWN: ("?", "cyan")}
 
+_FIRST_NAMESPACE = 0xEFFFFFFC
+"""The inode of a machine's own process numbers (PROC_PID_INIT_INO of <linux/proc_ns.h>): a container has another."""
+_LOOK = """
+import sys
+from reem_async.local.reader import LocalReader
+from reem_async.plan.notices import Slot
+view = LocalReader().view(Slot("", *map(int, sys.argv[1:])), 1)
+sys.exit(0 if view is not None and bytes(view) == b"R" else 3)
+"""
+"""What another process runs to look into the memory of this one."""
+_UNSEEN = 3
+_PATIENCE = 20.0
+"""Seconds for a Python that imports numpy on a slow machine."""
+# What carries the tag of a top-level key: {foo}:ships, {foo}.bar.image.
+_TAGGED = re.compile(r"\{([^{}]*)\}(.*)", re.DOTALL)
+_REGISTRY = ":ships"
+
 
 def doctor(
     no_write: Annotated[
@@ -362,22 +379,6 @@ def _needed(extra: str) -> list[str]:
     return sorted(name for name in names if name != "reem-async")
 
 
-_FIRST_NAMESPACE = 0xEFFFFFFC
-"""The inode of a machine's own process numbers (PROC_PID_INIT_INO of <linux/proc_ns.h>): a container has another."""
-
-_LOOK = """
-import sys
-from reem_async.local.reader import LocalReader
-from reem_async.plan.notices import Slot
-view = LocalReader().view(Slot("", *map(int, sys.argv[1:])), 1)
-sys.exit(0 if view is not None and bytes(view) == b"R" else 3)
-"""
-"""What another process runs to look into the memory of this one."""
-_UNSEEN = 3
-_PATIENCE = 20.0
-"""Seconds for a Python that imports numpy on a slow machine."""
-
-
 async def _sharing(interface: RedisInterface) -> Finding:
     """Find out how large values get from one program of this machine to another; starts one, for a moment."""
     from reem_async.errors import RedisError
@@ -460,11 +461,6 @@ async def _subscribed(interface: RedisInterface) -> tuple[Any, Any]:
     finally:
         await wire.close()
     return usual, near
-
-
-# What carries the tag of a top-level key: {foo}:ships, {foo}.bar.image.
-_TAGGED = re.compile(r"\{([^{}]*)\}(.*)", re.DOTALL)
-_REGISTRY = ":ships"
 
 
 class Orphans(NamedTuple):

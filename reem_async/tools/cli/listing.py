@@ -42,6 +42,8 @@ OnePattern = Annotated[
     ),
 ]
 
+_AT_ONCE = 64  # round trips that are under way together
+
 
 def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_URL, namespace: Namespace = "") -> None:
     """List keys with type and size.
@@ -146,9 +148,6 @@ def _key(node: Outline) -> str:
     """Return the last element of a path as a user would type it."""
     key = node.path[-1]
     return f"[{key}]" if isinstance(key, int) else typed((key,))
-
-
-_AT_ONCE = 64  # round trips that are under way together
 
 
 async def found(interface: RedisInterface, pattern: str) -> AsyncIterator[Outline]:

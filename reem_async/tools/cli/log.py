@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 _NOTICED_LAG = 0.1
 """Seconds behind the pace that are worth a word."""
 
+_STDOUT = Path("-")
+
 
 def play(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")],
@@ -197,7 +199,6 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
-_STDOUT = Path("-")
 
 _File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
 

@@ -25,6 +25,8 @@ from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_use
 LOOK_SECONDS = 0.5
 """Seconds between looks whether the server is still there."""
 
+DEFAULT_PORT = 6379
+
 
 class Stop:
     """Set by Ctrl-C, by SIGTERM, and when the terminal closes.
@@ -90,9 +92,6 @@ def _use(url: str, variable: str | None = None, *, json: bool, data: str) -> lis
         ("asyncio", f"{imports} reem_async {connect}"),
         ("to stop", "Ctrl-C"),
     ]
-
-
-DEFAULT_PORT = 6379
 
 
 def up(

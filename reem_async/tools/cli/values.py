@@ -33,6 +33,11 @@ _MOST_AS_TEXT = 200_000
 _MOST_FOR_PREVIEW = 256_000_000
 """Bytes of an array that is fetched only to show its corners."""
 
+# Hz, with --count and no --rate.
+_RATE = 1.0
+# Seconds between two looks at how far it is.
+_SHOWN_EVERY = 0.5
+
 
 def get(
     path: PathArgument,
@@ -250,12 +255,6 @@ def _agreed(question: str) -> bool:
         return False  # the end of the input is no answer
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-# Hz, with --count and no --rate.
-_RATE = 1.0
-# Seconds between two looks at how far it is.
-_SHOWN_EVERY = 0.5
 
 
 def pub(
