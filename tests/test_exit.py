@@ -61,8 +61,7 @@ ENDS = {  # what runs before the import of REEM, and at the end of the program
     "__del__ of a cycle": ("at_end = AtEnd(cycle=True)", ""),
     "__del__ of a global made last": ("", "at_end = AtEnd()"),
     "__del__ of a cycle made last": ("", "at_end = AtEnd(cycle=True)"),
-    # Made before the interface: Python ends what is left in the order of its making, sockets of connections too.
-    "a generator": ("at_end = generator(); next(at_end)", ""),
+    "a generator": ("", "at_end = generator(); next(at_end)"),
     "a thread that outlives the main one": (
         "", "threading.Thread(target=lambda: (threading.main_thread().join(), last())).start()",
     ),
