@@ -208,11 +208,11 @@ def test_what_is_remembered_of_documents_is_bounded():
     for number in range(25_000):
         document = str(number)
         memory.saw_members(document, frozenset([b"x"]))
-        memory.broke_off(document)
+        memory.saw_interrupted(document)
         memory.saw_layout(document, (), ())
         memory.saw_number(document, (), 1.0)
         memory.saw_number("one", (document,), 1.0)
-    kept = (memory._members, memory._broken_off, memory._layouts, memory._numbers)
+    kept = (memory._members, memory._interrupted, memory._layouts, memory._numbers)
     sizes = [len(each) for each in kept]
     assert max(sizes) <= 10_001
     assert len(memory._numbers["one"]) <= 100
@@ -246,7 +246,7 @@ async def test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks(ainterfa
 def test_after_a_change_that_was_broken_off_an_empty_registry_shows_that_nothing_was_left():
     """So the next changes need not look again."""
     cache = ShapeCache()
-    cache.broke_off("foo")
+    cache.saw_interrupted("foo")
     assert cache.is_unsure("foo")
     cache.saw_members("foo", frozenset())
     assert not cache.is_unsure("foo")

@@ -27,7 +27,6 @@ _LONGEST = 1 << 15
 
 
 def is_array(fields: frozenset[bytes]) -> bool:
-    """Return whether a hash with these fields is an array."""
     return fields >= ARRAY_FIELDS and fields <= ARRAY_FIELDS | _MORE_FIELDS
 
 

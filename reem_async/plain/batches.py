@@ -115,12 +115,12 @@ def framed(commands: Sequence[Command], found: list[Reply]) -> list[Reply]:
     return [*([b"OK"] * body.start), *([b"QUEUED"] * (len(commands) - body.start - 1)), found[body]]
 
 
-def kind_told(begins: Reply) -> bytes:
+def string_type(begins: Reply) -> bytes:
     """Return the reply of TYPE for a string that begins so."""
     return DOCUMENT.encode() if isinstance(begins, bytes) and is_document(begins) else b"string"
 
 
-def text_told(reply: Reply, key: bytes, known: Known, error: MakeError) -> Reply:
+def document_text(reply: Reply, key: bytes, known: Known, error: MakeError) -> Reply:
     """Return the text in a reply to GET, or the module's error if the key holds no document."""
     if isinstance(reply, Exception):
         # GET of a list or a hash; plans know the module's message only.

@@ -18,12 +18,12 @@ from .batches import (
     Watched,
     asks,
     body_of,
+    document_text,
     framed,
     is_json,
     is_whole,
     key_of,
     run,
-    text_told,
 )
 from .documents import TextDocument
 
@@ -107,7 +107,7 @@ class _Look:
                 if key not in self._read:
                     begins = next(answers)
                     text = None if text == b"none" else begins
-            text = text_told(text, key, self._known, self._error)
+            text = document_text(text, key, self._known, self._error)
             found[key] = text if isinstance(text, Exception) else TextDocument(text)
         return found
 
@@ -183,7 +183,6 @@ class _Change:
         self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
 
     def has_conflict(self, replies: Sequence[Reply]) -> bool:
-        """Return whether another client was first."""
         return self._end > 0 and replies[self._end] is None
 
     def answers(self, replies: Sequence[Reply], known: Known) -> list[Reply]:

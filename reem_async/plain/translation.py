@@ -27,14 +27,14 @@ from .batches import (
     Watched,
     asks,
     body_of,
+    document_text,
     framed,
     is_json,
     is_look,
     key_of,
-    kind_told,
     replaces,
     run,
-    text_told,
+    string_type,
 )
 from .changes import after_look
 from .documents import MARK, READS, WRITES, TextDocument, is_document, stored
@@ -64,7 +64,7 @@ def finished(commands: Sequence[Command], replies: list[Reply], known: Known, er
     if type(text) is bytes and first[2] == "$" and is_document(text):
         known.saw(key_of(first), True)
         return [b"".join((b"[", memoryview(text)[1:], b"]"))]
-    text = text_told(text, key_of(first), known, error)
+    text = document_text(text, key_of(first), known, error)
     return [text if isinstance(text, Exception) else run(TextDocument(text), first, error)]
 
 
@@ -175,12 +175,12 @@ class _Answers:
             document = self._document(place)
             return document if isinstance(document, Exception) else run(document, command, self._error)
         if command[0] == "TYPE" and is_look(command) and reply == b"string":
-            return kind_told(self._replies[place + (2 if self._asking else 1)])
+            return string_type(self._replies[place + (2 if self._asking else 1)])
         return reply
 
     def text(self, place: int) -> Reply:
         """Return the text in the reply to the GET at `place`, or an error."""
-        return text_told(self._replies[place], key_of(self._sent[place]), self._known, self._error)
+        return document_text(self._replies[place], key_of(self._sent[place]), self._known, self._error)
 
     def _document(self, place: int) -> TextDocument | Exception:
         if place not in self._documents:
@@ -212,5 +212,5 @@ def _only_documents(commands: Sequence[Command], found: list[Reply]) -> Generato
         names = [name for name in names if b"{" not in name]
         if names:
             begins = yield [("GETRANGE", name, "0", "0") for name in names]
-            names = [name for name, each in zip(names, begins, strict=True) if kind_told(each) != b"string"]
+            names = [name for name, each in zip(names, begins, strict=True) if string_type(each) != b"string"]
         found[place] = [cursor, names]

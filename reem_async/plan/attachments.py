@@ -197,7 +197,6 @@ class ChangeOutcome:
         return members
 
     def _judged(self) -> Any:
-        """Return the result, REFUSED, or the error to raise."""
         reply = self.replies[self.main]
         if isinstance(reply, Exception):
             error = explained(reply, self.it.keys, self.it.path)
@@ -220,8 +219,7 @@ class ChangeOutcome:
         return self._finish(judged)
 
     def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
-        """Return whether a key may exist that the document does not refer to."""
-        if members and self.cache.was_broken_off(self.it.keys.document):
+        if members and self.cache.pop_interrupted(self.it.keys.document):
             return True
         if judged is REFUSED or isinstance(judged, Exception):
             # A deletion of nothing may have found leftovers of an interrupted call.

@@ -319,7 +319,6 @@ def spelled_out(rest: Path) -> Path:
 
 
 def escaped(text: str) -> str:
-    """Return the server's glob pattern for exactly `text`."""
     return _SPECIAL.sub(r"\\\1", text)
 
 
@@ -345,7 +344,6 @@ def _compiled(glob: bytes) -> re.Pattern[bytes]:
 
 
 def name_of(channel: bytes, namespace: str) -> str:
-    """Return the top-level key whose notices come on `channel`."""
     return channel.decode(errors="replace").rpartition(_TAIL)[0][1 + len(namespace) :]
 
 

@@ -26,7 +26,7 @@ class ShapeCache:
 
     def __init__(self) -> None:
         self._members: dict[str, frozenset[bytes]] = {}
-        self._broken_off: set[str] = set()
+        self._interrupted: set[str] = set()
         self._layouts: dict[tuple[str, Path], tuple[Placeholder, ...]] = {}
         self._numbers: dict[str, dict[Path, float]] = {}
         self._looked: dict[str, bool] = {}
@@ -48,7 +48,7 @@ class ShapeCache:
 
     def is_unsure(self, document: str) -> bool:
         """Return whether a change was interrupted, so that there may be unknown attachments."""
-        return document in self._broken_off
+        return document in self._interrupted
 
     def saw_members(self, document: str, members: frozenset[bytes]) -> None:
         # The first reply shows that the user has the right, see `writes._is_tried`.
@@ -58,7 +58,7 @@ class ShapeCache:
         if members or document in self._members:
             _put(self._members, document, members)
         if not members:  # so nothing was left
-            self._broken_off.discard(document)
+            self._interrupted.discard(document)
 
     def may_look(self, document: str) -> bool:
         return document in self._looked
@@ -66,18 +66,18 @@ class ShapeCache:
     def may_not_look(self, document: str) -> None:
         self._looked.pop(document, None)
 
-    def broke_off(self, document: str) -> None:
+    def saw_interrupted(self, document: str) -> None:
         """Note that a change was interrupted: it may have left attachments that nothing refers to."""
         self.forget_numbers(document)
-        if len(self._broken_off) >= _MOST:
-            self._broken_off.clear()
-        self._broken_off.add(document)
+        if len(self._interrupted) >= _MOST:
+            self._interrupted.clear()
+        self._interrupted.add(document)
 
-    def was_broken_off(self, document: str) -> bool:
+    def pop_interrupted(self, document: str) -> bool:
         """Return whether a change was interrupted since the last call of this."""
-        if document not in self._broken_off:
+        if document not in self._interrupted:
             return False
-        self._broken_off.discard(document)
+        self._interrupted.discard(document)
         return True
 
     def layout(self, document: str, path: Path) -> tuple[Placeholder, ...]:

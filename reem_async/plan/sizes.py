@@ -53,7 +53,6 @@ def _size(word: Any) -> int:
 
 
 def sizes_of(commands: Iterable[Command]) -> list[int]:
-    """Return the bytes of each argument that is not a str."""
     return [_size(word) for command in commands for word in command if type(word) is not str]
 
 

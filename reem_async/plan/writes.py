@@ -252,7 +252,6 @@ def _stale(it: DocumentChange, known: frozenset[bytes]) -> list[bytes]:
 
 
 def _clearing(it: DocumentChange, stale: list[bytes]) -> list[Command]:
-    """Return the commands that remove old attachments."""
     tag = it.keys.tag.encode()
     # New ones are unlinked first: SET would fail in the transaction if a foreign type had that name.
     gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.attachments]

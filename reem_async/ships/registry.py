@@ -152,7 +152,6 @@ class Ships:
             raise self.lacks(label, where) from None
 
     def lacks(self, label: str, where: str) -> BadData:
-        """Return the error for a missing ship."""
         known = ", ".join(self._by_label) or "none"
         return BadData(
             f"{where} was written by the ship {label!r}, which this interface lacks (it has: {known}); "

@@ -278,7 +278,7 @@ class DocumentWriter:
             except BaseException as error:
                 # Cancelled, interrupted, or without a reply: it is unknown what was applied. A later change cleans up.
                 if _may_have_left(error):
-                    session.cache.broke_off(document)
+                    session.cache.saw_interrupted(document)
                 else:
                     session.cache.forget_numbers(document)
                 # The message says all; REEM's own frames would only hide the caller's line.

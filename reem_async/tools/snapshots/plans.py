@@ -147,7 +147,6 @@ def _commands(command: str) -> Callable[[str, Sequence[Any]], list[Command]]:
 
 
 def _scored(reply: Reply) -> list[Any]:
-    """Return member, score, member, score."""
     return [each for member, score in reply for each in (member, repr(float(score)).encode())]
 
 
@@ -214,7 +213,6 @@ def lifetimes(names: Sequence[str]) -> Plan:
 
 
 def shown(key: bytes, kind: str) -> str:
-    """Return how a foreign key is named."""
     return f"{key.decode(errors='backslashreplace')} ({kind})"
 
 

@@ -240,7 +240,6 @@ async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) 
 
 
 async def _put(session: Session, archive: Archive, name: str, keys: Keys, done: list[str], *, replace: bool) -> int:
-    """Write one key to the server; return its bytes."""
     size = 0
 
     def notices() -> list[Command]:

@@ -83,7 +83,6 @@ async def _asked(interface: RedisInterface, *command: str) -> Any:
 
 
 async def _place(interface: RedisInterface) -> Path:
-    """Return where the server keeps its file, as the server sees it."""
     words = []
     for option in ("dir", "dbfilename"):
         reply = await _asked(interface, "CONFIG", "GET", option)
