@@ -195,10 +195,10 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
     assert (run.returncode, run.stdout, said.count("\n")) == (1, "", 1)
     assert said.startswith("reem ls: no server answers at 127.0.0.1:1")
     assert "reem up" in said
-    assert "--url redis://host:port or REEM_URL" in said
+    assert "--url or REEM_URL" in said
     assert "hidden" not in said
     said = cli.error(1, "ls", "--url", cli.url.replace("//", "//nobody:hidden-4711@"))
-    assert "does not take this user name and password" in said
+    assert "refused this user name and password" in said
     assert "hidden" not in said
 
 
@@ -209,7 +209,7 @@ def test_the_password_may_be_in_a_variable_of_its_own():
         cli = CommandLine(f"redis://127.0.0.1:{server.port}", "")
         assert "needs a password" in cli.error(1, "ls")
         for wrong in ("wrong-0815", "wrong 0815"):
-            assert "does not take this user name and password" in cli.error(1, "ls", REEM_PASSWORD=wrong)
+            assert "refused this user name and password" in cli.error(1, "ls", REEM_PASSWORD=wrong)
         cli.result("set", "speed", "0.5", REEM_PASSWORD="known-4711")
         assert cli.result("get", "speed", REEM_PASSWORD="known-4711") == "0.5\n"
         assert cli.process("doctor", REEM_PASSWORD="known-4711").returncode == 0
@@ -222,9 +222,8 @@ def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
     cli.url = "redis://robot.invalid:6379"
     warning, error = cli.process("ls", PYTHONWARNINGS="").stderr.splitlines()
     assert warning.startswith("reem ls: warning: the connection to robot.invalid:6379 is not encrypted")
-    silent = warning.rpartition("silence this: ")[2]
-    assert silent.startswith("PYTHONWARNINGS=")
-    assert cli.process("ls", PYTHONWARNINGS=silent.partition("=")[2]).stderr.splitlines() == [error]
+    silent = warning.rpartition("silence this: ")[2].rpartition("PYTHONWARNINGS=")[2]
+    assert cli.process("ls", PYTHONWARNINGS=silent).stderr.splitlines() == [error]
 
 
 @pytest.mark.long

@@ -148,9 +148,9 @@ def locked():
     ("options", "words"),
     [
         ({}, ["needs a password", "password="]),
-        ({"password": "wr0ng"}, ["does not take"]),
-        ({"username": "nobody", "password": "wr0ng"}, ["does not take"]),
-        ({"username": "guest", "password": "wr0ng"}, ["does not take"]),
+        ({"password": "wr0ng"}, ["refused"]),
+        ({"username": "nobody", "password": "wr0ng"}, ["refused"]),
+        ({"username": "guest", "password": "wr0ng"}, ["refused"]),
         ({"username": "default"}, ["password"]),
     ],
 )

@@ -148,7 +148,7 @@ class Options:
         message = (
             f"the connection to {self.address} {danger}; use {remedy} (SECURITY.md says how), or, on a network that "
             "is the robot's own, silence this: "
-            "warnings.filterwarnings('ignore', category=reem.InsecureConnection) or PYTHONWARNINGS=ignore::UserWarning"
+            "warnings.filterwarnings('ignore', category=reem.InsecureConnection), or PYTHONWARNINGS=ignore::UserWarning"
         )
         if message not in _said:
             _said.add(message)
@@ -224,7 +224,8 @@ class Options:
             )
         return NotConnected(
             f"no server answers at {self.address} ({_shown(reason, text)}); start one with `reem up` or with "
-            f"compose.yaml, or give the right address, such as redis://host:port{self._hint(reason)}"
+            f"compose.yaml, or give the right address: redis://host:port (on the command line by "
+            f"--url or REEM_URL){self._hint(reason)}"
         )
 
     def unanswered(self, error: ConnectionLost) -> NotConnected:

@@ -53,7 +53,7 @@ COMMANDS = (
         "Start a simulated robot and show it on a page in the web browser, until Ctrl-C.",
     ),
     Entry("doctor", "doctor", "doctor", SERVER, "Check server, connection and installation, and say what to do."),
-    Entry("migrate", "legacy.command", "migrate", SERVER, "Convert what REEM 0.1 or older has stored, in place."),
+    Entry("migrate", "legacy.command", "migrate", SERVER, "Convert data of REEM 0.1 or older, in place."),
     Entry("ls", "listing", "ls", LOOK, "List keys with type and size."),
     Entry("tree", "listing", "tree", LOOK, "Show what is below keys; arrays are not fetched."),
     Entry("get", "values", "get", LOOK, "Print a value, or write it to a file."),
