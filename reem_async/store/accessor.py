@@ -409,7 +409,7 @@ class Accessor(Handle):
                 print(update.path, update.value, update.data)
 
         An update holds `path` (what changed, such as "arm.joint"), `value` (what was written there), `data` (all that
-        is here now), `time`, `origin` ("published" or "stored"), `deleted`, `initial` (the value that was here
+        is here now), `time`, `origin` ("published", "stored" or "found"), `deleted`, `initial` (the value that was here
         already), and `gap` and `missed` (updates before it were lost).
 
         Published updates arrive one by one. Plain writes (by a KeyValueStore, another language, redis-cli, an expiry,
