@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from reem_async.connection import RedisInterface
 
 
-# Scripts depend on these numbers: the same in every command, listed in the README.
+# Scripts depend on these numbers: the same in every command, listed in docs/reference/environment.md.
 FAILED, USAGE, NOTHING, TIMED_OUT, INTERRUPTED = 1, 2, 3, 4, 130
 
 PASSWORD_VARIABLE = "REEM_PASSWORD"  # noqa: S105 - the name of a variable
