@@ -274,6 +274,33 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
     assert noticed > 40
 
 
+@pytest.mark.parametrize("cut", [0, 150])
+def test_a_flipped_bit_in_the_head_of_any_record_is_counted_if_it_costs_something(names, file_and_values, tmp_path, cut):
+    """Also one that makes another kind of record of it, which may hide what follows."""
+    data, damaged = file_and_values[0].read_bytes(), tmp_path / "damaged.mcap"
+    heads, place, rng = [], 8, random.Random(3)
+    while place < len(data) - 8:
+        heads.append(place)
+        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
+
+    def state():
+        with open_log(damaged) as log:
+            found = [[(each.path, str(each.value)) for each in log.updates(patterns=[name])] for name in log.names()]
+            return found, log.damaged + log.unreadable
+
+    damaged.write_bytes(data)
+    whole, _ = state()
+    flips = [(head + byte, 1 << bit) for head in heads for byte in (0, 1, 2) for bit in range(8)]
+    for place, flip in rng.sample(flips, min(sized(60, 400), len(flips))):
+        broken = bytearray(data[: len(data) - cut])
+        if place < len(broken) - 8:
+            broken[place] ^= flip
+            damaged.write_bytes(broken)
+            with contextlib.suppress(DamagedRecording):
+                found, count = state()
+                assert found == whole or count, (place, flip)
+
+
 def mutated(data, rng):
     """A file with a few things done to it."""
     broken = bytearray(data)

@@ -255,7 +255,7 @@ def test_what_a_full_disk_keeps_from_beginning_is_not_there(binterface, file):
 
 
 @pytest.mark.parametrize(
-    ("module", "part"), [(recorder, "Monitor"), (recorder, "Sampler"), (recorder, "RecordedKeys"), (sink, "Writer")]
+    ("module", "part"), [(recorder, "Monitor"), (recorder, "Sampler"), (recorder, "RecordedKeys"), (sink, "McapWriter")]
 )
 def test_whatever_keeps_a_recorder_from_being_made_leaves_no_file(binterface, file, monkeypatch, module, part):
     monkeypatch.setattr(module, part, lambda *_, **__: 1 / 0)

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.stream_reader import get_chunk_data_stream
@@ -29,6 +28,7 @@ from .format import DamagedRecording
 from .mcap_reader import (
     HEAD,
     MAGIC,
+    MALFORMED,
     ChunkInfo,
     Contents,
     Footer,
@@ -55,8 +55,8 @@ _BARE_BYTES = 1 << 20
 _MESSAGE = struct.Struct("<BQHIQQ")
 # Head of the record, checksum of all before it.
 _DATA_END = struct.Struct("<BQI")
-# What the library raises over bytes that are no record.
-_MALFORMED = (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError)
+# What other records of these kinds would hide: all that follows.
+_END_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
 Progress = Callable[[int, int], None]
 """Called with how much of something is done, and how much there is."""
@@ -117,7 +117,7 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
                 if known.setdefault(record.id, record) != record:
                     return None
             position = end
-    except _MALFORMED:
+    except MALFORMED:
         return None
     return index_of(channels, times, offsets)
 
@@ -146,6 +146,8 @@ class _Scan:
             # What follows a damaged head could be anything.
             if opcode == 0 or end > self._size or (opcode == Opcode.CHUNK and length < _SMALLEST_CHUNK):
                 break
+            if length != _END_LENGTHS.get(opcode, length):
+                break
             is_bare = opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
             if not is_bare or position - bare >= _BARE_BYTES:
                 self._take_bare(bare, position)
@@ -158,6 +160,8 @@ class _Scan:
                 end = self._take_chunk(position, end)
             elif opcode == Opcode.METADATA:
                 self._take_metadata(position + HEAD.size, end)
+            elif opcode == Opcode.MESSAGE_INDEX:  # its chunk is not one any more
+                self.damaged += 1
             position, bare = end, bare if is_bare else end
             if progress is not None:
                 progress(position, self._size)
@@ -194,10 +198,11 @@ class _Scan:
                 break
             index += HEAD.size + length
         info = ChunkInfo(0, start, last, position, end - position, end, index - end, np.empty(0, np.uint16))
-        # Where the file ends there, a part of the index may be missing.
-        is_whole = index + HEAD.size <= self._size and opcode != Opcode.MESSAGE_INDEX
+        # A part of the index may be missing where the file ends there, or a record follows that MCAP does not know.
+        is_whole = index + HEAD.size <= self._size and opcode <= Opcode.DATA_END and opcode != Opcode.MESSAGE_INDEX
         text = self._source.read(end, index - end)
         found = parse_index(text, record_starts(text), start, last) if is_whole else None
+        self.damaged += is_whole and bool(text) and found is None
         known = found is not None and found.span() == (start, last)
         if found is not None and known and self.contents.channels.keys() >= set(found.channels.tolist()):
             self._add(info, found)
@@ -209,7 +214,7 @@ class _Scan:
         try:
             record = Metadata.read(ReadDataStream(io.BytesIO(self._source.read(start, end - start))))
             self.contents.metadata[start] = record
-        except _MALFORMED:
+        except MALFORMED:
             self.damaged += 1
 
 
@@ -265,10 +270,11 @@ class Container:
         self.indexed = footer is not None
         try:
             contents, is_complete = (Contents(), False) if footer is None else read_summary(self._source, footer)
-        except _MALFORMED:
+        except MALFORMED:
             contents, is_complete, self.damaged = Contents(), False, 1
         self._messages = contents.messages  # as the writer has counted them
         if is_complete:
+            self.damaged = contents.damaged
             return contents
         scan = _Scan(self._source)
         scan.run(footer, progress)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, MetadataIndex, Schema, Statistics
 
@@ -26,6 +27,8 @@ Numbers = np.ndarray[Any, Any]
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 """The head of each record: opcode, length of what follows."""
+MALFORMED = (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError)
+"""What the library raises over bytes that are no record."""
 # Where the summary and its offsets begin (8 bytes each), and a CRC-32.
 _FOOTER = HEAD.size + 20
 _FOOTER_HEAD = HEAD.pack(Opcode.FOOTER, 20)
@@ -164,6 +167,8 @@ class Contents:
 
     Attributes:
         messages: How many there are by the statistics of the summary; None if there are none.
+        ends: Where each metadata record ends that the summary lists.
+        damaged: How many records outside of chunks cannot be read, although the summary lists what follows them.
     """
 
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -171,6 +176,8 @@ class Contents:
     chunks: list[ChunkInfo] = field(default_factory=list)
     metadata: dict[int, Metadata] = field(default_factory=dict)
     messages: int | None = None
+    ends: dict[int, int] = field(default_factory=dict)
+    damaged: int = 0
 
     def unknown(self) -> int:
         """Return how many channels with messages, or their schemas, the file does not describe."""
@@ -252,8 +259,7 @@ def _parsed(source: Source, data_end: int, text: bytes) -> Contents:
         elif opcode == Opcode.STATISTICS:
             contents.messages = Statistics.read(stream).message_count
         elif opcode == Opcode.METADATA_INDEX:
-            it = MetadataIndex.read(stream)
-            contents.metadata[it.offset] = _metadata(source, it.offset, it.length)
+            _take_metadata(source, MetadataIndex.read(stream), contents)
     return contents
 
 
@@ -267,18 +273,24 @@ def _chunk(text: bytes, body: int, end: int, start: int) -> ChunkInfo:
     return ChunkInfo(0, first, last, offset, length, offset + length, index_length, channels, start + places)
 
 
-def _metadata(source: Source, offset: int, length: int) -> Metadata:
-    if offset + length > source.size or length < HEAD.size:
+def _take_metadata(source: Source, place: MetadataIndex, contents: Contents) -> None:
+    if place.offset + place.length > source.size or place.length < HEAD.size:
         raise ValueError("a metadata record goes beyond the file")
-    text = source.read(offset + HEAD.size, length - HEAD.size)
-    record: Metadata = Metadata.read(ReadDataStream(io.BytesIO(text)))
-    return record
+    text = source.read(place.offset, place.length)
+    contents.ends[place.offset] = place.offset + place.length
+    try:
+        if HEAD.unpack_from(text) != (Opcode.METADATA, place.length - HEAD.size):
+            raise ValueError("not the metadata record that the summary lists")
+        contents.metadata[place.offset] = Metadata.read(ReadDataStream(io.BytesIO(text[HEAD.size :])))
+    except MALFORMED:
+        contents.damaged += 1
 
 
 def _lists_all(source: Source, data_end: int, contents: Contents) -> bool:
     """Return whether the summary lists all that the reader needs of the data section; ValueError if it lists more."""
     position, listed, is_all = len(MAGIC), 0, True
-    ends = {it.offset: it.index + it.index_length for it in contents.chunks}
+    ends = {it.offset: it.index + it.index_length for it in contents.chunks} | contents.ends
+    first = min(ends, default=data_end)
     while position < data_end:
         end = ends.get(position, 0)
         if end <= position:
@@ -286,10 +298,14 @@ def _lists_all(source: Source, data_end: int, contents: Contents) -> bool:
                 raise ValueError("the data section ends within a record")
             opcode, length = HEAD.unpack(source.peek(position, HEAD.size))
             end = position + HEAD.size + length
-            is_all = is_all and (opcode not in _LISTED or position in contents.metadata)
-        listed += position in ends or position in contents.metadata
+            if position == len(MAGIC) and (opcode != Opcode.HEADER or end > first):
+                # The header is damaged. The reader needs nothing of it.
+                end, contents.damaged = first, contents.damaged + 1
+            else:
+                is_all = is_all and opcode not in _LISTED
+        listed += position in ends
         position = end
-    if position != data_end or listed != len(contents.chunks) + len(contents.metadata):
+    if position != data_end or listed != len(ends):
         raise ValueError("the summary lists what the file does not have")
     return is_all
 
