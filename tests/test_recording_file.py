@@ -275,7 +275,9 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
 
 
 @pytest.mark.parametrize("cut", [0, 150])
-def test_a_flipped_bit_in_the_head_of_any_record_is_counted_if_it_costs_something(names, file_and_values, tmp_path, cut):
+def test_a_flipped_bit_in_the_head_of_any_record_is_counted_if_it_costs_something(
+    names, file_and_values, tmp_path, cut
+):
     """Also one that makes another kind of record of it, which may hide what follows."""
     data, damaged = file_and_values[0].read_bytes(), tmp_path / "damaged.mcap"
     heads, place, rng = [], 8, random.Random(3)
