@@ -126,6 +126,8 @@ def beside(name: str, url: str, folder: str) -> Iterator[None]:
         text=True,
     )
     try:
+        if is_recording:
+            process.stdout.readline()  # it has begun, and ends properly at Ctrl-C
         yield
     finally:
         process.send_signal(signal.SIGINT if is_recording else signal.SIGKILL)
