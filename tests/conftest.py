@@ -137,6 +137,7 @@ WITH_MODULE = {
     "test_nobody_gets_in_without_a_password": "the same",
     "test_whole_arms_send_what_they_should": "sends commands of the module by sockets of its own",
     "test_outline_tells_what_is_there_without_fetching_arrays": "counts GET",
+    "test_a_write_that_loses_the_server_before_its_last_step_says_so": "without it there is no such step",
     "test_the_servers_own_text_would_not_do": "shows how the module reads numbers",
     "test_what_a_user_may_not_do_is_named": "takes away rights to the module's commands",
     "test_a_client_that_may_not_read_the_document_removes_no_array_of_it": "may ask for the type of a document alone",
