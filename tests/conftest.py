@@ -113,6 +113,7 @@ def server_url(request):
 
 
 ONE_SERVER = {
+    "test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks": "in a cluster it takes a second",
     "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",
     "test_all_subscribers_of_an_interface_share_one_connection": "counts connections: in a cluster, one for each node",
     "test_connections_of_redis_py_have_the_attributes": "takes the URL of one server apart",
