@@ -428,6 +428,7 @@ def test_the_last_line(capsys):
 def test_echo_of_what_is_not_there_yet_says_so(cli, space, listening):
     with listening("echo", "later", "robot.*", topics=2) as process:
         assert process.stderr.readline() == "nothing is stored at later yet: waiting for it\n"
+        assert process.stderr.readline() == "nothing is stored at robot.* yet: waiting for it\n"
         space["later"] = {"frame": 1, "rgb": np.zeros((100, 100, 3), np.uint8)}
         what = process.stdout.readline().rstrip("\n").split("  ")[2]
         assert what == '<{"frame":1,"rgb":"<uint8[100,100,3], 30.0 kB>"}, 30.2 kB, not fetched>'

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import aclosing, suppress
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from reem_async.tools.cli.following import Ending, follow
+from reem_async.tools.cli.listing import found
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
 from reem_async.tools.cli.output import (
     clean,
@@ -118,15 +119,16 @@ async def _kind(interface: RedisInterface, path: Path) -> str:
 async def _say_what_is_waited_for(interface: RedisInterface, patterns: Sequence[str]) -> None:
     """Say which of the paths are not there yet: nothing is printed until they are written."""
     from reem_async.errors import MissingKey, RedisError, ReemError
-    from reem_async.store.catalog import outline
 
     for path in patterns:
-        if not any(mark in path for mark in "*?"):
-            with suppress(ReemError, RedisError):
-                try:
-                    await outline(interface, path)
-                except MissingKey:
-                    note(f"nothing is stored at {path} yet: waiting for it")
+        with suppress(ReemError, RedisError):
+            try:
+                async with aclosing(found(interface, path)) as places:
+                    is_there = await anext(places, None) is not None
+            except MissingKey:
+                is_there = False
+            if not is_there:
+                note(f"nothing is stored at {path} yet: waiting for it")
 
 
 def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:

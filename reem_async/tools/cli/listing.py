@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncGenerator, Iterator
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -150,7 +150,7 @@ def _key(node: Outline) -> str:
     return f"[{key}]" if isinstance(key, int) else typed((key,))
 
 
-async def found(interface: RedisInterface, pattern: str) -> AsyncIterator[Outline]:
+async def found(interface: RedisInterface, pattern: str) -> AsyncGenerator[Outline, None]:
     """Yield the outlines of all that a pattern names, by name. One round trip for each top-level key.
 
     Raises:
