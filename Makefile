@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
 
-test: $(VENV)/ready  ## the fast run, five minutes: every promise, on an embedded real server
+test: $(VENV)/ready  ## the fast run, about six minutes: every promise, on an embedded real server
 	$(BIN)/python -m pytest -q $(TOGETHER)
 
 test-all: $(VENV)/ready  ## the long run: every test at full size, then those that measure time, alone, and all variants
