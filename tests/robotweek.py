@@ -96,7 +96,8 @@ class Program:
         found = [line for line in said.splitlines() if any(words in line for words in COMPLAINTS[:3] + COMPLAINTS[4:])]
         for block in said.split("Traceback (most recent call last):\n")[1:]:
             last = next((line for line in block.splitlines() if re.match(r"[\w.]+: |[\w.]+$", line)), "")
-            if not last.startswith(("reem_async.", "reem.", "KeyboardInterrupt", "ImportError")):
+            imports = "\nDuring handling of" in block and block.count('File "') == block.count('"<frozen importlib')
+            if not imports and not last.startswith(("reem_async.", "reem.", "KeyboardInterrupt", "ImportError")):
                 found.append(f"{last} in\n{block[:2000]}")
         if found:
             raise Wrong(f"the {self.name} said: {found[0]}")
