@@ -25,8 +25,6 @@ try:
 except ImportError:
     uvloop = None  # type: ignore[assignment]
 
-__all__ = ["LastPortal", "Portal", "Threads", "finish"]
-
 Result = TypeVar("Result")
 
 _LONGEST_LAST = 2.0

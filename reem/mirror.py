@@ -19,8 +19,6 @@ from .subscribe import Following
 if TYPE_CHECKING:
     from .connection import RedisInterface
 
-__all__ = ["Mirror"]
-
 
 @documented_by(core.Mirror)
 class Mirror(Following):

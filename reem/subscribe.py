@@ -19,8 +19,6 @@ from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 from ._twin import documented_by
 from .connection import RedisInterface
 
-__all__ = ["CallbackSubscriber", "PatternWatch", "SilentSubscriber", "Watch"]
-
 
 class Following:
     """What begins to follow in `listen` and ends in `close`; `with` calls both."""

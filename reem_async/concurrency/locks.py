@@ -9,8 +9,6 @@ import weakref
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-__all__ = ["Locks", "ProcessLock", "ThreadLock"]
-
 Lock = TypeVar("Lock", bound=Any)
 
 # Keys whose locks are kept though they are not in use; making one costs a microsecond.

@@ -13,8 +13,6 @@ from ..errors import QueueFull
 from ..plan.arguments import check_instance, whole
 from .wakeup import Wakeups, wakeups
 
-__all__ = ["EMPTY", "BoundedQueue", "Ended", "Every", "Last", "Newest", "PlaceQueue", "Policy", "chosen", "noop"]
-
 
 class Policy:
     """How many updates wait at most, and what happens to the next one. Use one of the subclasses.

@@ -14,8 +14,6 @@ import struct
 import sys
 import time
 
-__all__ = ["come_second", "give_way", "keep_memory", "stand_back", "take_short_turns"]
-
 # Niceness: added to that of a program which comes second, and the highest there is.
 _NICER, _NICEST = 5, 19
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3

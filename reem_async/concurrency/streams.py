@@ -11,8 +11,6 @@ from typing import Generic, Self, TypeVar
 from ..errors import BadType
 from .queues import EMPTY, BoundedQueue, Ended, Policy, noop
 
-__all__ = ["Following", "Stream", "arrived"]
-
 Item = TypeVar("Item")
 
 

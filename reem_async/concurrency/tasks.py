@@ -9,8 +9,6 @@ from typing import Any
 
 from .timeouts import forget
 
-__all__ = ["Tasks", "is_being_cancelled", "started"]
-
 _LONGEST_END = 1.0
 """Seconds to wait for cancelled tasks: a ship of a user's own may be at work in one, and not end at once."""
 

@@ -19,19 +19,6 @@ try:
 except ImportError:  # Windows: what the kernel still holds cannot be asked there
     fcntl = termios = None  # type: ignore[assignment]
 
-__all__ = [
-    "LONGEST",
-    "LOOKS",
-    "check_timeout",
-    "confirmed",
-    "forget",
-    "moved_last",
-    "server_timeout",
-    "time_limit",
-    "timeout",
-    "unsent",
-]  # fmt: skip
-
 LONGEST = 1e6
 """Seconds that a time limit may have: eleven days, which is as good as none."""
 

@@ -6,8 +6,6 @@ import os
 import queue
 from typing import NoReturn
 
-__all__ = ["Descriptor", "Wakeups", "wakeups"]
-
 
 class Descriptor:
     """A file descriptor that is closed with this object, unless its number is another file's by then.

@@ -13,8 +13,6 @@ from ..plan.notices import Slot
 from .reader import LocalReader
 from .segment import Segment
 
-__all__ = ["host", "reason_against"]
-
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _PROCESSES = "/proc/self/ns/pid"
 _PASSING = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC)

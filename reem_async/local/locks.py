@@ -11,8 +11,6 @@ import errno
 import fcntl
 import struct
 
-__all__ = ["lock_for_reading", "lock_for_writing", "unlock"]
-
 # struct flock of <fcntl.h> where off_t has 64 bits: l_type, l_whence, l_start, l_len, l_pid (0 for these locks), and
 # the padding at its end.
 _FLOCK = struct.Struct("@hhqqi4x")

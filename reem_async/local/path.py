@@ -20,8 +20,6 @@ if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from .reader import LocalReader
     from .segment import HEAD, SLOTS, Segment
 
-__all__ = ["LEAST", "MEMORY", "LocalPath"]
-
 LEAST = 1 << 16
 """Bytes from which a value goes through shared memory: below, a fetch from the server takes no longer."""
 

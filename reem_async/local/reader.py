@@ -24,8 +24,6 @@ from ..plan.notices import Slot
 from .locks import lock_for_reading
 from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, stamp_at
 
-__all__ = ["LocalReader"]
-
 _MAPPINGS = 64
 """Segments that are kept mapped: so many cameras that publish through one host."""
 

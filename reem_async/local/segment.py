@@ -27,8 +27,6 @@ from ..concurrency.wakeup import Descriptor
 from ..plan.notices import starts
 from .locks import lock_for_writing, unlock
 
-__all__ = ["HEAD", "IDENTITY", "MARK", "NAME", "SEALS", "SLOTS", "STAMP", "Segment", "Shape", "stamp_at"]
-
 SLOTS = 6
 """One that is written, three for a subscriber (see `reader.py`), two for others that are not as far."""
 

@@ -12,8 +12,6 @@ from typing import Any, NamedTuple
 
 from ..errors import BadData, ClusterReply, PartialWrite, Refused, turned_down
 
-__all__ = ["Command", "Plan", "Reply", "blamed", "unwrap", "wire_commands"]
-
 Command = tuple[Any, ...]
 """One server command: its words as str, bytes, int, float or a flat buffer."""
 

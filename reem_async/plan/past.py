@@ -22,8 +22,6 @@ from typing import Any, Generic, TypeVar
 from .paths import Path
 from .trees import MISSING, get
 
-__all__ = ["Past"]
-
 C = TypeVar("C")
 
 

@@ -17,8 +17,6 @@ from .process import HOST, PortTaken, ServerProcess, ServerProgram, packed
 from .programs import find_program
 from .startable import Startable
 
-__all__ = ["EmbeddedCluster", "NodeProcess"]
-
 SLOTS = 16384
 ATTEMPTS = 10  # to find ports that no other program takes just before the server does
 JOIN_SECONDS = 30.0  # for all nodes to know of each other

@@ -17,8 +17,6 @@ from reem_async.server.process import HOST, PortTaken, ServerProcess, has_data
 from reem_async.server.programs import find_program
 from reem_async.server.startable import Startable
 
-__all__ = ["EmbeddedServer"]
-
 ATTEMPTS = 10  # to find a port that no other program takes just before the server does
 FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored
 PASSWORD_BYTES = 512  # the server's own limit

@@ -10,8 +10,6 @@ from typing import Self
 import anyio
 import anyio.to_thread
 
-__all__ = ["Startable"]
-
 
 class Startable(ABC):
     """A server, or several."""

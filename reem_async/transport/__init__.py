@@ -21,8 +21,6 @@ from .state import States
 if TYPE_CHECKING:
     from .options import Options
 
-__all__ = ["Contention", "Held", "Transport", "counted", "document_of", "drive", "scanned"]
-
 _UNWATCH: Command = ("UNWATCH",)
 _UNAPPLIED = (Contended, NotConnected, Refused)
 """Errors of a plan that the server did nothing for."""

@@ -11,8 +11,6 @@ from redis.asyncio.connection import parse_url
 
 from ..errors import BadType, BadValue
 
-__all__ = ["address_of", "listed", "settings_of"]
-
 _SCHEMES = ("redis://", "rediss://", "unix://")
 
 

@@ -22,8 +22,6 @@ from .state import States
 from .text import HeldText, Text
 from .wire import BUFFER, Wire, close_all, first_answer, open_wire
 
-__all__ = ["AsyncTransport"]
-
 # Connections for WATCH that are kept for the next caller; more at the same time are made and closed again.
 _SPARE = 4
 _LENT = 32

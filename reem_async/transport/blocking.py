@@ -32,8 +32,6 @@ from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallRead
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 
-__all__ = ["BlockingTransport", "keep_open_at_exit"]
-
 _RECORD = 1 << 14
 """Bytes in one record of TLS, at most."""
 _SLICE = 1 << 19

@@ -11,8 +11,6 @@ from ..errors import Misuse, NoJsonSupport
 from .options import Options
 from .packing import Packer
 
-__all__ = ["asyncio_client", "client"]
-
 _NO_JSON = "UNKNOWN COMMAND 'JSON."
 """How the error of a server without JSON begins, in capitals; redis-py has taken its `ERR` away."""
 

@@ -47,8 +47,6 @@ from .route import (
 )
 from .state import States
 
-__all__ = ["ClusterOptions", "ClusterTransport"]
-
 SLOTS = 16384
 
 _EXAMPLE = "redis+cluster://user:password@host:7000,host:7001"

@@ -10,8 +10,6 @@ from typing import Protocol
 from . import Transport
 from .options import Options
 
-__all__ = ["CompositeTransport", "NewTransport", "ToOneServer"]
-
 
 class ToOneServer(Transport, Protocol):
     """The transport to one server."""

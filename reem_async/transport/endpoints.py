@@ -8,8 +8,6 @@ from . import Transport
 from .composite import NewTransport
 from .options import Options, look_nearby
 
-__all__ = ["make_transport"]
-
 _CLUSTER = ("redis+cluster://", "rediss+cluster://")
 _SENTINEL = ("redis+sentinel://", "rediss+sentinel://")
 

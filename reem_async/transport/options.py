@@ -39,11 +39,6 @@ from .addresses import settings_of
 from .packing import Packer
 from .parsing import LARGEST
 
-__all__ = [
-    "INFO_SERVER", "Address", "NodeOptions", "Options", "ServerSocket", "SocketOptions", "connecting_by",
-    "is_this_machine", "look_nearby", "question", "question_here", "server_run_id",
-]  # fmt: skip
-
 Address = tuple[str, int]
 """Host and port."""
 

@@ -27,8 +27,6 @@ from ..plan import Command
 from ..plan.sizes import LARGE, has_large
 from ..ships.numpy import flat_buffer
 
-__all__ = ["SLOW", "CommandRecorder", "Packer", "Piece", "as_text", "pack"]
-
 Piece = bytes | memoryview
 
 SLOW = 1 << 13

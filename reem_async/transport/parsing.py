@@ -17,8 +17,6 @@ from ..errors import ClusterNode
 from ..plan import Reply
 from ..plan.replies import refusal
 
-__all__ = ["LARGEST", "MORE", "NOT_THE_PROTOCOL", "LargeReader", "ReplyReader", "SmallReader", "error_of"]
-
 NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError, TypeError, ValueError)
 """What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
 

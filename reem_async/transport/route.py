@@ -39,12 +39,6 @@ from ..errors import ConnectionLost, NotConnected, TlsRefused
 from ..plan import Command, Reply, blamed
 from . import Held, Transport
 
-__all__ = [
-    "Ask", "HeldAcross", "Moved", "Route", "Unapplied", "asked_of", "is_moved", "is_unapplied", "key_of",
-    "key_slot", "keys_in", "looked_early", "places_refused", "publishes", "refusal", "slot_of", "slots_of",
-    "watched", "without_looks",
-]  # fmt: skip
-
 key_slot: Callable[[bytes], int] = redis.crc.key_slot
 """Return the number of the slot that a key or channel belongs to."""
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from .aio import AsyncTransport
     from .wire import Wire
 
-__all__ = ["SentinelOptions", "SentinelTransport"]
-
 _LOOK_PAUSE = 1.0
 """Seconds between questions to the sentinels."""
 _ROLE: Command = ("ROLE",)

@@ -16,8 +16,6 @@ from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed
 
-__all__ = ["State", "StateChange", "StateChanges", "States"]
-
 logger = logging.getLogger("reem.connection")
 
 State = Literal["idle", "connected", "lost", "reconnecting", "closed"]

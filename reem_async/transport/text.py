@@ -23,8 +23,6 @@ from ..plan.sizes import KEPT, as_given, is_large, stage
 from . import Contention, Held
 from .parsing import error_of
 
-__all__ = ["PROBE", "HeldText", "Text", "is_plain", "lists_json", "over_wire"]
-
 PROBE: Command = ("JSON.GET",)
 """Refused by every server: for its number of words by one that knows the command, else as an unknown one."""
 

@@ -29,8 +29,6 @@ from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
 from .text import PROBE, is_plain, lists_json, over_wire
 
-__all__ = ["BUFFER", "Wire", "close_all", "first_answer", "open_wire"]
-
 _BUSY = 2.5
 """The connection is busy if three reads come within so many times `pace`."""
 
