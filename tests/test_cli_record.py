@@ -130,6 +130,7 @@ def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
     assert (run.returncode, run.stderr) == (0, "")
     assert "complete" in run.stdout
     assert f"/{key('a')}/n\tupdate\treem.{key('a')}.n\t10\t" in run.stdout
+    assert re.search(rf"/{key('a')}/image\tpart \(read\)\tfoxglove.RawImage\t1\t-\t", run.stdout), run.stdout
 
     run = reem("play", file, "--rate", "20", "--remap", f"{key('a')}={key('b')}")
     assert (run.returncode, run.stderr) == (0, "")

@@ -319,7 +319,7 @@ def test_a_plain_server_is_started_when_told():
 
     with up("--plain", "--port", "0") as (process, said):
         port = port_in(said)
-        assert "documents as text: the server has no JSON module" in said
+        assert "documents stored as text: the server has no JSON module" in said
         with redis.Redis(port=port) as client:
             assert b"ReJSON" not in [module[b"name"] for module in client.module_list()]
         with reem.RedisInterface(f"redis://localhost:{port}") as interface:

@@ -30,7 +30,7 @@ from redis.retry import Retry
 import reem
 import reem.server
 import reem.snapshots
-from reem_async.errors import BadData, BadValue, Misuse, ServerFailed, ServerMissing
+from reem_async.errors import BadData, BadValue, Misuse, ServerFailed, ServerFull, ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.server import embedded as server_module
 from reem_async.server import process as _server_process
@@ -310,6 +310,21 @@ class TestPrivacy:
     def test_passwords_that_no_server_takes(self, password):
         with pytest.raises(BadValue, match="password"):
             EmbeddedServer(password=password)
+
+
+class TestMemory:
+    def test_writes_beyond_the_limit_are_refused(self):
+        with EmbeddedServer(maxmemory="20mb") as server, reem.RedisInterface(server) as interface:
+            kvs = reem.KeyValueStore(interface)
+            kvs["kept"] = np.ones(1000)
+            with pytest.raises(ServerFull):
+                kvs["frames"] = [bytes(1_000_000)] * 40
+            assert kvs["kept"].read().sum() == 1000
+
+    @pytest.mark.parametrize("limit", ["", "0", "2 gb", "2tb", "-1", "2gb\nport 1"])
+    def test_limits_that_no_server_takes(self, limit):
+        with pytest.raises(BadValue, match="maxmemory must be a number"):
+            EmbeddedServer(maxmemory=limit)
 
 
 def other_addresses() -> list[str]:

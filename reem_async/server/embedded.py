@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import socket
 import threading
@@ -52,6 +53,7 @@ class EmbeddedServer(Startable):
         snapshot: str | os.PathLike[str] | None = None,
         *,
         json: bool = True,
+        maxmemory: str | None = None,
     ) -> None:
         """Prepare a server; `start` or a `with` block starts it.
 
@@ -65,9 +67,11 @@ class EmbeddedServer(Startable):
                 namespace it was taken of. The directory, if there is one, must hold no data yet.
             json: False starts it without loading a JSON module (one that is built into the program stays, and `json`
                 says so); so does REEM_SERVER_PLAIN=1.
+            maxmemory: how much the data may take, such as "500mb" or "2gb". Writes beyond it raise ServerFull, and
+                nothing is lost. None sets no limit.
 
         Raises:
-            BadValue: a port or password that no server takes.
+            BadValue: a port, password or limit that no server takes.
         """
         if not 0 <= port <= 65535:
             raise BadValue(f"port {port} is not in 0..65535")
@@ -75,11 +79,14 @@ class EmbeddedServer(Startable):
             raise BadValue(f"a password has 1 to {PASSWORD_BYTES} bytes; None means that there is none")
         if password is not None and "\0" in password:
             raise BadValue("a password cannot contain NUL")
+        if maxmemory is not None and not re.fullmatch(r"[1-9]\d{0,17}[kmg]?b?", maxmemory, re.IGNORECASE | re.ASCII):
+            raise BadValue(f"maxmemory must be a number with kb, mb or gb, such as 2gb, got {maxmemory!r}")
         self._wanted_port = port
         self._wanted_directory = None if directory is None else Path(directory).absolute()
         self._password = password
         self._snapshot = None if snapshot is None else Path(snapshot).absolute()
         self._json = json
+        self._maxmemory = maxmemory
         self._lock = threading.RLock()
         self._owner: int | None = None
         self._process: ServerProcess | None = None
@@ -221,7 +228,12 @@ class EmbeddedServer(Startable):
             port = _bindable(self._wanted_port)
             try:
                 return ServerProcess(
-                    program, port=port, directory=self._wanted_directory, password=self._password, rdb=rdb
+                    program,
+                    port=port,
+                    directory=self._wanted_directory,
+                    password=self._password,
+                    rdb=rdb,
+                    maxmemory=self._maxmemory,
                 )
             except PortTaken:  # by a program that came between the look and the start
                 if not attempts:

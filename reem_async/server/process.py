@@ -74,9 +74,11 @@ class ServerProcess:
         directory: Path | None,
         password: str | None,
         rdb: Path | None = None,
+        maxmemory: str | None = None,
     ) -> None:
         self.port = port
         self.json = program.json
+        self._maxmemory = maxmemory
         self.scratch = _private_directory()
         self.directory = directory or self.scratch
         self.log = self.directory / "server.log"
@@ -172,6 +174,8 @@ class ServerProcess:
         ]
         if password is not None:
             lines.append(f"requirepass {_quoted(password.encode())}")
+        if self._maxmemory is not None:
+            lines += [f"maxmemory {self._maxmemory}", "maxmemory-policy noeviction"]
         return "\n".join(lines) + "\n"
 
     def _plant(self, rdb: Path, *, keep: bool) -> None:

@@ -211,6 +211,8 @@ def info(
 ) -> None:
     """Show what a recording holds: when, what, how often, how much, and what is missing.
 
+    A path may have three channels: published values, those marked (stored), and those marked (read), which the
+    recorder read from the server at the start, after a loss, or as samples.
     The exit code is 1 if a part of the file was found to be damaged or missing.
     """
 
@@ -260,10 +262,10 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
     rows = [
         (
             clean(each.topic),
-            clean(f"{_role(each)} {each.path}".strip() if each.topic.startswith("/_reem") else _role(each)),
+            clean(f"{each.role} {each.path}".strip() if each.topic.startswith("/_reem") else _role(each)),
             clean(each.schema),
             str(each.messages),
-            f"{each.rate:.1f} Hz",
+            f"{each.rate:.1f} Hz" if each.messages > 1 else "-",
             size_text(each.bytes),
         )
         for each in order
@@ -286,8 +288,8 @@ def _print(log: Log, channels: list[ChannelSummary]) -> None:
 
 
 def _role(each: ChannelSummary) -> str:
-    """Return what the messages of a channel are, and whether they were only stored."""
-    return f"{each.role} (stored)" if each.kind == "stored" else each.role
+    """Return what the messages of a channel are, and where they come from if they were not published."""
+    return each.role + {"stored": " (stored)", "kvs": " (read)"}.get(each.kind, "")
 
 
 def _missing(log: Log) -> str:

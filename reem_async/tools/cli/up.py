@@ -86,7 +86,7 @@ def _use(url: str, variable: str | None = None, *, json: bool, data: str) -> lis
     imports = "import os; from" if variable else "from"
     connect = f'import KeyValueStore, RedisInterface; kvs = KeyValueStore(RedisInterface("{url}"{password}))'
     return [
-        ("documents", "by the JSON module" if json else "as text: the server has no JSON module"),
+        ("documents", "stored as JSON" if json else "stored as text: the server has no JSON module"),
         ("data", data),
         ("blocking", f"{imports} reem {connect}"),
         ("asyncio", f"{imports} reem_async {connect}"),
@@ -125,6 +125,12 @@ def up(
             help="Begin with what this snapshot holds, portable or RDB. A --directory must have no data yet.",
         ),
     ] = None,
+    maxmemory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE", help="The most that the data may take, such as 2gb; writes beyond it are refused."
+        ),
+    ] = None,
     cluster: Annotated[
         bool,
         typer.Option(
@@ -133,7 +139,7 @@ def up(
     ] = False,
     plain: Annotated[
         bool,
-        typer.Option("--plain", help="Without the JSON module: documents are kept as text, as on arm64 and macOS."),
+        typer.Option("--plain", help="Without the JSON module: documents are stored as text, as on arm64 and macOS."),
     ] = False,
 ) -> None:
     """Start a private server and keep it up until Ctrl-C.
@@ -142,13 +148,13 @@ def up(
 
     Examples:
       reem up
-      reem up --directory /var/lib/robot --port 6400
+      reem up --directory /var/lib/robot --port 6400 --maxmemory 2gb
       reem up --from reem-20260801T120000Z.zip
       reem up --cluster
       reem up --plain
     """
     if cluster:
-        if any(given is not None for given in (port, directory, password_from_env, snapshot)):
+        if any(given is not None for given in (port, directory, password_from_env, snapshot, maxmemory)):
             fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
         _up_cluster(plain=plain)
         return
@@ -158,7 +164,8 @@ def up(
     if snapshot is not None and snapshot.exists() and not snapshot.is_file():
         fail(f"{snapshot} is no file; give a snapshot")
     try:
-        server = EmbeddedServer(port, directory, os.environ[variable] if variable else None, snapshot, json=not plain)
+        password = os.environ[variable] if variable else None
+        server = EmbeddedServer(port, directory, password, snapshot, json=not plain, maxmemory=maxmemory)
         with server:  # until it is up, Ctrl-C ends the loading at once
             stop = Stop()
             _describe(server, directory, variable, snapshot)
