@@ -16,12 +16,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import ServerFailed
+from reem_async.server.embedded import EmbeddedServer
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import USAGE, CommandFailed, interface_to, run_local
 
 if TYPE_CHECKING:
-    from reem_async.server.embedded import EmbeddedServer
     from reem_async.tools.browser import Source
 
 _PACKAGES = {"starlette": "starlette", "uvicorn": "uvicorn", "PIL": "pillow"}
@@ -192,8 +194,6 @@ def _run(port: int | None, page_port: int | None, open_: bool) -> None:
 
 
 def _server(port: int) -> EmbeddedServer:
-    from reem_async.server.embedded import EmbeddedServer
-
     server = EmbeddedServer(port)
     server.start()  # the `with` block stops it
     return server
@@ -201,8 +201,6 @@ def _server(port: int) -> EmbeddedServer:
 
 def _first_of(wanted: int | None, usual: int, start: Any) -> Any:
     """Start at the port that was asked for; if none was, at the usual one, or at a free one if that is taken."""
-    from reem_async.errors import ServerFailed
-
     if wanted is not None:
         return start(wanted)
     try:
@@ -235,7 +233,6 @@ def _programs(url: str) -> Iterator[list[subprocess.Popen[bytes]]]:
 
 
 async def _show(server_port: int, page_port: int | None, open_: bool, running: list[subprocess.Popen[bytes]]) -> None:
-    from reem_async.connection import RedisInterface
     from reem_async.tools.browser import LiveSource, PageServer, create_app, listen
 
     source = LiveSource(RedisInterface(f"redis://localhost:{server_port}", timeout=5.0))

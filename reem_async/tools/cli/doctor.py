@@ -11,29 +11,29 @@ import textwrap
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from importlib import metadata
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import typer
 
 from reem_async._installation import CURE, original_reem
-from reem_async.errors import BadKey, RedisError, ReemError
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadKey, NoJsonSupport, RedisError, ReemError
+from reem_async.local.host import reason_against
+from reem_async.local.segment import Segment
 from reem_async.plan.attachments import orphans, remove_orphans
+from reem_async.plan.keys import Keys
 from reem_async.plan.paths import check_top_key, parse_suffix
 from reem_async.plan.sizes import STAGED
 from reem_async.session import Session
 from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
+from reem_async.tools.cli.following import follow
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url
 from reem_async.tools.cli.output import clean, emit, emit_json, is_terminal, styled, width
 from reem_async.tools.cli.running import FAILED, for_users, interface_to, run_local
-from reem_async.transport import scanned
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.plan.keys import Keys
-    from reem_async.session import Session
-    from reem_async.transport import Transport
-    from reem_async.transport.aio import AsyncTransport
+from reem_async.tools.cli.top import ALL, Board
+from reem_async.transport import Transport, scanned
+from reem_async.transport.aio import AsyncTransport
 
 # Enough for a 99th percentile that is not the slowest one alone.
 _ROUND_TRIPS = 200
@@ -131,8 +131,6 @@ def _show(node: str, finding: Finding, as_json: bool) -> None:
 
 async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> AsyncIterator[tuple[str, Finding]]:
     """Yield what is found at the servers, with the node of a cluster that it is about, and of the installation."""
-    from reem_async.errors import RedisError
-
     interface = interface_to(url, namespace)
     transport = interface.session.transport
     try:
@@ -160,10 +158,6 @@ async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> As
 
 async def _publishers(interface: RedisInterface) -> Finding:
     """Listen for a moment whether any key is published by two at once."""
-    from reem_async.errors import RedisError, ReemError
-    from reem_async.tools.cli.following import follow
-    from reem_async.tools.cli.top import ALL, Board
-
     board = Board(ALL)
     try:
         ending = await follow(interface, (), board.take, seconds=_LISTENS)
@@ -180,8 +174,6 @@ async def _publishers(interface: RedisInterface) -> Finding:
 
 async def _of_node(interface: RedisInterface, node: Transport, *, write: bool) -> list[tuple[str, Finding]]:
     """Return what is found at one node of a cluster; that it does not answer is a finding as well."""
-    from reem_async.errors import RedisError
-
     address, found = node.options.address, list[tuple[str, Finding]]()
     try:
         async for finding in _of_server(interface, node, write=write):
@@ -202,8 +194,6 @@ def _worst_first(reports: Sequence[Sequence[tuple[str, Finding]]]) -> list[tuple
 
 
 async def _of_server(interface: RedisInterface, server: Transport, *, write: bool) -> AsyncIterator[Finding]:
-    from reem_async.errors import NoJsonSupport
-
     session, options = interface.session, server.options
     # Each node of a cluster is timed with a key of its own slots; else it would only say MOVED.
     keys = await _keys_at(session, server)
@@ -240,7 +230,6 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
 
 async def _old_data(interface: RedisInterface) -> Finding:
     """Count the keys of the namespace that are of versions before 1.0, on all servers."""
-    from reem_async.errors import RedisError
     from reem_async.legacy.finding import find
 
     try:
@@ -251,8 +240,6 @@ async def _old_data(interface: RedisInterface) -> Finding:
 
 async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
     """Count the arrays that no document refers to, on all servers, and `clean` removes them."""
-    from reem_async.errors import RedisError
-
     try:
         found = await find_orphans(interface.session, remove=clean)
     except RedisError as error:
@@ -381,9 +368,6 @@ def _needed(extra: str) -> list[str]:
 
 async def _sharing(interface: RedisInterface) -> Finding:
     """Find out how large values get from one program of this machine to another; starts one, for a moment."""
-    from reem_async.errors import RedisError
-    from reem_async.local.host import reason_against
-
     reason = reason_against() or await unseen_by_another()
     if reason:
         return shared_memory(reason)
@@ -429,8 +413,6 @@ def is_contained() -> bool:
 
 async def unseen_by_another() -> str:
     """Return why another process of this user cannot look into the memory of this one; empty if it can."""
-    from reem_async.local.segment import Segment
-
     segment = Segment(1)
     number, stamp = segment.put([b"R"], [1]) or (0, 0)
     place = os.getpid(), segment.descriptor, segment.inode, number, stamp

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import aclosing, suppress
 from datetime import datetime
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
+import numpy as np
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, RedisError, ReemError, WrongKind
+from reem_async.plan.paths import Path, Pattern, parse_pattern, spelled_out
+from reem_async.plan.placeholders import Unfetched
+from reem_async.plan.trees import MISSING, get
+from reem_async.pubsub.monitor import ANNOUNCED, Event
+from reem_async.store.catalog import outline
+from reem_async.store.reader import DocumentReader
 from reem_async.tools.cli.following import Ending, follow
-from reem_async.tools.cli.listing import found
+from reem_async.tools.cli.listing import as_data, describe, found
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
 from reem_async.tools.cli.output import (
     clean,
@@ -27,11 +37,6 @@ from reem_async.tools.cli.output import (
     width,
 )
 from reem_async.tools.cli.running import for_users, run
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.plan.paths import Path, Pattern
-    from reem_async.pubsub.monitor import Event
 
 
 def echo(
@@ -63,11 +68,6 @@ def echo(
     """
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, WrongKind
-        from reem_async.plan.paths import parse_pattern
-        from reem_async.pubsub.monitor import ANNOUNCED
-        from reem_async.store.reader import DocumentReader
-
         skipped = 0
 
         asked = [parse_pattern(text) for text in patterns or ()]
@@ -102,10 +102,6 @@ def echo(
 
 async def _kind(interface: RedisInterface, path: Path) -> str:
     """Return what is at a path now, arrays as type and shape: one round trip, in which none is fetched."""
-    from reem_async.errors import RedisError, ReemError
-    from reem_async.store.catalog import outline
-    from reem_async.tools.cli.listing import as_data, describe
-
     try:
         node = await outline(interface, path)
     except (ReemError, RedisError):
@@ -118,8 +114,6 @@ async def _kind(interface: RedisInterface, path: Path) -> str:
 
 async def _say_what_is_waited_for(interface: RedisInterface, patterns: Sequence[str]) -> None:
     """Say which of the paths are not there yet: nothing is printed until they are written."""
-    from reem_async.errors import MissingKey, RedisError, ReemError
-
     for path in patterns:
         with suppress(ReemError, RedisError):
             try:
@@ -133,12 +127,6 @@ async def _say_what_is_waited_for(interface: RedisInterface, patterns: Sequence[
 
 def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
     """Return what an update of a whole dict says of the one place in it that was asked for."""
-    import dataclasses
-
-    from reem_async.plan.paths import spelled_out
-    from reem_async.plan.trees import MISSING, get
-    from reem_async.pubsub.monitor import ANNOUNCED
-
     meant = [pattern for pattern in asked if pattern.concerns(event.path)]
     if len(meant) != 1 or event.value is ANNOUNCED:
         return event
@@ -210,8 +198,6 @@ def _moment(time: float) -> str:
 
 def _one_line(value: Any) -> str:
     """Return a value in one line; arrays as their type and first and last numbers."""
-    import numpy as np
-
     if isinstance(value, np.ndarray):
         body = np.array2string(value, threshold=12, edgeitems=3, max_line_width=10_000, separator=" ")
         return clean(f"{value.dtype}[{','.join(map(str, value.shape))}] {' '.join(body.split())}")
@@ -229,8 +215,6 @@ def _each_leaf(value: Any, change: Callable[[Any], Any]) -> Any:
 
 def _unfetched_as_text(leaf: Any) -> Any:
     """Return a text in place of what was left at the server."""
-    from reem_async.plan.placeholders import Unfetched
-
     return f"<{leaf.summary or leaf.label}, {size_text(leaf.size)}>" if isinstance(leaf, Unfetched) else leaf
 
 

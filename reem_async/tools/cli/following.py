@@ -8,15 +8,16 @@ import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
+from reem_async.concurrency.queues import Last
+from reem_async.connection import RedisInterface
+from reem_async.errors import ReemError
+from reem_async.plan.notices import LARGEST_INLINE
+from reem_async.plan.paths import parse_shown
+from reem_async.pubsub.monitor import Event, Monitor
+from reem_async.pubsub.pattern_watch import PatternWatch
 from reem_async.tools.cli.output import note
 from reem_async.tools.cli.running import TIMED_OUT
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.pubsub.monitor import Event, Monitor
-    from reem_async.pubsub.pattern_watch import PatternWatch
 
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
@@ -91,9 +92,6 @@ async def follow(
         tick: Shows what there is so far.
         stored: Also hand on what is only stored; arrays of over 16 KB are not fetched for that.
     """
-    from reem_async.concurrency.queues import Last
-    from reem_async.pubsub.monitor import Monitor
-
     ending, start = Ending(), time.monotonic()
     end = start + seconds if seconds else _NEVER
     next_tick = start + every if every else _NEVER
@@ -128,11 +126,6 @@ async def follow(
 @contextlib.asynccontextmanager
 async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: Monitor) -> AsyncIterator[None]:
     """Have what is only stored come out of a monitor, too."""
-    from reem_async.concurrency.queues import Last
-    from reem_async.errors import ReemError
-    from reem_async.plan.notices import LARGEST_INLINE
-    from reem_async.pubsub.pattern_watch import PatternWatch
-
     watch = PatternWatch(interface.session, patterns, Last(_WAITING), largest=LARGEST_INLINE)
     try:
         await watch.listen()
@@ -147,9 +140,6 @@ async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: M
 
 
 async def _hand_on(watch: PatternWatch, monitor: Monitor) -> None:
-    from reem_async.plan.paths import parse_shown
-    from reem_async.pubsub.monitor import Event
-
     async for update in watch:
         if update.origin == "stored":
             now = time.time()

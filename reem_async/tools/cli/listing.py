@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator, Iterator
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadData, MissingKey, WrongKind
+from reem_async.plan.paths import check_top_key, parse, parse_pattern
+from reem_async.store.catalog import Outline, names, outline
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Url, complete_path
 from reem_async.tools.cli.output import (
     clean,
@@ -25,10 +29,6 @@ from reem_async.tools.cli.output import (
     width,
 )
 from reem_async.tools.cli.running import NOTHING, for_users, run
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.store.catalog import Outline
 
 # Entries that are drawn of one dict or list: lists of thousands of numbers would fill the screen.
 _MOST_CHILDREN = 50
@@ -156,9 +156,6 @@ async def found(interface: RedisInterface, pattern: str) -> AsyncGenerator[Outli
     Raises:
         MissingKey: The pattern is a path, and nothing is there.
     """
-    from reem_async.plan.paths import check_top_key, parse, parse_pattern
-    from reem_async.store.catalog import names, outline
-
     # A plain path is asked for directly, and that nothing is there is an error; a pattern that finds nothing is none.
     if not any(mark in pattern for mark in "*?"):
         name, *_ = parse(pattern) or ("",)
@@ -177,9 +174,6 @@ async def found(interface: RedisInterface, pattern: str) -> AsyncGenerator[Outli
 
 async def _outline(interface: RedisInterface, name: str) -> Outline | None:
     """Return what is under a top-level key; None if it is gone, kind "?" if REEM did not write it."""
-    from reem_async.errors import BadData, MissingKey, WrongKind
-    from reem_async.store.catalog import Outline, outline
-
     try:
         return await outline(interface, (name,))
     except (MissingKey, WrongKind):

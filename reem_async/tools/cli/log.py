@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reem_async.connection import RedisInterface
 from reem_async.errors import BadValue
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
 from reem_async.tools.cli.output import (
@@ -33,7 +34,6 @@ from reem_async.tools.cli.record import tools
 from reem_async.tools.cli.running import USAGE, CommandFailed, run, run_local
 
 if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
     from reem_async.tools.recording import ChannelSummary, Log, Replayer, ReplayStatus
 
 _NOTICED_LAG = 0.1

@@ -8,35 +8,34 @@ import sys
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from reem_async.tools.cli.running import NOTHING, complain
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.ships.base import SpecialDatatypeShip
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadType, BadValue, ReemError
+from reem_async.plan.paths import parse, shorten
+from reem_async.ships.base import SpecialDatatypeShip
+from reem_async.ships.registry import default_ships
+from reem_async.store.catalog import names
+from reem_async.store.store import KeyValueStore
+from reem_async.tools.cli.output import typed
+from reem_async.tools.cli.running import NOTHING, complain, interface_to
 
 _SECONDS = 1.0  # longer than this, a completion only disturbs
 # Names that are offered: a shell asks before it shows more than about a hundred.
 _MOST = 200
-_NEEDED = ("reem_async.store.catalog", "reem_async.store.store", "reem_async.tools.cli.running", "redis")
 
 
 def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
     """Return the paths that begin with what was typed, up to the next dot; nothing if the server cannot be asked."""
     url = ctx.params.get("url") or os.environ.get("REEM_URL") or "localhost"
     with suppress(Exception):  # a shell that completes is no place for messages
-        for module in _NEEDED:  # importing is not part of the time that a server has to answer
-            import_module(module)
         return asyncio.run(asyncio.wait_for(_names(url, ctx.params.get("namespace") or "", incomplete), _SECONDS))
     return []
 
 
 async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
-    from reem_async.tools.cli.running import interface_to
-
     async with interface_to(url, namespace, _SECONDS) as interface:
         outer = _begun(incomplete)
         found = await (_below(interface, outer, incomplete) if outer else _top(interface, incomplete))
@@ -48,9 +47,6 @@ async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
 
 async def _top(interface: RedisInterface, incomplete: str) -> list[str]:
     """Return the top-level keys that go on as typed."""
-    from reem_async.store.catalog import names
-    from reem_async.tools.cli.output import typed
-
     found: list[str] = []
     async for name in names(interface, "*"):
         shown = typed((name,))
@@ -63,9 +59,6 @@ async def _top(interface: RedisInterface, incomplete: str) -> list[str]:
 
 
 async def _goes_on(interface: RedisInterface, path: str) -> bool:
-    from reem_async.errors import ReemError
-    from reem_async.store.store import KeyValueStore
-
     with suppress(ReemError):  # a list, an array, a number
         return bool(await KeyValueStore(interface).at(path).keys())
     return False
@@ -73,8 +66,6 @@ async def _goes_on(interface: RedisInterface, path: str) -> bool:
 
 def _begun(incomplete: str) -> tuple[str | int, ...]:
     """Return the whole elements of a path before the one that is being typed; none at the top."""
-    from reem_async.plan.paths import parse
-
     # The longest whole path in front of the last separator. Within a quoted key a separator is none, and what stands
     # before it does not parse.
     for end in range(len(incomplete), 0, -1):
@@ -86,9 +77,6 @@ def _begun(incomplete: str) -> tuple[str | int, ...]:
 
 async def _below(interface: RedisInterface, outer: tuple[str | int, ...], incomplete: str) -> list[str]:
     """Return the keys of the dict at `outer` that go on as typed; nothing of it is fetched."""
-    from reem_async.store.store import KeyValueStore
-    from reem_async.tools.cli.output import typed
-
     place = KeyValueStore(interface)[str(outer[0])]
     for element in outer[1:]:
         place = place[element]
@@ -184,8 +172,6 @@ WindowLength = Annotated[
 
 def named_ships(names: list[str] | None) -> list[Any]:
     """Return the ships of an interface: those named by `--ship`, then the default ones."""
-    from reem_async.ships.registry import default_ships
-
     # The user's own ships first, as in a program: they may take what the default ones would.
     return [*map(ship_named, names or ()), *default_ships()]
 
@@ -199,10 +185,6 @@ def ship_named(text: str) -> SpecialDatatypeShip:
         BadValue: There is none.
         BadType: It is no ship.
     """
-    from reem_async.errors import BadType, BadValue
-    from reem_async.plan.paths import shorten
-    from reem_async.ships.base import SpecialDatatypeShip
-
     module, colon, name = text.partition(":")
     if not (module and colon and name):
         raise BadValue(f"{shorten(text)} does not name a ship; write it like my_ships:PoseShip")

@@ -13,7 +13,9 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import typer
+from rich.cells import cell_len, set_cell_size
 
+from reem_async.plan.paths import suffix
 from reem_async.tools import jsontext
 
 # What moves the cursor, changes colours or breaks lines: keys and values come from anywhere.
@@ -105,8 +107,6 @@ def typed(path: Sequence[str | int]) -> str:
 
 
 def _element(key: str | int) -> str:
-    from reem_async.plan.paths import suffix
-
     # Quoted as JSON if the plain form would show what a terminal obeys.
     text = suffix((key,))
     return text if clean(text) == text or text.startswith("[") else f"[{json.dumps(key)}]"
@@ -131,8 +131,6 @@ def columns(
             emit("\t".join(row))
         return
     # Widths in cells of the terminal: Chinese characters take two, accents none.
-    from rich.cells import cell_len, set_cell_size
-
     kept = [list(row) for row in rows]
     if not kept:
         return

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
+from reem_async.connection import RedisInterface
 from reem_async.errors import BadValue
 from reem_async.tools.cli.options import (
     DEFAULT_URL,
@@ -24,9 +25,9 @@ from reem_async.tools.cli.options import (
 )
 from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
 from reem_async.tools.cli.running import CommandFailed, guarded, run
+from reem_async.transport.options import look_nearby
 
 if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
     from reem_async.tools.recording import Recorder, RecorderStatus
 
 # Seconds between two lines that say how it is getting on.
@@ -80,8 +81,6 @@ def record(
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.transport.options import look_nearby
-
         # Before the recorder is made: threads that it starts inherit the scheduling.
         try:
             if background:

@@ -14,15 +14,13 @@ import sys
 import warnings
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadInput, MissingKey, RedisError, ReemError
 from reem_async.tools.cli.output import clean
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-
 
 # Scripts depend on these numbers: the same in every command, listed in docs/reference/environment.md.
 FAILED, USAGE, NOTHING, TIMED_OUT, INTERRUPTED = 1, 2, 3, 4, 130
@@ -84,8 +82,6 @@ def guarded(name: str, *, live: bool = False) -> Iterator[None]:
     Raises:
         typer.Exit: The block failed, was interrupted, or could not print.
     """
-    from reem_async.errors import BadInput, MissingKey, RedisError, ReemError
-
     try:
         with _short_warnings(name):
             yield
@@ -158,8 +154,6 @@ def interface_to(
 
     The password is that of the URL, or else in the environment variable REEM_PASSWORD.
     """
-    from reem_async.connection import RedisInterface
-
     address = url if "://" in url else f"redis://{url}"
     password = os.environ.get(PASSWORD_VARIABLE)
     # A password in the URL comes first: it is the one that was typed for this server.

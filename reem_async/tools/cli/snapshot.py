@@ -10,10 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import BadData, RedisError, ReemError
+from reem_async.tools import snapshots
 from reem_async.tools.cli.commands import help_text
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
 from reem_async.tools.cli.output import (
@@ -29,11 +32,8 @@ from reem_async.tools.cli.output import (
     styled,
 )
 from reem_async.tools.cli.running import FAILED, NOTHING, CommandFailed, for_users, guarded, run, run_local
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.tools.snapshots import Progress, Snapshot
-    from reem_async.tools.snapshots.files import Pruned
+from reem_async.tools.snapshots import Progress, RdbUnavailable, Snapshot, described
+from reem_async.tools.snapshots.files import SUFFIXES, Pruned, dated, new_name, prune, sniff
 
 app = typer.Typer(rich_markup_mode="rich", help="Save what a server holds to files, list them, restore them.")
 
@@ -165,8 +165,6 @@ class _Saver:
 
     async def by_period(self, interface: RedisInterface, every: float) -> NoReturn:
         """Take one each `every` seconds; what goes wrong after the first is said, and the next is tried."""
-        from reem_async.errors import RedisError, ReemError
-
         start, turn = time.monotonic(), 0
         try:
             while True:
@@ -198,29 +196,23 @@ class _Saver:
                     raise
 
     async def _saved_as(self, interface: RedisInterface, bar: bool) -> Snapshot:
-        from reem_async.tools.snapshots import RdbUnavailable, save, save_rdb
-
         if self.rdb:
             try:
-                return await save_rdb(interface, self._path("rdb"), overwrite=self.overwrite)
+                return await snapshots.save_rdb(interface, self._path("rdb"), overwrite=self.overwrite)
             # Said once; the next ones by period try again, since rights may have changed.
             except RdbUnavailable as error:
                 self._note_once(
                     f"No RDB file: {for_users(error)}. A portable snapshot, of the keys of REEM, is taken instead."
                 )
         with _progress(shown=bar and not self.as_json) as progress:
-            return await save(
+            return await snapshots.save(
                 interface, self._path("portable"), self.match, overwrite=self.overwrite, progress=progress
             )
 
     def _path(self, kind: str) -> Path:
-        from reem_async.tools.snapshots.files import new_name
-
         return self.file or new_name(self.directory, kind, time.time(), auto=self.keep is not None)
 
     def _pruned(self, newest: Path) -> Pruned:
-        from reem_async.tools.snapshots.files import Pruned, prune
-
         self.made.append(newest)
         # Without --keep nothing is ever deleted, so there is nothing to remember.
         if self.keep is None:
@@ -285,16 +277,13 @@ def restore(
         check_there(file)
 
     async def work(interface: RedisInterface) -> None:
-        from reem_async.tools.snapshots import describe
-        from reem_async.tools.snapshots import restore as restored
-
         with _progress(shown=not as_json) as progress:
-            done = await restored(interface, file, match, replace=replace, into=into, progress=progress)
+            done = await snapshots.restore(interface, file, match, replace=replace, into=into, progress=progress)
         if as_json:
             emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
             return
         emit(f"{counted(len(done.names), 'key')} restored, {size_text(done.size)}")
-        saved = (await describe(file)).namespace
+        saved = (await snapshots.describe(file)).namespace
         if saved != namespace:
             note(f"They were saved under the namespace {saved!r} and are now under {namespace!r} (--namespace).")
 
@@ -320,9 +309,6 @@ def check_there(path: Path) -> None:
 def listed(path: Path, check: bool, as_json: bool) -> int:
     """Print the snapshots in a directory, or the keys in a file; returns the exit code."""
     check_there(path)
-    from reem_async.errors import BadData
-    from reem_async.tools.snapshots import described
-
     if path.is_file():
         _show_keys(described(path, check=check), as_json)
         return 0
@@ -340,9 +326,6 @@ def listed(path: Path, check: bool, as_json: bool) -> int:
 
 def _candidates(directory: Path) -> Iterator[Path]:
     """Yield the files that are snapshots by name and first bytes, or by a name that only snapshots have."""
-    from reem_async.errors import BadData
-    from reem_async.tools.snapshots.files import SUFFIXES, dated, sniff
-
     for file in sorted(directory.iterdir()):
         if file.suffix not in SUFFIXES.values() or not file.is_file():
             continue

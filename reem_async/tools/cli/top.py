@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from statistics import fmean, pstdev
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console, Group
@@ -20,14 +20,12 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from reem_async.connection import RedisInterface
+from reem_async.pubsub.monitor import Event
 from reem_async.tools.cli.following import Ending, follow
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url, WindowLength
 from reem_async.tools.cli.output import cut, emit, emit_json, is_terminal, note, size_text, typed
 from reem_async.tools.cli.running import run
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.pubsub.monitor import Event
 
 _WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
 _DRAW_SECONDS = 0.25  # people can read numbers that change four times a second

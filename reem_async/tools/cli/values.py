@@ -11,21 +11,25 @@ import zipfile
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import IO, Annotated, Any, NoReturn
 
+import numpy as np
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.errors import MissingKey
+from reem_async.plan.paths import Path as KeyPath
+from reem_async.plan.paths import show
+from reem_async.store.accessor import Accessor
+from reem_async.store.catalog import Outline, outline
+from reem_async.store.publish import PublishSpace
+from reem_async.store.reader import DocumentReader
+from reem_async.store.store import KeyValueStore
+from reem_async.tools.cli.listing import as_data, below_arrays, describe
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width, write_over
 from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.errors import MissingKey
-    from reem_async.plan.paths import Path as KeyPath
-    from reem_async.store.accessor import Accessor
-    from reem_async.store.catalog import Outline
 
 _MOST_AS_TEXT = 200_000
 """Bytes of arrays that are printed as JSON: one of uint8 is up to four of text."""
@@ -82,12 +86,6 @@ def get(
         raise typer.BadParameter(f"{output}: the name of a file ends in one of {', '.join(FILES)}")
 
     async def work(interface: RedisInterface) -> None:
-        import numpy as np
-
-        from reem_async.errors import MissingKey
-        from reem_async.store.catalog import outline
-        from reem_async.store.store import KeyValueStore
-
         if output is not None and output.exists() and not force:
             raise there_already(output)
         store = KeyValueStore(interface)
@@ -116,11 +114,6 @@ def get(
 
 async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -> Any:
     """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
-    from reem_async.errors import MissingKey
-    from reem_async.plan.paths import show
-    from reem_async.store.catalog import outline
-    from reem_async.store.reader import DocumentReader
-
     for end in range(len(path) - 1, 0, -1):
         if not isinstance(path[end], int):
             break
@@ -137,8 +130,6 @@ async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -
 
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
     """Return a value for people; fetches it only if it is one array."""
-    from reem_async.tools.cli.listing import as_data
-
     # For scripts: the text as it is, without quotes. A terminal is not sent what it would obey.
     if raw and node.kind == "str":
         text = str(node.value)
@@ -151,8 +142,6 @@ async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: boo
 
 
 def _check_size(node: Outline) -> None:
-    from reem_async.tools.cli.listing import below_arrays
-
     size = below_arrays(node)
     if size > _MOST_AS_TEXT:
         raise CommandFailed(
@@ -221,17 +210,11 @@ def delete(
 
 
 def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
-    from reem_async.store.publish import PublishSpace
-    from reem_async.store.store import KeyValueStore
-
     return (PublishSpace if publish else KeyValueStore)(interface).at(path)
 
 
 async def _ask(interface: RedisInterface, path: str) -> None:
     """Ask before a whole key goes; raises MissingKey, and CommandFailed if the answer is no."""
-    from reem_async.store.catalog import outline
-    from reem_async.tools.cli.listing import describe
-
     what = describe(await outline(interface, path), 60)
     if not _agreed(f"Delete {clean(path)} ({what}) at {interface.hostname}?"):
         raise CommandFailed("nothing was deleted")
@@ -288,8 +271,6 @@ def pub(
     repeated = rate is not None or count is not None
 
     async def work(interface: RedisInterface) -> None:
-        from reem_async.store.publish import PublishSpace
-
         place = PublishSpace(interface).at(path)
         if repeated:
             until = "" if count else " until Ctrl-C"
@@ -375,8 +356,6 @@ def _from_file(path: Path) -> Any:
             return _json(_read(file, str(path)), str(path))
     if path.suffix != ".npy":
         raise CommandFailed(f"{path}: @ takes a .json or .npy file", USAGE)
-    import numpy as np
-
     try:
         return np.load(path, allow_pickle=False)
     except OSError:
@@ -387,8 +366,6 @@ def _from_file(path: Path) -> Any:
 
 def preview(value: Any, columns: int) -> str:
     """Return a few lines that show an array or bytes: what it is, its range, its corners."""
-    import numpy as np
-
     if isinstance(value, bytes):
         return f"{len(value)} bytes\n{value[:64]!r}{'…' if len(value) > 64 else ''}"
     if not isinstance(value, np.ndarray):
@@ -404,8 +381,6 @@ def preview(value: Any, columns: int) -> str:
 
 def _range(array: Any) -> str:
     """Return least, greatest and mean of the finite numbers of an array, and how many others there are."""
-    import numpy as np
-
     numbers = array
     # Only floats have NaN: for others, the mask would cost a pass and a copy for nothing.
     if array.dtype.kind == "f" and not (fine := np.isfinite(array)).all():
@@ -441,16 +416,12 @@ def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
 
 
 def _write_npy(value: Any, file: IO[bytes], where: str) -> str:
-    import numpy as np
-
     array = _array(value, where, "npy")
     np.save(file, array, allow_pickle=False)
     return f"{array.dtype}[{','.join(map(str, array.shape))}]"
 
 
 def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
-    import numpy as np
-
     # By path, so that two arrays of the same key in different dicts do not collide.
     arrays: dict[str, Any] = {}
     others = _collect(value, (), arrays)
@@ -467,8 +438,6 @@ def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
 
 def _collect(value: Any, path: tuple[str | int, ...], arrays: dict[str, Any]) -> int:
     """Enter the arrays below `value` by their paths; return how many other values there are."""
-    import numpy as np
-
     if isinstance(value, np.ndarray):
         arrays[typed(path) if path else "data"] = value
         return 0
@@ -486,8 +455,6 @@ def _write_json(value: Any, file: IO[bytes], where: str) -> str:
 
 
 def _write_png(value: Any, file: IO[bytes], where: str) -> str:
-    import numpy as np
-
     try:
         from PIL import Image
     except ModuleNotFoundError:
@@ -517,8 +484,6 @@ def _write_bytes(value: Any, file: IO[bytes], where: str) -> str:
 
 
 def _array(value: Any, where: str, kind: str) -> Any:
-    import numpy as np
-
     if isinstance(value, np.ndarray):
         return value
     raise CommandFailed(
