@@ -13,8 +13,6 @@ from reem_async.tools.cli.output import size_text
 
 
 class CheckStatus(StrEnum):
-    """How one check went, worst last but for what could not be looked at."""
-
     OK = "ok"
     WARN = "warn"
     FAIL = "fail"
@@ -38,14 +36,7 @@ _SMALL_BUFFER = 8_000_000
 
 
 class Finding(NamedTuple):
-    """One line of the report.
-
-    Attributes:
-        check: What was looked at.
-        status: How it went; unknown if it could not be looked at.
-        message: What was found.
-        remedy: What to do; empty if there is nothing.
-    """
+    """One line of the report: what was looked at, how it went, what was found, and what to do."""
 
     check: str
     status: CheckStatus
@@ -54,12 +45,7 @@ class Finding(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """What the server said of itself.
-
-    Attributes:
-        info: The reply to INFO; None if this user may not ask.
-        config: The reply to CONFIG GET; None if this user may not ask.
-    """
+    """The server's replies to INFO and CONFIG GET; None if this user may not ask."""
 
     info: Mapping[str, str] | None
     config: Mapping[str, str] | None
@@ -71,7 +57,6 @@ class Facts(NamedTuple):
 
 
 def not_allowed(check: str, command: str) -> Finding:
-    """Return the finding that this user lacks a right."""
     rule = "+" + command.lower().replace(" ", "|")
     return Finding(check, UNKNOWN, f"this user may not run {command}", f"ask as an administrator, or allow {rule}")
 
@@ -136,7 +121,6 @@ def is_loopback(host: str) -> bool:
 
 
 def latency(check: str, what: str, seconds: Sequence[float], *, large: bool) -> Finding:
-    """How long round trips take."""
     ranked = sorted(seconds)
     # With fewer than a hundred readings the 99th percentile is the slowest one.
     middle, late = median(ranked), ranked[min(len(ranked) * 99 // 100, len(ranked) - 1)]
@@ -147,7 +131,6 @@ def latency(check: str, what: str, seconds: Sequence[float], *, large: bool) -> 
 
 
 def clock(ahead: float, within: float) -> Finding:
-    """How far the server's clock is from this machine's."""
     text = f"the server's clock is {abs(ahead) * 1000:.1f} ms {'ahead' if ahead > 0 else 'behind'}"
     text += f", give or take {within * 1000:.1f} ms"
     # Only what cannot be the uncertainty of the measurement itself.
@@ -158,7 +141,6 @@ def clock(ahead: float, within: float) -> Finding:
 
 
 def memory(facts: Facts) -> Finding:
-    """How full the server is."""
     if facts.info is None:
         return not_allowed("memory", "INFO")
     used, limit = facts.number("used_memory"), facts.number("maxmemory")
@@ -175,7 +157,6 @@ def memory(facts: Facts) -> Finding:
 
 
 def eviction(facts: Facts) -> Finding:
-    """Whether the server may throw keys away."""
     if facts.info is None:
         return not_allowed("eviction", "INFO")
     policy = facts.info.get("maxmemory_policy", "noeviction")
@@ -242,7 +223,6 @@ def _some(names: Sequence[str]) -> str:
 
 
 def persistence(facts: Facts) -> Finding:
-    """Whether the data outlives the server."""
     if facts.info is None:
         return not_allowed("persistence", "INFO")
     if facts.info.get("rdb_last_bgsave_status", "ok") != "ok" or facts.info.get("aof_last_write_status", "ok") != "ok":

@@ -19,27 +19,17 @@ SERVER, LOOK, CHANGE, LIVE, LOG = "Server", "Look", "Change", "Live", "Record an
 
 
 class Entry(NamedTuple):
-    """What `reem --help` says of one command, and where the command is.
-
-    Attributes:
-        name: What the user types.
-        module: The module that has it: in this package, or below `reem_async` if it has a dot.
-        attribute: Its function, or its typer application if it has subcommands.
-        panel: The heading that it stands under.
-        help: One line; the whole text is the docstring.
-        takes_minus: Its values may begin with a minus sign: unknown options are handed to it as arguments.
-    """
+    """What `reem --help` says of one command, and where the command is."""
 
     name: str
-    module: str
-    attribute: str
+    module: str  # in this package, or below `reem_async` if it has a dot
+    attribute: str  # its function, or its typer application if it has subcommands
     panel: str
     help: str
-    takes_minus: bool = False
+    takes_minus: bool = False  # values may begin with a minus sign: unknown options are handed to it as arguments
 
     @property
     def full_module(self) -> str:
-        """The full name of the module."""
         return f"{'reem_async' if '.' in self.module else 'reem_async.tools.cli'}.{self.module}"
 
 

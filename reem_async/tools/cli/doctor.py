@@ -11,7 +11,7 @@ import textwrap
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from importlib import metadata
-from typing import Annotated, Any, NamedTuple, cast
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -239,12 +239,28 @@ async def _old_data(interface: RedisInterface) -> Finding:
 
 
 async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
-    """Count the arrays that no document refers to, on all servers, and `clean` removes them."""
+    """Count the arrays that no document refers to, on all servers, and `clean` removes them.
+
+    One round trip for about 1000 keys, and one for each top-level key with arrays; two more to remove some of them.
+    """
+    session = interface.session
+    counts, unknown = dict[str, int](), dict[str, str]()
     try:
-        found = await find_orphans(interface.session, remove=clean)
+        tagged = await _tagged(session)
     except RedisError as error:
         return Finding("arrays", UNKNOWN, f"not all keys can be looked at: {for_users(error)}")
-    return checks.orphans(found.counts, {name: for_users(why) for name, why in found.unknown.items()}, removed=clean)
+    for name, suffixes in sorted(tagged.items()):
+        keys = session.keys(name)
+        try:
+            found = await session.run(orphans(keys, suffixes))
+            if found and clean:
+                found = await session.run(remove_orphans(keys, suffixes, session.cache))
+        # Nothing is known of what belongs to a damaged document, or to one that this user may not read.
+        except (ReemError, RedisError) as error:
+            unknown[name] = for_users(error)
+        else:
+            counts |= {name: len(found)} if found else {}
+    return checks.orphans(counts, unknown, removed=clean)
 
 
 async def _keys_at(session: Session, server: Transport) -> Keys:
@@ -382,13 +398,7 @@ async def _sharing(interface: RedisInterface) -> Finding:
 
 
 def shared_memory(reason: str, refusal: str = "", *, contained: bool = False) -> Finding:
-    """Return what to say of it.
-
-    Args:
-        reason: Why memory cannot be shared here, empty if it can.
-        refusal: The error of the server for the channel by which such programs find each other.
-        contained: This is a container whose processes have numbers of their own.
-    """
+    """Return what to say, given why memory cannot be shared, or why the server refuses the channel for it."""
     otherwise = "large values go through the server"
     if reason:
         # Elsewhere than on Linux there is nothing that anybody could mend.
@@ -443,42 +453,6 @@ async def _subscribed(interface: RedisInterface) -> tuple[Any, Any]:
     finally:
         await wire.close()
     return usual, near
-
-
-class Orphans(NamedTuple):
-    """What was found.
-
-    Attributes:
-        counts: How many ships' keys no document refers to, by top-level key.
-        unknown: The top-level keys of which this is not known, and why.
-    """
-
-    counts: dict[str, int]
-    unknown: dict[str, Exception]
-
-
-async def find_orphans(session: Session, *, remove: bool = False) -> Orphans:
-    """Find the ships' keys in a session's namespace that no document refers to; `remove` them.
-
-    One round trip for about 1000 keys of the server, and one for each top-level key with arrays; two more for each key
-    of which some are removed.
-
-    Raises:
-        ClusterNode: The server is one node of several.
-    """
-    counts, unknown = dict[str, int](), dict[str, Exception]()
-    for name, suffixes in sorted((await _tagged(session)).items()):
-        keys = session.keys(name)
-        try:
-            found = await session.run(orphans(keys, suffixes))
-            if found and remove:
-                found = await session.run(remove_orphans(keys, suffixes, session.cache))
-        # Nothing is known of what belongs to a damaged document, or to one that this user may not read.
-        except (ReemError, RedisError) as error:
-            unknown[name] = error
-        else:
-            counts |= {name: len(found)} if found else {}
-    return Orphans(counts, unknown)
 
 
 async def _tagged(session: Session) -> dict[str, list[bytes]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import aclosing, suppress
 from datetime import datetime
 from typing import Annotated, Any
@@ -16,7 +16,7 @@ from reem_async.connection import RedisInterface
 from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, RedisError, ReemError, WrongKind
 from reem_async.plan.paths import Path, Pattern, parse_pattern, spelled_out
 from reem_async.plan.placeholders import Unfetched
-from reem_async.plan.trees import MISSING, get
+from reem_async.plan.trees import MISSING, get, mapped
 from reem_async.pubsub.monitor import ANNOUNCED, Event
 from reem_async.store.catalog import outline
 from reem_async.store.reader import DocumentReader
@@ -150,7 +150,7 @@ def _for_programs(event: Event, value: Any, known: bool, problem: str, skipped: 
     if event.deleted:
         entry["deleted"] = True
     elif known:
-        entry["value"] = _each_leaf(value, _unfetched_as_text) if event.stored else value
+        entry["value"] = mapped(value, _unfetched_as_text) if event.stored else value
     elif problem:
         entry["error"] = problem
     if event.stored:
@@ -201,16 +201,7 @@ def _one_line(value: Any) -> str:
     if isinstance(value, np.ndarray):
         body = np.array2string(value, threshold=12, edgeitems=3, max_line_width=10_000, separator=" ")
         return clean(f"{value.dtype}[{','.join(map(str, value.shape))}] {' '.join(body.split())}")
-    return json_text(_each_leaf(value, _summarised))
-
-
-def _each_leaf(value: Any, change: Callable[[Any], Any]) -> Any:
-    """Return a tree with what a function makes of each leaf."""
-    if isinstance(value, dict):
-        return {key: _each_leaf(item, change) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_each_leaf(item, change) for item in value]
-    return change(value)
+    return json_text(mapped(value, _summarised))
 
 
 def _unfetched_as_text(leaf: Any) -> Any:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from reem_async.concurrency.queues import Last
 from reem_async.connection import RedisInterface
@@ -16,7 +17,7 @@ from reem_async.plan.notices import LARGEST_INLINE
 from reem_async.plan.paths import parse_shown
 from reem_async.pubsub.monitor import Event, Monitor
 from reem_async.pubsub.pattern_watch import PatternWatch
-from reem_async.tools.cli.output import note
+from reem_async.tools.cli.output import emit_json, note, write_over
 from reem_async.tools.cli.running import TIMED_OUT
 
 _WAITING = 100_000
@@ -30,27 +31,16 @@ _NEVER = float("inf")
 
 @dataclass(slots=True)
 class Ending:
-    """What there was to hear, for the last line.
-
-    Attributes:
-        taken: How many updates were taken.
-        lost: How many were lost on the way: their publishers counted them.
-        skipped: How many came faster than they were taken, and were dropped here.
-        gaps: How often the connection broke or a message was unreadable.
-        seconds: How long it went on.
-        paths: Where the updates were, the first 10,000.
-        timed_out: The time was over before there was enough.
-        stored: Plain writes are followed, too.
-    """
+    """What a live command has received, for its last line."""
 
     taken: int = 0
-    lost: int = 0
-    skipped: int = 0
-    gaps: int = 0
+    lost: int = 0  # on the way: their publishers counted them
+    skipped: int = 0  # came faster than they were taken, and were dropped here
+    gaps: int = 0  # the connection broke or a message was unreadable
     seconds: float = 0.0
     paths: set[str] = field(default_factory=set)
     timed_out: bool = False
-    stored: bool = False
+    stored: bool = False  # plain writes are followed, too
 
     def tell(self) -> int:
         """Say in one line how it went; return the exit code."""
@@ -80,17 +70,9 @@ async def follow(
     tick: Callable[[Ending], None] = lambda _: None,
     stored: bool = False,
 ) -> Ending:
-    """Hand each update to `take` until there were `count`, `seconds` are over, or Ctrl-C.
+    """Hand each update to `take` until there were `count`, `seconds` are over, or Ctrl-C; call `tick` in between.
 
-    Args:
-        interface: The server.
-        patterns: Which paths; all if there is none.
-        take: Is called, and awaited if it returns something to await.
-        count: How many to take, None for no end.
-        seconds: How long, None for no end.
-        every: Seconds between calls of `tick`; None to never call it.
-        tick: Shows what there is so far.
-        stored: Also hand on what is only stored; arrays of over 16 KB are not fetched for that.
+    With `stored`, plain writes are handed on, too; arrays of over 16 KB are not fetched for that.
     """
     ending, start = Ending(), time.monotonic()
     end = start + seconds if seconds else _NEVER
@@ -146,6 +128,29 @@ async def _hand_on(watch: PatternWatch, monitor: Monitor) -> None:
             monitor.queue.put(
                 Event(parse_shown(update.path), update.value, update.deleted, 0, now, now, "", 0, stored=True)
             )
+
+
+@contextlib.asynccontextmanager
+async def progress(
+    text: Callable[[], str], data: Callable[[], dict[str, Any]], every: float, *, as_json: bool
+) -> AsyncIterator[None]:
+    """Show how something is getting on: a line in place of the last one, or for scripts a line of JSON a second."""
+
+    async def show() -> None:
+        while True:
+            await asyncio.sleep(1.0 if as_json else every)
+            if as_json:
+                emit_json(data())
+            else:
+                write_over(text())
+
+    task = asyncio.create_task(show())
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        write_over("")
 
 
 def _enter(event: Event, ending: Ending) -> None:

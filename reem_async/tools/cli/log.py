@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import datetime
 import os
 import shutil
 import sys
 import tempfile
-from collections.abc import AsyncIterator
 from contextlib import ExitStack
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,17 +17,18 @@ import typer
 
 from reem_async.connection import RedisInterface
 from reem_async.errors import BadValue
+from reem_async.tools.cli.following import progress
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
 from reem_async.tools.cli.output import (
     clean,
     columns,
     emit,
     emit_json,
+    figures,
     note,
     progress_bar,
     size_text,
     styled,
-    write_over,
 )
 from reem_async.tools.cli.record import tools
 from reem_async.tools.cli.running import USAGE, CommandFailed, run, run_local
@@ -41,13 +41,16 @@ _NOTICED_LAG = 0.1
 
 _STDOUT = Path("-")
 
+_File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
+_Only = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
+]
+
 
 def play(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")],
-    patterns: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
-    ] = None,
+    file: _File,
+    patterns: _Only = None,
     rate: Annotated[
         float, typer.Option("--rate", "-r", min=0.001, max=1_000_000, metavar="N", help="N times as fast as it was.")
     ] = 1.0,
@@ -93,7 +96,9 @@ def play(
                 if step:
                     await _step(replayer, log, as_json)
                 else:
-                    async with _progress(replayer, as_json):
+                    async with progress(
+                        lambda: _progress(replayer), lambda: figures(replayer.status, 6), 0.1, as_json=as_json
+                    ):
                         await replayer.play()
             finally:
                 _end(replayer.status, file, as_json)
@@ -148,39 +153,17 @@ def _read_line() -> bytes:
     return line
 
 
-@contextlib.asynccontextmanager
-async def _progress(replayer: Replayer, as_json: bool) -> AsyncIterator[None]:
-    """Show the progress: a line that is written over on a terminal, a line of JSON a second for scripts."""
-    task = asyncio.create_task(_show(replayer, as_json))
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        write_over("")
-
-
-async def _show(replayer: Replayer, as_json: bool) -> None:
-    while True:
-        await asyncio.sleep(1.0 if as_json else 0.1)
-        status = replayer.status
-        if as_json:
-            emit_json(_fields(status))
-            continue
-        done, length = status.position - replayer.start, replayer.end - replayer.start
-        lag = f"  {status.lag:.2f} s behind" if status.lag > _NOTICED_LAG else ""
-        rounds = f"  round {status.rounds + 1}" if status.rounds else ""
-        write_over(f"{done:.1f}/{length:.1f} s  {status.published} published{rounds}{lag}")
-
-
-def _fields(status: ReplayStatus) -> dict[str, float]:
-    names = ("position", "published", "refused", "lag", "most_lag", "rounds", "unreadable")
-    return {name: round(getattr(status, name), 6) for name in names}
+def _progress(replayer: Replayer) -> str:
+    status = replayer.status
+    done, length = status.position - replayer.start, replayer.end - replayer.start
+    lag = f"  {status.lag:.2f} s behind" if status.lag > _NOTICED_LAG else ""
+    rounds = f"  round {status.rounds + 1}" if status.rounds else ""
+    return f"{done:.1f}/{length:.1f} s  {status.published} published{rounds}{lag}"
 
 
 def _end(status: ReplayStatus, file: Path, as_json: bool) -> None:
     if as_json:
-        emit_json(_fields(status) | {"ended": True})
+        emit_json(figures(status, 6) | {"ended": True})
         return
     text = f"{file}: {status.published} published"
     if status.refused:
@@ -198,9 +181,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
-
-
-_File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
 
 
 @app.command()
@@ -243,13 +223,8 @@ def _summary(log: Log, channels: list[ChannelSummary]) -> dict[str, Any]:
         "damaged": log.damaged,
         "gaps": [{"time": time, "path": path, "missed": missed} for time, path, missed in log.gaps()],
         "metadata": log.metadata,
-        "channels": [_channel(each) for each in channels],
+        "channels": [asdict(each) | {"rate": each.rate} for each in channels],
     }
-
-
-def _channel(each: ChannelSummary) -> dict[str, Any]:
-    names = ("topic", "path", "role", "kind", "schema", "messages", "bytes", "first", "last", "rate")
-    return {name: getattr(each, name) for name in names}
 
 
 def _print(log: Log, channels: list[ChannelSummary]) -> None:
@@ -315,10 +290,7 @@ def _when(instant: float) -> str:
 @app.command()
 def export(
     file: _File,
-    patterns: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
-    ] = None,
+    patterns: _Only = None,
     to: Annotated[
         str | None,
         typer.Option(

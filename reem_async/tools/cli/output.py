@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import re
@@ -81,6 +82,11 @@ def json_text(value: Any, *, pretty: bool = False) -> str:
     return "\n".join(map(clean, jsontext.json_text(value, pretty=pretty).split("\n")))
 
 
+def figures(status: Any, digits: int) -> dict[str, float]:
+    """Return the fields of a dataclass of numbers, rounded, for JSON."""
+    return {name: round(number, digits) for name, number in dataclasses.asdict(status).items()}
+
+
 def emit_json(value: Any) -> None:
     """Print a value as a line of JSON, at once: a program may wait for it."""
     emit(json_text(value))
@@ -118,13 +124,9 @@ def columns(
     right: frozenset[int] = frozenset(),
     shrink: Sequence[int] = (0,),
 ) -> None:
-    """Print rows: aligned and coloured on a terminal, separated by tabs elsewhere.
+    """Print rows of clean cells: aligned and coloured on a terminal, separated by tabs elsewhere.
 
-    Args:
-        rows: The cells, clean.
-        styles: The colour of each column, "" for none.
-        right: Which columns are numbers.
-        shrink: Which columns are cut on a narrow terminal, in this order.
+    Columns in `right` are numbers; those in `shrink` are cut on a narrow terminal, in this order.
     """
     if not is_terminal():
         for row in rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,7 @@ import typer
 from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
 from reem_async.connection import RedisInterface
 from reem_async.errors import BadValue
+from reem_async.tools.cli.following import progress
 from reem_async.tools.cli.options import (
     DEFAULT_URL,
     AsJson,
@@ -23,7 +25,7 @@ from reem_async.tools.cli.options import (
     existing,
     named_ships,
 )
-from reem_async.tools.cli.output import clean, emit, emit_json, note, size_text, write_over
+from reem_async.tools.cli.output import clean, emit, emit_json, figures, note, size_text
 from reem_async.tools.cli.running import CommandFailed, guarded, run
 from reem_async.transport.options import look_nearby
 
@@ -104,11 +106,8 @@ def record(
             async with recorder:
                 begun = True
                 _begin(recorder, duration, as_json)
-                shown = asyncio.create_task(_show(recorder, as_json))
-                try:
+                async with _progress(recorder, as_json):
                     await recorder.wait(duration)
-                finally:
-                    shown.cancel()
         except asyncio.CancelledError:  # Ctrl-C is how a recording ends; it may have failed all the same
             if not begun:  # there is no recording
                 raise
@@ -136,27 +135,32 @@ def tools(name: str) -> Any:
     return getattr(recording, name)
 
 
-async def _show(recorder: Recorder, as_json: bool) -> None:
-    """Show how it is getting on: a line that is written over on a terminal, lines of JSON for scripts."""
+def _progress(recorder: Recorder, as_json: bool) -> AbstractAsyncContextManager[None]:
     before, then = recorder.status, time.monotonic()
-    while True:
-        await asyncio.sleep(1.0 if as_json else _SHOWN_EVERY)
-        status, now = recorder.status, time.monotonic()
-        rates = (status.messages - before.messages) / (now - then), (status.bytes - before.bytes) / (now - then)
-        # Rates are of the time since the last line, not of the whole recording.
-        before, then = status, now
-        if as_json:
-            emit_json(_fields(status) | {"rate": round(rates[0], 1)})
-        else:
-            text = f"{_clock(status.seconds)}  {status.messages} messages  {rates[0]:.0f}/s  {size_text(rates[1])}/s"
-            text += f"  {size_text(status.file_bytes)} in the file  {_missing(status)}"
-            write_over(text)
+
+    def looked() -> tuple[RecorderStatus, float, float]:
+        """Return the status, and messages and bytes a second since the last look."""
+        nonlocal before, then
+        old, since = before, then
+        before, then = recorder.status, time.monotonic()
+        return before, (before.messages - old.messages) / (then - since), (before.bytes - old.bytes) / (then - since)
+
+    def text() -> str:
+        status, messages, size = looked()
+        line = f"{_clock(status.seconds)}  {status.messages} messages  {messages:.0f}/s  {size_text(size)}/s"
+        return f"{line}  {size_text(status.file_bytes)} in the file  {_missing(status)}"
+
+    def data() -> dict[str, Any]:
+        status, messages, _ = looked()
+        return figures(status, 3) | {"rate": round(messages, 1)}
+
+    return progress(text, data, _SHOWN_EVERY, as_json=as_json)
 
 
 def _begin(recorder: Recorder, duration: float | None, as_json: bool) -> None:
     """Say that it has begun: from now on nothing is missed, and Ctrl-C completes the file."""
     if as_json:
-        emit_json(_fields(recorder.status))
+        emit_json(figures(recorder.status, 3))
     else:
         note(f"recording into {recorder.path} " + ("until Ctrl-C" if duration is None else f"for {duration:g} s"))
 
@@ -173,30 +177,12 @@ def _nothing(patterns: list[str], failed: int) -> str:
 
 def _end(recorder: Recorder, as_json: bool) -> None:
     status = recorder.status
-    write_over("")
     if as_json:
-        emit_json(_fields(status) | {"file": str(recorder.path), "ended": True})
+        emit_json(figures(status, 3) | {"file": str(recorder.path), "ended": True})
         return
     size = recorder.path.stat().st_size if recorder.path.exists() else 0
     what = f"{status.messages} messages, {size_text(status.bytes)} in {_clock(status.seconds)}"
     emit(clean(f"{recorder.path}: {what}, {size_text(size)} in the file; {_missing(status)}"))
-
-
-def _fields(status: RecorderStatus) -> dict[str, Any]:
-    names = (
-        "seconds",
-        "messages",
-        "bytes",
-        "file_bytes",
-        "dropped",
-        "skipped",
-        "gaps",
-        "lost",
-        "late",
-        "failed",
-        "rate",
-    )
-    return {name: round(getattr(status, name), 3) for name in names}
 
 
 def _missing(status: RecorderStatus) -> str:

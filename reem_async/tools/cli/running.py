@@ -34,11 +34,7 @@ CALL_SECONDS = 5.0
 
 
 class CommandFailed(Exception):
-    """A command cannot be done; the message says why and what to do.
-
-    Attributes:
-        code: The exit code.
-    """
+    """A command cannot be done; the message says why and what to do."""
 
     def __init__(self, message: str, code: int = FAILED) -> None:
         super().__init__(message)
@@ -54,15 +50,9 @@ def run(
     live: bool = False,
     ships: Sequence[Any] | None = None,
 ) -> None:
-    """Connect, do `work`, and turn what goes wrong into a line and an exit code.
+    """Connect, do `work`, which returns the exit code, and turn what goes wrong into a line and an exit code.
 
-    Args:
-        name: The command, for messages.
-        work: What to do with the server; returns the exit code, None for 0.
-        url: The server.
-        namespace: What goes before every key.
-        live: The command goes on until Ctrl-C.
-        ships: The interface's ships; None for the default ones.
+    A `live` command goes on until Ctrl-C.
     """
     run_local(name, lambda: asyncio.run(_connected(work, url, namespace, ships)), live=live)
 
@@ -77,11 +67,7 @@ def run_local(name: str, work: Callable[[], int | None], *, live: bool = False) 
 
 @contextmanager
 def guarded(name: str, *, live: bool = False) -> Iterator[None]:
-    """End the command where the block fails: errors that users can do something about become one line.
-
-    Raises:
-        typer.Exit: The block failed, was interrupted, or could not print.
-    """
+    """End the command where the block fails: errors that users can do something about become one line."""
     try:
         with _short_warnings(name):
             yield

@@ -356,15 +356,12 @@ def _show_files(found: list[Snapshot], damaged: dict[str, str], directory: Path,
 
 def _show_keys(it: Snapshot, as_json: bool) -> None:
     if as_json:
-        values = [
-            {
-                "key": key.name,
-                "size": key.size,
-                "values": [{"place": place, "type": kind, "size": size} for place, kind, size in key.values],
-            }
+        names = ("place", "type", "size")
+        keys = [
+            {"key": key.name, "size": key.size, "values": [dict(zip(names, each, strict=True)) for each in key.values]}
             for key in it.keys
         ]
-        emit_json({**facts(it), "keys": values})
+        emit_json({**facts(it), "keys": keys})
         return
     emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, taken {_when(it)} at {clean(it.server) or 'unknown'}")
     rows = [[clean(key.name), size_text(key.size), _arrays(len(key.values))] for key in it.keys]
@@ -379,18 +376,8 @@ def _arrays(count: int) -> str:
 
 def facts(it: Snapshot) -> dict[str, Any]:
     """Return what `--json` says of a snapshot."""
-    return {
-        "path": str(it.path),
-        "kind": it.kind,
-        "time": it.time,
-        "size": it.size,
-        "count": it.count,
-        "server": it.server,
-        "namespace": it.namespace,
-        "foreign": it.foreign,
-        "foreign_names": it.foreign_names,
-        "unsaved": dict(it.unsaved),
-    }
+    names = ("kind", "time", "size", "count", "server", "namespace", "foreign", "foreign_names")
+    return {"path": str(it.path), **{name: getattr(it, name) for name in names}, "unsaved": dict(it.unsaved)}
 
 
 def _when(it: Snapshot) -> str:

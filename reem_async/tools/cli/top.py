@@ -38,12 +38,7 @@ _BETWEEN = 2  # blanks between two columns
 
 
 class Window:
-    """The last `length` updates of one path.
-
-    Attributes:
-        total: How many updates there were in all.
-        lost: How many were lost on the way.
-    """
+    """The last `length` updates of one path, and how many there were and were lost in all."""
 
     def __init__(self, length: int) -> None:
         self.total = 0
@@ -119,16 +114,9 @@ def spread(values: Sequence[float]) -> Spread | None:
 
 
 class View(NamedTuple):
-    """What one of the commands shows of a window.
+    """What one of the commands shows of a window: columns after the path, the same for programs, and a remark."""
 
-    Attributes:
-        headers: Of the columns after the path; the last ones may be left out on a narrow terminal.
-        cells: The text in these columns.
-        data: The same for programs.
-        remark: What one should know to read it.
-    """
-
-    headers: tuple[str, ...]
+    headers: tuple[str, ...]  # the last ones may be left out on a narrow terminal
     cells: Callable[[Window], tuple[str, ...]]
     data: Callable[[Window], dict[str, Any]]
     remark: str = ""
@@ -203,15 +191,7 @@ ALL = View(
 
 
 class Board:
-    """The windows of all paths that were updated.
-
-    Args:
-        view: What is shown of them.
-        length: How many updates of a path count.
-
-    Attributes:
-        windows: By path; in the view of `reem top` by top-level key.
-    """
+    """The windows of all paths that were updated; in the view of `reem top`, of all top-level keys."""
 
     def __init__(self, view: View, length: int = _WINDOW) -> None:
         self.view = view

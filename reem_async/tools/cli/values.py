@@ -20,6 +20,7 @@ from reem_async.connection import RedisInterface
 from reem_async.errors import MissingKey
 from reem_async.plan.paths import Path as KeyPath
 from reem_async.plan.paths import show
+from reem_async.plan.trees import walk
 from reem_async.store.accessor import Accessor
 from reem_async.store.catalog import Outline, outline
 from reem_async.store.publish import PublishSpace
@@ -221,21 +222,12 @@ async def _ask(interface: RedisInterface, path: str) -> None:
 
 
 def _agreed(question: str) -> bool:
-    """Ask; Ctrl-C ends the asking, which the event loop, standing still meanwhile, would not get to know of."""
-    pressed = []
-
-    def interrupted(*_: object) -> NoReturn:
-        pressed.append(True)
-        raise KeyboardInterrupt
-
     # asyncio's handler would only set a flag for the event loop, which stands still while it is asked.
-    before = signal.signal(signal.SIGINT, interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        return typer.confirm(question, err=True)
-    except typer.Abort:
-        if pressed:
-            raise asyncio.CancelledError from None
-        return False  # the end of the input is no answer
+        sys.stderr.write(f"{question} [y/N]: ")
+        sys.stderr.flush()
+        return sys.stdin.readline().strip().lower() in ("y", "yes")  # the end of the input is no answer
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -423,8 +415,9 @@ def _write_npy(value: Any, file: IO[bytes], where: str) -> str:
 
 def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
     # By path, so that two arrays of the same key in different dicts do not collide.
-    arrays: dict[str, Any] = {}
-    others = _collect(value, (), arrays)
+    leaves = [(path, leaf) for path, leaf in walk(value, ()) if not isinstance(leaf, dict | list)]
+    arrays = {typed(path) if path else "data": leaf for path, leaf in leaves if isinstance(leaf, np.ndarray)}
+    others = len(leaves) - len(arrays)
     if not arrays:
         raise CommandFailed(f"{where} holds no array; use a .json file")
     # Uncompressed, as numpy.savez writes it: arrays hardly shrink.
@@ -434,18 +427,6 @@ def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
                 np.lib.format.write_array(member, array, allow_pickle=False)
     left = f"; {others} other values left out" if others else ""
     return f"{len(arrays)} array{'' if len(arrays) == 1 else 's'}{left}"
-
-
-def _collect(value: Any, path: tuple[str | int, ...], arrays: dict[str, Any]) -> int:
-    """Enter the arrays below `value` by their paths; return how many other values there are."""
-    if isinstance(value, np.ndarray):
-        arrays[typed(path) if path else "data"] = value
-        return 0
-    if isinstance(value, dict):
-        return sum([_collect(item, (*path, key), arrays) for key, item in value.items()])
-    if isinstance(value, list):
-        return sum([_collect(item, (*path, place), arrays) for place, item in enumerate(value)])
-    return 1
 
 
 def _write_json(value: Any, file: IO[bytes], where: str) -> str:
