@@ -81,7 +81,6 @@ class Sink:
             raise
         self._schemas: dict[Any, int] = {}
         self._channels: dict[Any, int] = {}
-        self._matched: dict[Any, int] = {}  # which channel messages of a signature go to: found once
         self._known: dict[Any, list[tuple[Signature, int]]] = {}
         self._count = 0
         self._new: list[Any] = []
@@ -92,20 +91,13 @@ class Sink:
     def json(self, path: Path, role: Role, kind: Kind, document: JsonMessage, stamp: tuple[int, int, int]) -> int:
         """Write a JSON message; returns its bytes. `stamp` is log time and publish time in ns, and a number."""
         found = signature(document.tree) if role == Role.UPDATE else OPEN
-        key = path, role, kind, document.wrapped, found
-        channel = self._matched.get(key)
-        if channel is None:
-            # Only to be quick: what is forgotten is found again by `fits`.
-            if len(self._matched) >= _MOST_CHANNELS:
-                self._matched.clear()
-            channel = self._matched[key] = self._json_channel(path, role, kind, document.wrapped, found)
-        return self._message(channel, [document.text], stamp)
+        return self._message(self._json_channel(path, role, kind, document.wrapped, found), [document.text], stamp)
 
     def _json_channel(self, path: Path, role: Role, kind: Kind, wrapped: bool, found: Signature) -> int:
         place = path, role, kind, wrapped
         known = self._known.get(place, [])
         for types, channel in known:
-            if fits(found, types):
+            if found == types or fits(found, types):
                 return channel
         self._check_room()
         # A path that changes its type all the time gets a schema without types.
@@ -140,7 +132,6 @@ class Sink:
         self._message(self._channels["statistics"], [document.text], stamp)
 
     def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
-        """Return the number and the name of a schema."""
         key = name, encoding, known
         if key not in self._schemas:
             text = schema_bytes(name) if encoding == "protobuf" else schema_text(name, known)
@@ -201,7 +192,7 @@ class Sink:
 
 
 Signature = Any
-"""The types in a message: a str for a plain value, a tuple of pairs for an object, a list of one for an array,
+"""The types in a message: a str for a plain value, a tuple of pairs for an object, a set of one for an array,
 None where any value may be."""
 
 OPEN: Signature = ()
@@ -220,23 +211,8 @@ def signature(value: Any) -> Signature:
     if kind is dict:
         return tuple([(key, signature(item)) for key, item in value.items()])
     if kind is list or kind is tuple:
-        return _Items(signature(value[0])) if value and _alike(value) else None
+        return frozenset([signature(value[0])]) if value and _alike(value) else None
     return None
-
-
-class _Items(tuple[Any, ...]):
-    """The signature of an array, by that of its items."""
-
-    __slots__ = ()
-
-    def __new__(cls, item: Signature) -> _Items:
-        return super().__new__(cls, (item,))
-
-    def __eq__(self, other: object) -> bool:
-        return type(other) is _Items and super().__eq__(other)
-
-    def __hash__(self) -> int:
-        return hash(("items", *self))
 
 
 def _alike(items: Any) -> bool:
@@ -252,8 +228,8 @@ def fits(found: Signature, known: Signature) -> bool:
         return True
     if type(found) is not type(known):
         return False
-    if type(found) is _Items:
-        return fits(found[0], known[0])
+    if type(found) is frozenset:
+        return fits(*found, *known)
     if type(found) is tuple:
         types = dict(known)
         return all(fits(kind, types[key]) for key, kind in found if key in types)
@@ -269,8 +245,9 @@ _DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def _schema(known: Signature) -> dict[str, Any]:
-    if type(known) is _Items:
-        return {"type": "array", "items": _schema(known[0])} if known[0] is not None else {"type": "array"}
+    if type(known) is frozenset:
+        (item,) = known
+        return {"type": "array"} if item is None else {"type": "array", "items": _schema(item)}
     if type(known) is tuple:
         # null and mixed arrays have no type that viewers take: the object is open, so they may be left out.
         fields = {key: _schema(kind) for key, kind in known if kind is not None}
