@@ -92,7 +92,8 @@ class Program:
 
     def check_output(self) -> None:
         """Complain of what a clean program does not print. Errors of REEM are due, and Ctrl-C as it imports modules."""
-        said = self.said()
+        # A callback of Python's imports that Ctrl-C ends.
+        said = self.said().replace("Exception ignored in: <function _get_module_lock", "")
         found = [line for line in said.splitlines() if any(words in line for words in COMPLAINTS[:3] + COMPLAINTS[4:])]
         for block in said.split("Traceback (most recent call last):\n")[1:]:
             last = next((line for line in block.splitlines() if re.match(r"[\w.]+: |[\w.]+$", line)), "")
