@@ -226,7 +226,9 @@ def test_cut_at_every_record_it_is_equal_or_reported(original, file):
             try:
                 with open_log(file) as log:
                     found = contents(log, instants)
-                    unknown = {it[0] for (_, part), told in found.items() if part == 0 for it in told if it not in known}
+                    unknown = {
+                        it[0] for (_, part), told in found.items() if part == 0 for it in told if it not in known
+                    }
                     # The tail may complete one message that has no checksum.
                     last = max(it for it in starts(data) if it <= place)
                     unsure = data[last] == 5 or (data[last] == 6 and not any(data[last + 33 : last + 37]))
