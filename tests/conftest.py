@@ -252,6 +252,18 @@ def url_of_user(url, name, password):
     return f"{scheme}://{name}:{password}@{rest.rpartition('@')[2]}"
 
 
+@contextlib.asynccontextmanager
+async def server_without_right(right):
+    """A server of its own: a store there, and the address of a user who lacks one right."""
+    import reem_async
+    from reem_async.server.embedded import EmbeddedServer
+
+    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as interface:
+        with redis.Redis.from_url(server.url) as client:
+            client.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", f"-{right}")
+        yield reem_async.KeyValueStore(interface), url_of_user(server.url, "robot", "pw")
+
+
 class Keys:
     """Makes names that no other test uses: `key("foo")` and `key("foobar")` share their beginning."""
 

@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 import redis
-from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, subscribed, url_of_user
+from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, server_without_right, subscribed
 
 import reem_async
 from reem_async.plan.trees import MISSING
@@ -182,13 +182,10 @@ async def test_what_is_published_all_the_time_is_read_now_and_then(server_url, k
 @pytest.mark.long
 @pytest.mark.parametrize("right", ["client|tracking", "type"])
 async def test_who_may_not_track_looks_once_a_second_and_says_so(caplog, right):
-    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
-        with contextlib.closing(redis.Redis(port=server.port)) as raw:
-            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", f"-{right}")
-        kvs = reem_async.KeyValueStore(own)
+    async with server_without_right(right) as (kvs, url):
         await kvs["a"].write({"n": 1, "array": np.zeros(5)})
         with caplog.at_level(logging.WARNING, "reem"):
-            async with past_of(url_of_user(server.url, "robot", "pw")) as source:
+            async with past_of(url) as source:
                 await seen(source, 1, "a", "n")
                 at = time.time()
                 for number in range(2, 4):
@@ -205,12 +202,9 @@ async def test_who_may_not_track_looks_once_a_second_and_says_so(caplog, right):
 
 
 async def test_who_may_not_track_is_not_shown_the_present_of_an_array_for_its_past():
-    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
-        with contextlib.closing(redis.Redis(port=server.port)) as raw:
-            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-client|tracking")
-        kvs = reem_async.KeyValueStore(own)
+    async with server_without_right("client|tracking") as (kvs, url):
         await kvs["a"].write({"n": 1, "array": np.zeros(5)})
-        async with past_of(url_of_user(server.url, "robot", "pw")) as source:
+        async with past_of(url) as source:
             await seen(source, 1, "a", "n")
             at = time.time()
             await kvs["a"]["array"].write(np.ones(5))

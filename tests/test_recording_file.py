@@ -15,7 +15,6 @@ import tracemalloc
 import mcap.reader
 import mcap.writer
 import numpy as np
-import orjson
 import pytest
 from conftest import aeventually, assert_same, eventually, python, sized
 from test_recording import FRAME, IMAGE
@@ -24,7 +23,7 @@ from test_recording_layout import RawImage
 import reem
 import reem.recording
 from reem_async.errors import BadData, BadValue, MissingKey
-from reem_async.tools.recording import DamagedRecording, Recorder, RecordingFailed, open_log
+from reem_async.tools.recording import DamagedRecording, Recorder, open_log
 from reem_async.tools.recording import mcap_writer as recording_writer
 from reem_async.tools.recording.mcap_writer import McapWriter
 from reem_async.tools.recording.output import Output
@@ -269,6 +268,8 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
         found, count = check(damaged, names, seen)
         worst = min(worst, found if is_whole else worst)
         noticed += count > 0
+        with open_log(damaged) as log:
+            assert not is_whole or log.verify(), f"bit {place}"
         assert is_whole or count or found == whole, f"bit {place}"
     assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
     assert noticed > 40
@@ -341,26 +342,6 @@ def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp
             log.verify()
 
 
-@pytest.mark.long
-def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_values, tmp_path):
-    """Any bit of a log time: either what is told is right, or `verify` says that something is damaged."""
-    file, seen = file_and_values
-    whole, damaged = file.read_bytes(), tmp_path / "damaged.mcap"
-    with open_log(file) as log:
-        places = [info for info in log._container.chunks if info.index_length][-2:]
-    for info in places:
-        for offset in range(info.index, info.index + info.index_length):
-            data = bytearray(whole)
-            data[offset] ^= 1 << random.Random(offset).randrange(8)
-            damaged.write_bytes(data)
-            with open_log(damaged) as log:
-                assert log.verify() >= 1
-                assert log.channels()
-                time, value = seen[-1]
-                with contextlib.suppress(DamagedRecording):  # the whole chunk is left out
-                    assert log[names("a")].at(time)["n"] <= value["n"]
-
-
 def test_history_goes_on_from_a_keyframe_behind_what_is_damaged(names, file_and_values, tmp_path):
     file, _ = file_and_values
     with open_log(file) as log:
@@ -409,27 +390,6 @@ async def test_what_is_no_recording(tmp_path, recorded):
         open_log(foreign)
     with pytest.raises(FileNotFoundError):
         open_log(tmp_path / "none.mcap")
-
-
-async def test_hostile_contents_are_refused(tmp_path):
-    """Well-formed MCAP whose notes lie."""
-    file = tmp_path / "hostile.mcap"
-    notes = orjson.dumps([[["a"], "stored", "numpy", ["x"], 1, 5, "", "", None]]).decode()
-    with file.open("wb") as stream:
-        writer = mcap.writer.Writer(stream)
-        writer.start()
-        schema = writer.register_schema("x", "jsonschema", b"{}")
-        metadata = {"reem.path": '["x"]', "reem.role": "update", "reem.kind": "pub"}
-        channel = writer.register_channel("/x", "json", schema, metadata)
-        writer.add_message(channel, 1_000_000, orjson.dumps({"a": 1, "$ship": notes}), 1)
-        writer.add_message(channel, 2_000_000, b"\xff", 1)
-        writer.finish()
-    with open_log(file) as log:
-        with pytest.raises(DamagedRecording, match="x"):
-            log["x"].at(0.001)
-        with pytest.raises(DamagedRecording):
-            log["x"].at(0.002)
-        assert list(log.updates()) == []
 
 
 RECORD = """
@@ -530,11 +490,3 @@ def test_a_full_disk_ends_the_recording_and_leaves_a_file_that_can_be_read(key, 
         assert numbers == sorted(set(numbers))
         assert 30 < len(numbers) < 130
         assert log.verify() == 0
-
-
-def test_no_space_at_all(key, server_url, interface):
-    """/dev/full takes nothing: said at once, and by the error that says why."""
-    if not os.path.exists("/dev/full"):
-        pytest.skip("no /dev/full here")
-    with pytest.raises((RecordingFailed, OSError), match="No space left"):
-        reem.recording.Recorder(interface, [key("a")], "/dev/full", overwrite=True)

@@ -323,6 +323,8 @@ def test_only_what_patterns_name_is_kept():
     assert pruned({"left": 1}, ("robot",), patterns) == {}
     assert pruned(1, ("robot",), patterns) is MISSING
     assert pruned(tree, ("arm",), patterns) is MISSING
+    dicts_stay = parse_pattern("a.b"), parse_pattern("a.*.c")  # only a dict on the way stays empty
+    assert pruned({"x": 1, "y": {"z": 1}}, ("a",), dicts_stay) == {"y": {}}
     long, image = (Reference(label, ("robot", "left"), 0, 9) for label in ("list", "numpy"))
     assert pruned({"left": long, "right": image}, ("robot",), patterns) == {"left": long}  # as a short list
 

@@ -12,10 +12,8 @@ import pytest
 from conftest import PATIENCE, Remembering, aeventually, assert_same
 
 import reem_async
-from reem_async.plan.paths import parse_pattern
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.recording import Recorder, Replayer, key_recorder, open_log
-from reem_async.tools.recording.stored import pruned
 from reem_async.tools.recording.times import published
 
 LARGE = np.zeros((300, 300))
@@ -272,11 +270,6 @@ async def test_parts_of_keys_have_their_parents(key, apspace, akvs, binterface, 
         status = await Replayer(binterface, log, rate=100, patterns=[f"{key()}.b.v"]).play()
     assert status.refused == 0
     assert await akvs[key()].read() == {"b": {}}
-
-
-def test_only_a_dict_on_the_way_stays_empty():
-    patterns = parse_pattern("a.b"), parse_pattern("a.*.c")
-    assert pruned({"x": 1, "y": {"z": 1}}, ("a",), patterns) == {"y": {}}
 
 
 @pytest.mark.parametrize("clock", [5.0, -1e9, 2e10, 1e300, math.inf, math.nan])

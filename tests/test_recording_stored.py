@@ -9,13 +9,10 @@ import logging
 
 import numpy as np
 import pytest
-import redis
-from clusterkit import owner, raw_of
-from conftest import PLAIN, RawCluster, Remembering, aeventually, assert_same, eventually
+from conftest import PLAIN, RawCluster, Remembering, aeventually, assert_same, eventually, server_without_right
 
 import reem_async
 from reem_async.pubsub.manager import manager_of
-from reem_async.server.embedded import EmbeddedServer
 from reem_async.tools.recording import Recorder, Replayer, open_log
 from reem_async.tools.recording.export import export
 
@@ -325,6 +322,7 @@ async def test_it_goes_on_after_a_broken_connection(key, akvs, server_url, raw, 
         await akvs[key()]["n"].write(2)
         await recorder.written(key())
     with open_log(file) as log:
+        assert [path for _, path, _ in log.gaps()] == [key()]
         assert_same(log[key()].at(log.end), {"n": 2, "a": FRAME + np.uint8(1)})
         stored = [(update.shown, update.kind) for update in log.updates()][1:]
         assert stored == [(f"{key()}.n", "stored"), (f"{key()}.a", "stored"), (f"{key()}.n", "stored")]
@@ -333,17 +331,10 @@ async def test_it_goes_on_after_a_broken_connection(key, akvs, server_url, raw, 
 @pytest.mark.parametrize("right", ["client|tracking", "type"])
 async def test_who_may_not_track_has_it_at_the_keyframes_and_is_warned_once(file, caplog, right):
     """As before there were such messages; it is marked as found."""
-    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
-        with contextlib.closing(redis.Redis(port=server.port)) as raw:
-            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", f"-{right}")
-        kvs = reem_async.KeyValueStore(own)
+    async with server_without_right(right) as (kvs, url), reem_async.RedisInterface(url) as other:
         await kvs["a"].write({"n": 1})
-        url = f"redis://robot:pw@127.0.0.1:{server.port}"
         with caplog.at_level(logging.WARNING, "reem"):
-            async with (
-                reem_async.RedisInterface(url) as other,
-                recording(other, ["*"], file, keyframe=0.1) as recorder,
-            ):
+            async with recording(other, ["*"], file, keyframe=0.1) as recorder:
                 before = recorder.status.messages
                 await kvs["a"]["n"].write(2)
                 await kvs["b"].write(3)
@@ -361,13 +352,9 @@ async def test_who_may_not_track_has_it_at_the_keyframes_and_is_warned_once(file
 async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_nothing_of_it(file):
     """However much was read of it just before."""
     large = np.zeros(1_000_000)
-    async with EmbeddedServer() as server, reem_async.RedisInterface(server) as own:
-        with contextlib.closing(redis.Redis(port=server.port)) as raw:
-            raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-client|tracking")
-        kvs = reem_async.KeyValueStore(own)
+    async with server_without_right("client|tracking") as (kvs, url), reem_async.RedisInterface(url) as other:
         await kvs["a"].write({"n": 1, "large": large})
-        url = f"redis://robot:pw@127.0.0.1:{server.port}"
-        async with reem_async.RedisInterface(url) as other, recording(other, ["*"], file) as recorder:
+        async with recording(other, ["*"], file) as recorder:
             await aeventually(lambda: not recorder._key_recorder("a").busy)
             assert recorder._key_recorder("a")._reader.feed.attachments._raw is None
             await kvs["a"]["n"].write(2)
@@ -407,36 +394,3 @@ async def test_play_and_export_say_what_was_only_stored(key, akvs, apspace, bint
         ("published", {"n": 2}),
         ("published", {}),
     ]
-
-
-async def test_on_a_cluster_each_node_tells(cluster, key, file):
-    """Of keys that are there and of new ones, also over a connection that was made anew."""
-    async with reem_async.RedisInterface(cluster) as one, reem_async.RedisInterface(cluster) as two:
-        kvs, names = reem_async.KeyValueStore(one), [key(f"k{number}") for number in range(8)]
-        assert len({owner(cluster, name).port for name in names}) > 1
-        for name in names[:6]:
-            await kvs[name].write({"n": 0, "a": FRAME})
-        async with recording(two, [key("*")], file) as recorder:
-            for name in names[:6]:
-                await kvs[name]["n"].write(1)
-                await recorder.written(name)
-            for name in names[6:]:
-                await kvs[name].write({"n": 1, "a": FRAME})
-                await recorder.written(name)
-            manager = manager_of(two.session)
-            for node in cluster.nodes:
-                wires = set(manager._wires.values())
-                with raw_of(node) as raw:
-                    raw.client_kill_filter(_type="pubsub")
-                await aeventually(lambda wires=wires: len(set(manager._wires.values()) - wires) == 1)
-            await aeventually(lambda: not manager._missing())
-            # Each key is read after each loss: what is found then may have been published.
-            await aeventually(lambda: recorder.status.gaps >= len(cluster.nodes) * len(names))
-            await aeventually(lambda: all(is_followed(recorder, name) for name in names))
-            for name in names:
-                await kvs[name]["n"].write(2)
-                await recorder.written(name)
-        for name in names:
-            found = [value for path, kind, value in news(file, name) if kind == "stored" and path.endswith(".n")]
-            assert found == ([1, 2] if name in names[:6] else [2])
-        await asyncio.gather(*[kvs[name].delete() for name in names])
