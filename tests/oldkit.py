@@ -28,8 +28,6 @@ class Pose:
 
 
 class PoseShip(SpecialDatatypeShip):
-    """The custom ship that the stores were written with."""
-
     def check_fit(self, value):
         return isinstance(value, Pose)
 

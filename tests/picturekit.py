@@ -48,7 +48,6 @@ def robot(url, name):
 
 @contextlib.contextmanager
 def running_robot(url, name):
-    """Run the robot in a process of its own."""
     process = subprocess.Popen([sys.executable, __file__, "robot", url, name])
     try:
         yield process
@@ -67,7 +66,6 @@ def look_back(ask, path, start, end, instants=INSTANTS):
 
 
 def told(answers):
-    """Return one line on the answers."""
     pictures = [answer for answer in answers if answer is not None]
     ages = [answer["age"] for answer in pictures if answer["age"] is not None]
     previews = sum([answer["preview"] for answer in pictures])
@@ -78,7 +76,6 @@ def told(answers):
 
 
 def main():
-    """Print what the slider has after a minute."""
     from browserkit import client_of, served
 
     from reem_async import RedisInterface as AsyncInterface

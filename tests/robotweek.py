@@ -138,7 +138,6 @@ class Observers:
                     self.numbers[update.sequence, update.time] = update.value["images_sent"]
 
     def wrong(self, truth: dict[str, Any]) -> list[str]:
-        """Return what differs from the server."""
         found = []
         for name, due in truth.items():
             held = {"watch": lambda name=name: self.last[name], "subscriber": self.subscribers[name].value}
@@ -229,14 +228,12 @@ class Week:
             del settings["array"]
 
     def put_right(self) -> None:
-        """Let everything go on that stands still."""
         self.server.resume()
         self.proxy.heal()
         for program in self.programs.values():
             program.send(signal.SIGCONT)
 
     def start_all(self) -> None:
-        """Start what has ended, as whatever looks after a robot's programs does."""
         for program in self.programs.values():
             if not program.running:
                 program.check_output()
@@ -257,7 +254,6 @@ class Week:
         return before
 
     def pause(self) -> None:
-        """Compare everything with the server."""
         self.put_right()
         self.programs["camera"].end(signal.SIGKILL)
         truth = self.truth()

@@ -199,7 +199,6 @@ def test_keys_with_a_dot_are_shown_as_paths_write_them(kvs, address, key):
 
 
 def keep_publishing(page, work, until):
-    """Publish while the page draws, until something is to be seen."""
     for number in range(200):
         work(number)
         page.wait_for_timeout(50)

@@ -86,7 +86,6 @@ def brute(base, changes, at):
 
 @pytest.mark.parametrize("seed", range(8))
 def test_any_instant_equals_a_replay_of_all_changes_whatever_was_folded(seed):
-    """Sets, deletions in dicts and in lists, whole replacements, with old changes made part of the base."""
     chance = random.Random(seed)
     history = History(30.0, 1 << 30)
     history.start = 0.0

@@ -29,7 +29,6 @@ from reem_async.tools.browser.trees import Leaf
 
 @pytest.fixture(scope="module")
 def page(server_url):
-    """A browser of the server of this test run, that may only look."""
     with served(live(server_url)) as (address, source):
         yield address, source
 
@@ -45,7 +44,6 @@ IMAGE = np.random.default_rng(1).integers(0, 256, (40, 60, 3), np.uint8)
 
 @pytest.fixture
 def robot(kvs, key):
-    """A key with a bit of everything."""
     name = key("robot")
     kvs[name] = {
         "n": 1,
@@ -105,7 +103,6 @@ def test_long_texts_are_not_fetched_for_the_tree_but_for_the_view(ask, kvs, key)
 
 
 def test_the_snippet_of_a_path_reads_it(ask, robot):
-    """Both are run as programs of their own."""
     for front, code in ask.json("node", path=f'{robot}["a.b"]["c d"]')["snippets"].items():
         done = python(code + "print(value)")
         assert done.returncode == 0, (front, done.stderr)
@@ -478,7 +475,6 @@ def memory_of(pid):
 @pytest.mark.alone
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the memory is read from /proc")
 def test_ten_thousand_keys_and_eight_megabytes():
-    """The first page comes at once, and what is looked at is let go again."""
     with EmbeddedServer() as server:
         fill(server)
         with served(live(server.url)) as (address, source), client_of(address) as ask:
@@ -506,7 +502,6 @@ def look(ask):
 
 
 def fill(server):
-    """Ten thousand small keys in one go, and a large array."""
     with redis.Redis.from_url(server.url) as client:
         pipeline = client.pipeline(transaction=False)
         for number in range(10_000):

@@ -210,7 +210,6 @@ def test_dragging_the_slider_shows_the_past(visit, pspace, key):
 
 
 def when(page, name):
-    """When the mode was last changed."""
     return page.evaluate("async (path) => (await (await fetch('/api/node?path=' + path)).json()).time", f"{name}.mode")
 
 
@@ -283,7 +282,6 @@ def test_arrays_have_tabs(visit, kvs, key):
 
 
 def colour(page):
-    """The colour in the middle of the picture that is shown."""
     return page.evaluate(
         """() => {
             const image = document.querySelector(".picture img");

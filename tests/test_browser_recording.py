@@ -19,7 +19,6 @@ pytest.importorskip("mcap", reason="mcap is not installed: pip install 'reem-asy
 
 
 async def record(path):
-    """Record an arm that moves and a camera; returns when each step was."""
     times = []
     with EmbeddedServer() as server:
         async with reem_async.RedisInterface(server) as interface:
@@ -52,7 +51,6 @@ def ask(run):
 
 @pytest.fixture(scope="module")
 def steps(ask):
-    """An instant right after each of the five steps."""
     series = ask.json("series", path="cam.step")
     values = dict(zip(series["lines"][0], series["times"], strict=True))
     return [values[float(step)] + 0.01 for step in range(1, 6)]

@@ -18,7 +18,6 @@ from reem_async.tools.browser.app import LOOPBACK
 
 @pytest.fixture(scope="module")
 def address(server_url):
-    """A browser that may only look."""
     with served(live(server_url)) as (address, _):
         yield address
 
@@ -151,7 +150,6 @@ def config_of(text):
 
 @pytest.fixture
 def write(writable):
-    """Writes as the page does; headers can be changed."""
     with client_of(writable) as client:
         secret = config_of(client.http.get("/").text)["key"]
 

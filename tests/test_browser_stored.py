@@ -47,12 +47,10 @@ async def told(source, *names):
 
 
 def content(source, *path):
-    """What the past has as of now."""
     return thawed(source.history.tree(path, time.time()))
 
 
 async def seen(source, value, *path):
-    """Wait until the past has a value."""
     await aeventually(lambda: alike(content(source, *path), value))
 
 

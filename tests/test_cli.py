@@ -59,7 +59,6 @@ class CommandLine:
         return run
 
     def result(self, *arguments, **options):
-        """The output of a command that must succeed."""
         run = self(*arguments, **options)
         assert run.exit_code == 0, run.stderr
         return run.stdout
@@ -75,7 +74,6 @@ class CommandLine:
 
     @contextlib.contextmanager
     def running(self, command, *arguments, **options):
-        """A command that goes on by itself; killed at the end."""
         with subprocess.Popen(
             self.words(command, *arguments),
             env=self.environment(),
@@ -204,7 +202,6 @@ def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
 
 @pytest.mark.long
 def test_the_password_may_be_in_a_variable_of_its_own():
-    """For every command; one in the URL goes before it."""
     with EmbeddedServer(password="known-4711") as server:
         cli = CommandLine(f"redis://127.0.0.1:{server.port}", "")
         assert "needs a password" in cli.error(1, "ls")
@@ -267,7 +264,6 @@ def test_ls(cli, kvs):
 
 
 def test_ls_of_what_others_wrote(cli, kvs, raw):
-    """A broken document does not hide the rest; a list of Redis is no key of REEM."""
     raw.execute_command("JSON.SET", f"{cli.namespace}broken", "$", '"$ship nonsense"')
     raw.lpush(f"{cli.namespace}foreign", "x")
     names = {line.split("\t")[0]: line.split("\t")[1] for line in cli.result("ls").splitlines()}
@@ -478,7 +474,6 @@ def test_a_closed_pipe_is_no_error(cli, kvs):
 
 
 def test_ctrl_c_ends_what_is_not_live_with_130(cli):
-    """A server that never answers: the command waits, and can be interrupted."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         cli.url = f"redis://127.0.0.1:{silent.getsockname()[1]}"
         with cli.running("ls") as process:

@@ -23,7 +23,6 @@ def environment(**changes):
 
 
 def browse(*arguments):
-    """A run that ends by itself."""
     return subprocess.run(
         [*REEM, *arguments], env=environment(), capture_output=True, text=True, timeout=30, check=False
     )
@@ -31,7 +30,6 @@ def browse(*arguments):
 
 @contextlib.contextmanager
 def browsing(*arguments):
-    """A run that goes on, and what it said."""
     with subprocess.Popen(
         [*REEM, *arguments], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -81,7 +79,6 @@ def test_beyond_this_machine_there_is_a_token(server_url):
 
 
 def has_network():
-    """Whether this machine has an address that others can reach."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect(("192.0.2.1", 9))
         return not probe.getsockname()[0].startswith("127.")

@@ -24,7 +24,6 @@ from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts
 
 @pytest.fixture(scope="module")
 def own():
-    """A private server and its administrator's client."""
     with contextlib.ExitStack() as stack:
         try:
             url = stack.enter_context(EmbeddedServer()).url
@@ -34,7 +33,6 @@ def own():
 
 
 def findings(run):
-    """The report by check, as dicts of status, message, remedy."""
     rows = [json.loads(line) for line in run.stdout.splitlines()]
     assert all(set(row) == {"check", "status", "message", "remedy"} for row in rows)
     return {row["check"]: row for row in rows}
@@ -94,7 +92,6 @@ def test_nobody_there():
 
 
 def test_a_user_who_may_do_little(own):
-    """It says what it could not look at, and what would be needed."""
     url, admin = own
     rules = ["reset", "on", ">hidden-4711", "~robot:*", "&*", "-@all", "+hello", "+auth"]
     rules += ["+get", "+type", "+getrange"] if PLAIN else ["+json.get", "+json.type"]
@@ -137,7 +134,6 @@ def test_a_server_that_throws_keys_away(own):
 
 @pytest.mark.long
 def test_every_node_of_a_cluster_is_examined_and_named(cluster):
-    """The worst first of each check; nothing of it is a matter of which node is asked."""
     bad = cluster.nodes[1]
     with redis.Redis(port=bad.port) as admin:
         admin.config_set("maxmemory", "200mb")

@@ -66,7 +66,6 @@ def announced(cli, raw):
 
 
 def ended(process, number=signal.SIGINT):
-    """Send a signal; the exit code, what was said and what was said on standard error."""
     process.send_signal(number)
     said, errors = process.communicate(timeout=10)
     assert "Traceback" not in errors
@@ -198,7 +197,6 @@ def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
 
 
 def test_echo_shows_what_is_only_stored_and_marks_it(cli, space, listening):
-    """Arrays as what they are, without fetching them, and of a path that was asked for nothing else."""
     store = blocking.KeyValueStore(space.interface)
     store["imu"] = {"temp": 20, "acc": [1, 2]}
     with listening("echo", "imu.temp", "cam") as process:
@@ -226,7 +224,6 @@ def test_echo_shows_what_is_only_stored_and_marks_it(cli, space, listening):
 
 
 def test_stored_changes_are_counted_and_told_in_json(cli, space, listening):
-    """As what they are."""
     store = blocking.KeyValueStore(space.interface)
     store["foo"] = {"n": 0}
     with cli.running("echo", "foo", "--json", "--count", "1") as process:
@@ -353,7 +350,6 @@ def test_hz_reports_as_it_goes_and_at_the_end(listening, announced):
 
 @pytest.mark.parametrize("columns", [100, 50])
 def test_the_live_table_in_a_terminal(cli, columns, announced, raw):
-    """A row for a path appears, Ctrl-C ends it, and the table stays on the screen."""
     before, stop = subscriptions(raw), threading.Event()
 
     def publish():

@@ -91,7 +91,6 @@ def test_no_name_of_an_array_is_special_to_a_file(tmp_path):
     ],
 )
 def test_a_format_of_an_export_that_there_is_not(tmp_path, options, said):
-    """It is refused before the recording is opened, and before it becomes a part of a file's name."""
     run = CliRunner().invoke(build(), ["log", "export", str(tmp_path / "run.mcap"), *options], prog_name="reem")
     assert run.exit_code == 2
     assert run.stderr.startswith(f"reem log export: {said}") or said in run.stderr

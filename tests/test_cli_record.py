@@ -42,8 +42,6 @@ def environment(url):
 
 @pytest.fixture
 def reem(server_url, tmp_path):
-    """Runs a command to its end."""
-
     def run(*arguments, **options):
         command = [*REEM, *map(str, arguments)]
         settings = {"env": environment(server_url), "cwd": tmp_path, "timeout": 30, **options}
@@ -54,7 +52,6 @@ def reem(server_url, tmp_path):
 
 @contextlib.contextmanager
 def started(url, cwd, *arguments, **options):
-    """A command that is running."""
     command = [*REEM, *map(str, arguments)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
     with subprocess.Popen(command, env=environment(url), cwd=cwd, **pipes) as process:
@@ -79,7 +76,6 @@ def is_recording(file):
 
 @pytest.fixture
 def recorded(key, server_url, pspace, tmp_path):
-    """A recording that Ctrl-C has ended."""
     pspace[key("a")] = {"n": 0, "image": IMAGE}
     file = tmp_path / "run.mcap"
     with started(server_url, tmp_path, "record", key("*"), "-o", file, "--json") as process:
@@ -173,7 +169,6 @@ def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
 
 
 def test_step(key, recorded, server_url, kvs, tmp_path):
-    """One update for each line; the end of the input ends it."""
     file, _ = recorded
     with started(
         server_url, tmp_path, "play", file, "--step", "--remap", f"{key('a')}={key('b')}", stdin=subprocess.PIPE
@@ -191,7 +186,6 @@ def test_step(key, recorded, server_url, kvs, tmp_path):
 
 @pytest.mark.parametrize("option", [[], ["--json"]], ids=["text", "json"])
 def test_once_it_says_that_it_has_begun_nothing_is_missed_and_ctrl_c_ends_it(option, key, server_url, pspace, tmp_path):
-    """At once, before anything is published: a script waits for that line."""
     file = tmp_path / "run.mcap"
     with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
         line = begins(process, as_json=bool(option))
@@ -252,7 +246,6 @@ def test_what_cannot_be(key, reem, tmp_path):
 
 
 def test_on_a_terminal_a_line_is_written_over(key, server_url, pspace, tmp_path):
-    """Messages, rate, bytes, drops; Ctrl-C in the terminal ends it with a summary."""
     mine, its = pty.openpty()
     try:
         with started(

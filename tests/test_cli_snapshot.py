@@ -44,7 +44,6 @@ def environment(**changes):
 
 
 def snapshot(*arguments, code=0, **changes):
-    """Run it in this process; returns what it wrote to both outputs."""
     with mock.patch.dict(os.environ, environment(**changes), clear=True):
         run = CliRunner().invoke(app, [str(word) for word in arguments], prog_name="reem snapshot")
     assert isinstance(run.exception, (SystemExit, type(None))), run.exception
@@ -80,7 +79,6 @@ def names(directory):
 
 
 def test_in_a_process_of_its_own(kvs, env, tmp_path):
-    """As the shell sees it: both outputs apart, no colours, an exit code."""
     kvs["foo"] = 1
     for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 2), (["list"], 0)):
         run = subprocess.run(
@@ -98,7 +96,6 @@ def test_in_a_process_of_its_own(kvs, env, tmp_path):
 
 
 def test_there_and_back(kvs, env, server, tmp_path):
-    """By FILE and by time; by --url and by REEM_URL."""
     kvs["foo"] = {"x": np.arange(3), "n": 1}
     kvs["bar"] = 2
     file = tmp_path / "a.zip"
@@ -125,7 +122,6 @@ def test_there_and_back(kvs, env, server, tmp_path):
 
 
 def test_json_for_scripts(kvs, env, tmp_path):
-    """One object a line."""
     kvs["foo"] = {"x": np.arange(3)}
     with redis.Redis.from_url(env["REEM_URL"]) as raw:
         raw.set("foreign", 1)
@@ -247,7 +243,6 @@ def periodic(*arguments, **changes):
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
-    """A line for each; the oldest that it saved itself go, and nothing else."""
     kvs["foo"] = {"x": np.arange(3)}
     snapshot("save", "-d", tmp_path, **env)
     (mine,) = names(tmp_path)
@@ -338,7 +333,6 @@ def test_a_listing_ends_with_its_reader(tmp_path):
 
 @pytest.mark.long
 def test_by_period_it_outlives_the_server(tmp_path):
-    """What went wrong is said, and the next one is tried."""
     server = EmbeddedServer()
     with server:
         port = server.port
@@ -368,7 +362,6 @@ def test_ctrl_c_leaves_no_half_file(kvs, env, tmp_path):
 
 
 def test_in_a_terminal(kvs, env, tmp_path):
-    """Colours, a header, a bar on long work; all of it gone when redirected, as the other tests see."""
     for number in range(20):
         kvs[f"k{number}"] = np.zeros(100_000)
     said = b""

@@ -27,7 +27,6 @@ def cli(server_url, key):
 
 @pytest.fixture
 def robot(cli):
-    """Two programs publish `arm`, one of them `cam`, until the test ends."""
     over = threading.Event()
     with (
         blocking.RedisInterface(cli.url, namespace=cli.namespace) as one,
@@ -48,7 +47,6 @@ def robot(cli):
 
 
 def test_top_shows_keys_and_points_out_two_publishers(cli, robot):
-    """One row for each key, once, at the end."""
     run = cli("top", "--timeout", "1.5", "--json")
     assert run.exit_code == 0
     rows = {row["path"]: row for row in map(json.loads, run.stdout.splitlines())}
@@ -60,7 +58,6 @@ def test_top_shows_keys_and_points_out_two_publishers(cli, robot):
 
 
 def test_doctor_points_out_two_publishers(cli, robot):
-    """It listens for a second."""
     run = cli("doctor", "--no-write", "--json")
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "publishers"]
     assert row["status"] == "warn"
@@ -84,7 +81,6 @@ def test_who_takes_over_is_one_publisher():
     ],
 )
 def test_the_table_fits_any_terminal(columns, lines, titles):
-    """Numbers are whole, names are cut, and that two publish one key stands there however many keys there are."""
     board = Board(ALL, 100)
     for number in range(25 * 4):
         publisher = "b" if number % 8 == 3 else "a"  # key 03 has two
@@ -108,7 +104,6 @@ def test_the_table_fits_any_terminal(columns, lines, titles):
 
 
 def test_nan_is_called_by_its_name(cli):
-    """In JSON and in the preview of an array; None stays null, and nothing else changes."""
     assert json_text({"a": [1.5, float("nan")], "b": None}) == '{"a":[1.5,NaN],"b":null}'
     assert json_text(np.array([np.inf, -np.inf])) == "[Infinity,-Infinity]"
     assert json_text({"a": "\u00e9", "b": None}) == '{"a":"\u00e9","b":null}'
@@ -118,7 +113,6 @@ def test_nan_is_called_by_its_name(cli):
 
 
 def test_a_recording_of_nothing_warns(cli, tmp_path):
-    """It is complete and empty, and says where to look."""
     run = cli.process("record", "nothing*", "--duration", "0.2", "-o", str(tmp_path / "x.mcap"))  # it is made nicer
     assert run.returncode == 0
     assert "nothing was recorded" in run.stderr
@@ -139,7 +133,6 @@ def test_a_recording_of_nothing_warns(cli, tmp_path):
     ids=" ".join,
 )
 def test_a_file_that_is_not_there_is_exit_code_3(cli, tmp_path, monkeypatch, words):
-    """Of every command; and the file is named."""
     monkeypatch.chdir(tmp_path)
     run = subprocess.run([REEM, *words], env=cli.environment(), capture_output=True, text=True, timeout=30, check=False)
     assert run.returncode == 3, run.stderr
@@ -147,7 +140,6 @@ def test_a_file_that_is_not_there_is_exit_code_3(cli, tmp_path, monkeypatch, wor
 
 
 def test_a_server_on_the_port_is_named(cli, server_url):
-    """`reem up` where one is up already says how to use it."""
     port = str(blocking.RedisInterface(server_url).client.connection_pool.connection_kwargs.get("port"))
     run = subprocess.run([REEM, "up", "--port", port], capture_output=True, text=True, timeout=30, check=False)
     assert run.returncode == 1

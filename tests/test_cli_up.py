@@ -44,7 +44,6 @@ def reem_command(*arguments: str, **changes: str) -> subprocess.CompletedProcess
 
 @contextlib.contextmanager
 def up(*arguments: str, **changes: str):
-    """A `reem up` that is up, and what it said."""
     with subprocess.Popen(
         [*REEM, "up", *arguments],
         env=environment(**changes),
@@ -223,7 +222,6 @@ def test_ctrl_c_in_a_terminal_and_colours():
 
 @pytest.fixture
 def snapshots(tmp_path):
-    """A portable snapshot and an RDB file of the same server."""
     with EmbeddedServer() as server, reem.RedisInterface(server, namespace="r1:") as interface:
         reem.KeyValueStore(interface)["foo"] = {"x": np.arange(3), "n": 1.5}
         reem.snapshots.save(interface, tmp_path / "a.zip")
@@ -234,7 +232,6 @@ def snapshots(tmp_path):
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "what"), [("a.zip", "1 key"), ("b.rdb", "3 Redis keys")])
 def test_from_a_snapshot(snapshots, name, what):
-    """A past state beside the live one: on a free port, under the namespace it was taken of."""
     file = snapshots / name
     before = file.read_bytes()
     with up("--from", str(file)) as (process, said):
@@ -314,7 +311,6 @@ def test_without_the_extra(missing):
 
 @pytest.mark.long
 def test_a_plain_server_is_started_when_told():
-    """It has no module, is said to have none, and takes the same documents."""
     import reem
 
     with up("--plain", "--port", "0") as (process, said):

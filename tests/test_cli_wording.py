@@ -58,7 +58,6 @@ def messages():
 
 
 def test_no_message_advises_what_cannot_be_typed():
-    """Of the whole library, since nearly all of it is beneath a command."""
     wrong = [
         f"{file}: {text}"
         for file, text in messages()
@@ -75,7 +74,6 @@ def cli(server_url, key):
 
 
 def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):
-    """Of commands that meet such a message easily."""
     monkeypatch.chdir(tmp_path)
     cli.result("set", "a", "[1]")
     assert "a list only grows by appending" in cli.error(1, "set", "a[5]", "1")

@@ -208,7 +208,6 @@ class Reader:
 
 @pytest.fixture(scope="module")
 def port():
-    """A server of its own, as `reem up` starts one."""
     try:
         with EmbeddedServer() as server:
             yield int(server.url.rpartition(":")[2].partition("/")[0])
@@ -220,7 +219,6 @@ def port():
     "path", [page for page in PAGES if RUN & {language for language, _ in fenced(page)}], ids=title
 )
 def test_a_page_is_followed_word_for_word(path, port, tmp_path):
-    """By a newcomer: every block in its order, in an empty folder."""
     blocks = fenced(path)
     for module, package in NEEDS.items():
         if any(f"import {module}" in text for _, text in blocks) and importlib.util.find_spec(module) is None:
@@ -243,7 +241,6 @@ def test_every_block_is_run_or_only_shown(path):
 
 @pytest.mark.parametrize("path", PAGES, ids=title)
 def test_links_lead_somewhere(path):
-    """Those to files of this repository."""
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", path.read_text(encoding="utf-8")):
         if "generated" not in target:
             assert (path.parent / target).exists(), target
@@ -259,7 +256,6 @@ def test_every_page_is_in_the_table_of_contents():
 
 
 def test_recordings_say_what_to_install():
-    """Where the extra is missing."""
     for module in ("reem.recording", "reem_async.recording"):
         done = python(f"import sys; sys.modules['mcap'] = None; import {module}")
         assert "ModuleNotFoundError: recordings need mcap: pip install " in done.stderr
@@ -285,7 +281,6 @@ def test_the_figures_are_those_of_the_last_whole_run(tmp_path):
 
 
 def test_the_readme_is_short_and_begins_with_what_it_is():
-    """150 lines; what it is, a picture, a command, code and a comparison are on the first screen of 40."""
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert len(lines) <= 150
     first_screen = "\n".join(lines[:40])
@@ -303,7 +298,6 @@ def test_the_readme_is_short_and_begins_with_what_it_is():
 
 
 def test_a_decision_is_short():
-    """Context, decision, consequence; at most 12 lines."""
     _, *entries = re.split(r"^## ", (DOCS / "decisions.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
     for entry in entries:
         heading, *lines = [line for line in entry.splitlines() if line]

@@ -49,14 +49,12 @@ def run(module, *arguments, code=0, **environment):
 
 @pytest.fixture
 def url(server_url, raw):
-    """The server, rid of what the examples leave there."""
     yield server_url
     left = [name for key in KEYS for name in (key, *raw.scan_iter(match=f"{{{key}}}*", count=1000))]
     raw.unlink(*left)
 
 
 def counts(printed):
-    """The three numbers of the image system, and its latencies."""
     found = re.search(r"(\d+) frames sent, (\d+) processed, (\d+) acted upon", printed)
     assert found, printed
     times = re.search(r"median ([\d.]+) ms, p99 ([\d.]+) ms", printed)
@@ -69,7 +67,6 @@ def counts(printed):
 
 @FRONTS
 def test_the_image_system_runs_as_three_processes(front, url, tmp_path):
-    """On a given server: frames go through, are counted and timed, and the last one is written."""
     from PIL import Image
 
     png = tmp_path / "new folder" / "last.png"
@@ -110,7 +107,6 @@ def test_the_demo_needs_no_server(tmp_path):
 
 @pytest.mark.long
 def test_the_demo_fails_if_a_program_does(url, tmp_path):
-    """The exit code says so, and the message says which and why."""
     (tmp_path / "PIL.py").write_text("raise ImportError")
     path = os.pathsep.join([str(tmp_path), str(ROOT)])
     error = run("image_system", "--seconds", 1, "--out", tmp_path / "x.png", "--url", url, code=1, PYTHONPATH=path)
@@ -122,7 +118,6 @@ def test_the_demo_fails_if_a_program_does(url, tmp_path):
 @pytest.mark.parametrize("module", ["image_system", "image_system.camera", "custom_ship", "robot_node"])
 @FRONTS
 def test_an_example_without_its_server_says_so(module, front):
-    """One line, and what to do."""
     error = run(module, "--front", front, "--url", "redis://127.0.0.1:1", code=1)
     assert "no server answers at 127.0.0.1:1" in error
     assert "reem up" in error
@@ -135,7 +130,6 @@ def test_an_example_without_its_server_says_so(module, front):
 @pytest.mark.long
 @FRONTS
 def test_the_arm_actuator_runs_both_ways(front, url):
-    """Over the store and over publish/subscribe: set points are fresh, at about the rates wanted."""
     printed = run("arm_actuator", "--front", front, "--seconds", 1, "--url", url)
     for way in "store", "publish":
         found = re.search(rf"controller \({way}, {front}\): (\d+) set points at ([\d.]+) Hz", printed)
@@ -151,13 +145,11 @@ def test_the_arm_actuator_runs_both_ways(front, url):
 
 @FRONTS
 def test_the_custom_ship_carries_a_scan(front, url, raw):
-    """And the document says what it is."""
     assert "read back 20000 points of the front laser" in run("custom_ship", "--front", front, "--url", url)
     assert "front laser, 20000 points" in raw.execute_command("JSON.GET", "room")
 
 
 def test_a_scan_can_be_read_with_either_ship(url, monkeypatch):
-    """The label says which."""
     monkeypatch.syspath_prepend(str(ROOT))
     from examples.custom_ship import CompressedScanShip, ScanShip, take_scan
 
@@ -173,7 +165,6 @@ STOPPED = r"stopped after (\d+) heartbeats, (\d+) readings, (\d+) set points fol
 
 @FRONTS
 def test_the_robot_node_runs_its_loops(front, url):
-    """Each at its own rate."""
     found = re.search(STOPPED, run("robot_node", "--front", front, "--seconds", 1.5, "--url", url))
     assert found
     beats, readings, followed = map(int, found.groups())
@@ -186,7 +177,6 @@ def test_the_robot_node_runs_its_loops(front, url):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @FRONTS
 def test_the_robot_node_stops_in_order(front, number, url):
-    """Ctrl-C and SIGTERM: the loops end, the wheel stands still, the exit code is 0."""
     process = start("robot_node", "--front", front, "--seconds", 50, "--url", url)
     try:
         assert process.stdout.readline().startswith("running")
@@ -204,7 +194,6 @@ def test_the_robot_node_stops_in_order(front, number, url):
 @pytest.mark.parametrize("program", ["processor", "actuator"])
 @FRONTS
 def test_a_program_that_waits_stops_on_ctrl_c(front, program, url):
-    """Without a traceback; each is usable alone."""
     process = start(f"image_system.{program}", "--front", front, "--url", url)
     try:
         with reem.RedisInterface(url) as interface:
@@ -221,7 +210,6 @@ def test_a_program_that_waits_stops_on_ctrl_c(front, program, url):
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT / "examples")))
 def test_an_example_is_short_and_says_what_it_shows(path):
-    """And how to run it."""
     text = path.read_text(encoding="utf-8")
     documentation = ast.get_docstring(ast.parse(text))
     assert documentation

@@ -71,7 +71,6 @@ def old_keys(raw):
 
 @pytest.mark.parametrize("version", oldkit.VERSIONS)
 def test_old_data_is_not_read(kvs, raw, version):
-    """Whole or a part, again and again; what is stored as it is today is read."""
     replay(raw, version)
     for name, value in stored(version).items():
         if name in oldkit.NOT_OLD[version]:
@@ -125,7 +124,6 @@ def test_nor_do_subscribers_begin_with_it(kvs, raw):
 
 
 def test_subscribers_are_told_of_the_conversion(kvs, raw):
-    """One that was there first, of a key that was not old then."""
     with reem.SilentSubscriber("mixed", kvs.interface) as subscriber:
         replay(raw, "reem_0_1_2", {"mixed"})
         migrate(kvs.interface)
@@ -214,7 +212,6 @@ def test_keys_with_names_like_those_of_old_data_are_new(own, kvs, raw):
 
 @pytest.mark.parametrize("version", oldkit.VERSIONS)
 def test_it_reads_as_it_did_and_nothing_old_is_left(kvs, raw, version):
-    """Twice without harm, and nothing was changed before."""
     replay(raw, version)
     before = everything(raw)
     plan = migrate(kvs.interface, dry_run=True)
@@ -250,7 +247,6 @@ def test_it_reads_as_it_did_and_nothing_old_is_left(kvs, raw, version):
     ],
 )
 def test_broken_off_at_any_command_and_run_again(own, raw, version, only):
-    """What is not converted yet is not read; nothing is half converted."""
     after, cut_short = 0, True
     while cut_short:
         raw.flushall()
@@ -308,7 +304,6 @@ async def test_broken_off_at_any_step_in_a_cluster(cluster):
 
 
 def test_what_is_newer_stays(kvs, raw):
-    """An array that a program of today has written at an old place, and one elsewhere."""
     replay(raw, "reem_0_1_2", {"mixed"})
     kvs["mixed"]["image"] = A * 3
     kvs["mixed"]["more"] = [A]
@@ -327,7 +322,6 @@ def test_what_is_old_is_removed_in_the_transaction_alone(kvs, raw):
 
 
 def test_a_key_written_to_meanwhile_is_looked_at_again(own, kvs, raw):
-    """Between the look and the transaction."""
     replay(raw, "reem_0_1_2", {"mixed"})
     session = kvs.interface._followers.session
     run, count = session.run, 0
@@ -365,7 +359,6 @@ def test_namespace_pattern_and_database(own, raw):
 
 
 def test_a_key_that_cannot_be_converted_is_named_and_left(own, kvs, raw):
-    """Each with its reason, and the others are converted."""
     replay(raw, "reem_0_1_2", {"mixed", "deep", "pose", "over", "number"})
     raw.delete("mixed.image")
     raw.hset("deep.one", "dtype", "object")
@@ -399,7 +392,6 @@ def test_a_key_that_cannot_be_converted_is_named_and_left(own, kvs, raw):
 
 
 def test_a_user_without_the_rights_changes_nothing(own, raw):
-    """Neither to read hashes nor to find those left behind."""
     replay(raw, "reem_0_1_2", {"replaced", "number"})
     before = everything(raw)
     for right in ("-hgetall", "-hkeys", "-@write"):

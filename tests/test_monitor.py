@@ -185,8 +185,6 @@ def test_escaping_leaves_no_pattern():
 
 @pytest.mark.alone
 async def test_a_patient_monitor_is_woken_seldom_unless_somebody_else_is_in_a_hurry(key, server_url, apspace):
-    """Updates that wait for each other are all there, in order, and told together."""
-
     async def batches(*, hurried):
         async with reem_async.RedisInterface(server_url) as own, Monitor(own, [key("n")], patience=0.05) as monitor:
             if hurried:

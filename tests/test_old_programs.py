@@ -83,7 +83,6 @@ def test_a_new_program_imports_nothing_of_it():
 
 
 def test_paths_as_text_and_nested_dicts():
-    """The functions of `reem.utilities`."""
     from reem import utilities
 
     assert utilities.path_to_key_sequence(".") == []
@@ -112,7 +111,6 @@ def tolerant(interface):
 
 
 def test_the_tolerant_store_takes_both_kinds_of_paths(tolerant, key, raw):
-    """And creates what is missing on the way."""
     tolerant.set([key(), "a", "b"], 1)
     tolerant.set(f"{key()}.c.image", np.arange(3))
     assert tolerant.get(f"{key()}.a.b") == tolerant.get([key(), "a", "b"]) == 1
@@ -161,7 +159,6 @@ def test_a_pickled_tolerant_store_keeps_its_refresh_rate(interface):
 
 
 def test_a_variable_has_the_syntax_of_a_dict(tolerant, key):
-    """For one place, and for what is below it."""
     it = tolerant.var(f"{key()}.robot.count")
     it.set(1)
     it += 4
@@ -186,7 +183,6 @@ def test_a_variable_has_the_syntax_of_a_dict(tolerant, key):
 
 
 def test_a_variable_keeps_what_it_read_for_its_time(interface, kvs, key):
-    """Its own writes are seen at once, those of others when the time is over."""
     store = TolerantKeyValueStore(interface, refreshRate=3600)
     kvs[key()] = {"n": 1, "l": [1]}
     kept, fresh = store.var(key()), store.var(key(), refreshRate=0)
@@ -215,7 +211,6 @@ def where(interface):
 
 @pytest.mark.parametrize("package", [reem, reem_async])
 def test_ways_to_name_a_server(package, monkeypatch):
-    """Nothing is connected."""
     monkeypatch.delenv("REEM_URL", raising=False)
     make, store = package.RedisInterface, package.KeyValueStore
     assert where(make("localhost:7400")) == where(make("localhost", 7400)) == "localhost:7400"
@@ -237,8 +232,6 @@ def test_ways_to_name_a_server(package, monkeypatch):
 
 @pytest.mark.parametrize("package", [reem, reem_async])
 def test_socket_timeout_is_the_time_limit(package):
-    """As an option and in a URL; None is no limit."""
-
     def limit(*given, **options):
         interface = package.RedisInterface(*given, **options)
         return getattr(interface, "_direct", interface).session.options.timeout
@@ -254,7 +247,6 @@ def test_socket_timeout_is_the_time_limit(package):
 
 @pytest.mark.long
 def test_a_slow_server_is_waited_for_as_socket_timeout_says():
-    """Longer than the default of 1 s."""
     with EmbeddedServer() as server, reem.RedisInterface(server, socket_timeout=20) as interface:
         interface.client.client_pause(1500)
         kvs, began = reem.KeyValueStore(interface), time.monotonic()
@@ -284,7 +276,6 @@ def test_a_plain_client_of_the_same_server(interface, kvs, key):
 
 
 async def test_a_plain_client_for_asyncio(ainterface, akvs, key):
-    """redis.asyncio's."""
     await akvs[key()].write({"a": 5})
     assert isinstance(ainterface.client, redis.asyncio.Redis)
     assert await ainterface.client.json().get(key(), ".a") == 5
@@ -297,7 +288,6 @@ def test_the_plain_client_is_for_one_server():
 
 
 def test_accessors_have_path_reader_and_writer(interface, kvs, pspace, key):
-    """The path below the top-level key; the reader and the writer are those of the whole key."""
     kvs[key()] = {"a": [1, 2]}
     place = kvs[key()]["a"][0]
     assert (kvs[key()].path, place.path) == ([], ["a", 0])
@@ -312,7 +302,6 @@ def test_accessors_have_path_reader_and_writer(interface, kvs, pspace, key):
 
 
 def test_a_named_default_of_get(kvs, key):
-    """`default_value=`, of an element or of the place itself."""
     kvs[key()] = {"a": 1}
     assert kvs[key()].get("a", default_value=5) == 1
     assert kvs[key()].get("b", default_value=5) == 5
@@ -330,7 +319,6 @@ async def test_the_same_of_the_asyncio_front(akvs, key):
 
 
 def test_a_subscribers_local_copy(interface, pspace, key):
-    """Empty before anything is there."""
     with reem.SilentSubscriber(key(), interface) as mirror:
         assert mirror.local_copy == {}
         pspace[key()] = {"a": 1}
@@ -350,7 +338,6 @@ class Side(enum.StrEnum):
 
 
 def test_enums_that_are_numbers_or_text_are_stored_as_these(front, key):
-    """As json did; others are refused."""
     front.write([key()], {"a": Mode.IDLE, "b": [Name.LEFT, Side.RIGHT], "image": np.arange(3)})
     assert_same(front.read([key()]), {"a": 3, "b": ["left", "right"], "image": np.arange(3)})
     front.write([key()], Mode.IDLE)
@@ -436,7 +423,6 @@ def _telling(function, told):
 
 
 async def test_a_coroutine_function_too(ainterface, apspace, key):
-    """With its names turned."""
     told = asyncio.get_running_loop().create_future()
 
     async def callback(updated_path, data):
@@ -453,7 +439,6 @@ async def test_a_coroutine_function_too(ainterface, apspace, key):
     [(lambda: None, {}), (lambda data: None, {}), (lambda data, updated_path: None, {"extra": 5}), (_in_order, {})],
 )
 def test_a_callback_that_cannot_be_called_so_is_refused_at_once(package, function, kwargs):
-    """Not when the first update comes."""
     with pytest.raises(TypeError, match="callback_function cannot be called"):
         package.CallbackSubscriber("c", package.RedisInterface("localhost"), function, kwargs)
 

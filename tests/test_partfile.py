@@ -35,7 +35,6 @@ def refused(*_, **__):
 
 @pytest.fixture(params=["hard links", "none"])
 def links(request, monkeypatch):
-    """File systems with hard links and without."""
     if request.param == "none":
         monkeypatch.setattr(os, "link", refused)
 
@@ -66,7 +65,6 @@ def test_a_hidden_name_that_is_left_of_a_whole_file_goes_and_the_file_stays(tmp_
 
 
 def test_who_cannot_remove_the_hidden_name_has_the_file(tmp_path, monkeypatch):
-    """And says nothing else."""
     with monkeypatch.context() as patched:
         patched.setattr(os, "unlink", refused)
         written(tmp_path / "a", b"whole")

@@ -130,7 +130,6 @@ async def test_samples(key, akvs, binterface, file, tmp_path):
 
 
 async def test_a_full_queue_drops_and_says_so(key, apspace, akvs, binterface, file):
-    """What cannot be kept is counted by path, and the key is read anew afterwards."""
     async with Recorder(binterface, [key("*")], file, queue_bytes=200_000) as recorder:
         for number in range(300):
             await apspace[key("big")].write({"n": number, "a": np.full(1900, number)})

@@ -85,7 +85,6 @@ class Storing:
 
 
 async def truth_of(kvs):
-    """What the server has of all keys that are there."""
     return {name: await kvs[name].read() for name in NAMES if await kvs.contains(name)}
 
 
@@ -176,7 +175,6 @@ async def test_a_primary_of_a_cluster_that_is_killed(file, patterns):
 @pytest.mark.long
 @pytest.mark.parametrize("kill", [False, True], ids=["switched", "killed"])
 async def test_a_primary_that_sentinels_replace(watched, file, kill):
-    """By an administrator's word, and when it is killed."""
     await asyncio.to_thread(watched.settle)
 
     async def replaced():

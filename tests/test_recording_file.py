@@ -57,7 +57,6 @@ def file_and_values(recorded):
 
 @pytest.fixture
 def names(recorded):
-    """Makes the names in that file."""
     return lambda name: recorded[2] + name
 
 
@@ -213,7 +212,6 @@ def check(file, names, seen):
 
 
 def test_cut_anywhere_it_opens(names, file_and_values, tmp_path):
-    """At every kind of place: what is before the cut is there, and never anything else."""
     file, seen = file_and_values
     data = file.read_bytes()
     rng = random.Random(5)
@@ -305,7 +303,6 @@ def test_a_flipped_bit_in_the_head_of_any_record_is_counted_if_it_costs_somethin
 
 
 def mutated(data, rng):
-    """A file with a few things done to it."""
     broken = bytearray(data)
     for _ in range(rng.choice([1, 1, 5])):
         start = rng.randrange(len(broken))
@@ -327,7 +324,6 @@ def mutated(data, rng):
 
 
 def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp_path):
-    """What is missing is counted: no update is lost but at the end, and none is another one."""
     file, seen = file_and_values
     data, rng, broken = file.read_bytes(), random.Random(11), tmp_path / "broken.mcap"
     for number in range(sized(40, 150)):
@@ -404,7 +400,6 @@ asyncio.run(main(*sys.argv[1:]))
 
 
 def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace, tmp_path):
-    """While a thousand updates a second and pictures come in."""
     file, sent = tmp_path / "run.mcap", []
     process = python(RECORD, server_url, key("*"), file, start=True)
     try:

@@ -202,7 +202,6 @@ def test_the_schemas_are_those_that_foxglove_publishes(name):
 
 
 def test_other_arrays_carry_their_schema():
-    """A viewer that has only the file can read them, with figures to plot."""
     encoded = encode("numpy", np.array([1.0, 2.0, 6.0]), "a", TIME)
     message = message_class("reem.NdArray").FromString(b"".join(encoded.pieces))
     assert (list(message.shape), message.dtype, message.min, message.max, message.mean) == ([3], "float64", 1, 6, 3)

@@ -36,7 +36,6 @@ def file(tmp_path_factory):
 
 @pytest.fixture
 def reads(monkeypatch):
-    """The numbers of the chunks of which the index was read."""
     numbers, read = [], Container._read_index
 
     def noted(self, info):
@@ -48,7 +47,6 @@ def reads(monkeypatch):
 
 
 def test_channels_are_counted_by_each_index_once(file, reads, tmp_path):
-    """Whatever the number of channels, also of a recording whose recorder was killed."""
     killed, data, counts = tmp_path / "killed.mcap", file.read_bytes(), []
     killed.write_bytes(data[: data.rindex(b"reem.channels") - 13])
     for each in (file, killed):

@@ -26,7 +26,6 @@ def news(file, path):
 
 
 async def test_what_is_stored_beside_what_is_published_is_seen(key, apspace, akvs, binterface, file):
-    """Though updates go on coming; and at the end, though there was none since."""
     await apspace[key()].write({"x": 0, "y": 0, "z": 0})
     async with Recorder(binterface, [key()], file, keyframe=60) as recorder:
         stored = recorder.writer_thread.stored = Remembering()
@@ -183,7 +182,6 @@ async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, a
 
 @pytest.mark.alone
 async def test_a_key_that_cannot_be_read_is_told_of_once(key, raw, binterface, file, caplog):
-    """And it does not keep the recording from ending."""
     raw.set(key(), "no document")
     begun = time.monotonic()
     async with Recorder(binterface, [key()], file, keyframe=0.1) as recorder:
@@ -254,7 +252,6 @@ async def test_a_sampled_list_that_shrinks(key, akvs, binterface, file):
 
 
 async def test_parts_of_keys_have_their_parents(key, apspace, akvs, binterface, file):
-    """A recording, or a replay, of a part ends as the whole does, as far as the part goes."""
     await apspace[key()].write({})
     async with Recorder(binterface, [f"{key()}.b.v"], file):
         for number in range(3):
@@ -284,7 +281,6 @@ async def test_any_clock_of_a_publisher_can_be_recorded(key, akvs, binterface, f
 
 
 async def test_a_clock_that_jumps_while_it_is_recorded(key, apspace, binterface, file, monkeypatch):
-    """By years, hours and milliseconds, both ways: each update is there once, in order, at the time that passed."""
     jump, now, now_ns = 0.0, time.time, time.time_ns
     monkeypatch.setattr(time, "time", lambda: now() + jump)
     monkeypatch.setattr(time, "time_ns", lambda: now_ns() + int(jump * 1e9))

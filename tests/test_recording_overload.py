@@ -38,7 +38,6 @@ class Writing:
             self.thread.behind.clear()  # the recorder takes note, and has the key read anew
 
     def told(self):
-        """What is in the file after all."""
         self.thread.start()
         self.thread.stop({})
         assert self.thread.failure is None
@@ -107,7 +106,6 @@ async def test_what_is_published_and_dropped_before_it_is_taken_is_no_stored_cha
 
 @pytest.mark.parametrize("published", [False, True])
 async def test_after_an_overload_stored_changes_are_told_again(key, akvs, apspace, binterface, file, published):
-    """Whatever was dropped; the recording ends with what is there."""
     await akvs[key()].write({"n": 0, "p": ""})
     async with recording(binterface, [key()], file) as recorder:
         await aeventually(lambda: is_followed(recorder, key()))

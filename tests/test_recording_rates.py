@@ -7,6 +7,5 @@ from rates.measure import run
 
 
 def test_at_a_robot_s_rates_all_is_as_published_or_skipped(tmp_path):
-    """Each update in order, each instant as the publishers' own log has it, and played it ends the same."""
     outcome = run(seed=1, seconds=sized(2.0, 10.0), instants=sized(100, 500), folder=tmp_path)
     assert outcome.faults == []

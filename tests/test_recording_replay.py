@@ -55,7 +55,6 @@ def made(server_url, tmp_path_factory):
 
 @pytest.fixture
 def names(made):
-    """Makes the names in that recording."""
     return lambda name: made[1] + name
 
 
@@ -226,7 +225,6 @@ def test_export_npz(names, log, tmp_path):
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 async def test_deletions_and_what_is_empty_have_rows(key, apspace, server_url, tmp_path, kind):
-    """A row for each update, and in it what tells an empty dict or list from nothing."""
     file, name = tmp_path / "run.mcap", key("k")
     async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [name], file):
         for value in ({"a": 1, "b": 2, "deleted": 0}, {}, {"a": 3, "b": []}, []):
@@ -264,7 +262,6 @@ LONG = 2**62 + 1
 
 @pytest.fixture
 async def mixed(key, apspace, server_url, tmp_path):
-    """A recording of numbers that no one dtype of numpy holds exactly, and of some that one does."""
     async with reem_async.RedisInterface(server_url) as own, Recorder(own, [key()], tmp_path / "mixed.mcap"):
         for long, short, flags, item in ((LONG, 1, True, [LONG, 0.5]), (0.5, 0.5, 1, [1, 0.5]), (1, 2, 0, [2, 1])):
             await apspace[key()].write({"long": long, "short": short, "flags": flags, "item": item, "text": "abc\0"})

@@ -31,7 +31,6 @@ IMAGE = np.arange(40 * 30 * 3, dtype=np.uint8).reshape(40, 30, 3)
 
 @pytest.fixture(scope="module")
 def recorded(server_url, tmp_path_factory):
-    """A recording with all that there is: pictures, items that go, keys that go, keyframes, plain writes."""
     file, name = tmp_path_factory.mktemp("rewritten") / "run.mcap", f"rewritten{os.getpid()}"
     arm, base, note = f"{name}arm", f"{name}base", f"{name}note"
     with reem.RedisInterface(server_url) as interface:
@@ -71,7 +70,6 @@ def plain(it):
 
 
 def contents(log, instants):
-    """All that a reader can ask for, by top-level key."""
     found = {}
     for name in log.names():
         updates = log.updates(patterns=[name])
@@ -144,7 +142,6 @@ def rewritten(original, rng, chosen, *, metadata):
 
 
 def starts(data):
-    """Where the records of a file begin."""
     places, position = [], 8
     while position + 9 <= len(data):
         places.append(position)
@@ -158,7 +155,6 @@ def file(tmp_path):
 
 
 def test_whatever_is_optional_it_is_read_equal(original, file):
-    """Renumbered, in any order, with and without each index, summary part, chunk, checksum and metadata record."""
     source, instants, whole = original
     for seed in range(60):
         rng = random.Random(seed)
@@ -212,7 +208,6 @@ def test_filtered_it_is_equal_where_nothing_is_missing_or_else_reported(original
 
 
 def test_cut_at_every_record_it_is_equal_or_reported(original, file):
-    """And between them; what is read was recorded."""
     source, instants, whole = original
     known = [it for (_, part), told in whole.items() if part == 0 for it in told]
     for seed in range(5):
@@ -307,7 +302,6 @@ def made_up(rng):
 
 
 def test_made_up_messages_are_left_out(file, tmp_path):
-    """What is beside them is read; the errors are REEM's."""
     for seed in range(60):
         file.write_bytes(made_up(random.Random(seed)))
         try:

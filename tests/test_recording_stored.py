@@ -52,7 +52,6 @@ def is_followed(recorder, name):
 async def test_what_is_stored_is_recorded_a_moment_later_between_what_is_published(
     key, apspace, akvs, binterface, file
 ):
-    """Marked, at its deepest place, in its order; each instant has it."""
     await akvs[key()].write({"x": {"a": 0}, "y": 0})
     async with recording(binterface, [key()], file) as recorder:
         await akvs[key()]["x"]["a"].write(1)
@@ -106,7 +105,6 @@ async def test_what_others_store_and_several_changes_in_a_moment_are_seen(key, a
 
 
 async def test_keys_come_and_go(key, akvs, raw, binterface, file):
-    """One that is stored after recording began, and one that goes and comes again; expiry too."""
     await akvs[key("old")].write(1)
     async with recording(binterface, [key("*")], file) as recorder:
         await akvs[key("old")].delete()
@@ -127,7 +125,6 @@ async def test_keys_come_and_go(key, akvs, raw, binterface, file):
 
 
 async def test_a_key_that_is_not_there_yet_is_heard_of_at_once(key, akvs, binterface, file):
-    """By its name, no list of keys is asked for."""
     async with recording(binterface, [key()], file) as recorder:
         await aeventually(lambda: is_followed(recorder, key()))
         await akvs[key()].write(1)
@@ -229,7 +226,6 @@ async def test_an_array_is_not_taken_for_the_old_one_while_the_word_of_its_chang
 
 
 async def test_what_changed_its_place_or_type_is_right(key, akvs, binterface, file):
-    """Items of a list that move, with arrays in them; arrays that become numbers and back."""
     values = [
         {"l": [FRAME[:9], FRAME[9:19]], "a": np.arange(100)},
         {"l": [FRAME[9:19]], "a": 5},
@@ -256,7 +252,6 @@ async def test_what_changed_its_place_or_type_is_right(key, akvs, binterface, fi
 
 
 async def test_of_a_pattern_only_what_it_names(key, akvs, apspace, binterface, file):
-    """A change beside it is none, and samples are left alone."""
     await akvs[key()].write({"a": {"x": 1, "y": 1}, "temp": 1.0})
     async with recording(binterface, [f"{key()}.a.x"], file, sample={f"{key()}.temp": 0.05}) as recorder:
         await akvs[key()]["a"]["y"].write(2)
@@ -286,7 +281,6 @@ async def test_samples_stay_beside_two_places_that_are_stored_at_once(key, akvs,
 
 
 async def test_nothing_is_read_at_rest(key, akvs, raw, binterface, file):
-    """However many keyframes there are; only new keys are looked for."""
     if isinstance(raw, RawCluster):
         pytest.skip("counts the commands of one server")
     for number in range(20):
@@ -330,7 +324,6 @@ async def test_it_goes_on_after_a_broken_connection(key, akvs, server_url, raw, 
 
 @pytest.mark.parametrize("right", ["client|tracking", "type"])
 async def test_who_may_not_track_has_it_at_the_keyframes_and_is_warned_once(file, caplog, right):
-    """As before there were such messages; it is marked as found."""
     async with server_without_right(right) as (kvs, url), reem_async.RedisInterface(url) as other:
         await kvs["a"].write({"n": 1})
         with caplog.at_level(logging.WARNING, "reem"):
@@ -350,7 +343,6 @@ async def test_who_may_not_track_has_it_at_the_keyframes_and_is_warned_once(file
 
 
 async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_nothing_of_it(file):
-    """However much was read of it just before."""
     large = np.zeros(1_000_000)
     async with server_without_right("client|tracking") as (kvs, url), reem_async.RedisInterface(url) as other:
         await kvs["a"].write({"n": 1, "large": large})
@@ -363,7 +355,6 @@ async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_n
 
 
 async def test_play_and_export_say_what_was_only_stored(key, akvs, apspace, binterface, file, tmp_path):
-    """Played it is published like all else; tables have a column for it."""
     await akvs[key("a")].write({"n": 0})
     async with recording(binterface, [key("a")], file) as recorder:
         await akvs[key("a")]["n"].write(1)

@@ -49,7 +49,6 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def python(code: str, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    """Run code as a program in which every warning is an error."""
     done = subprocess.run(
         [sys.executable, "-X", "dev", "-W", "error", "-c", textwrap.dedent(code), *arguments],
         env=environment(**changes),
@@ -764,7 +763,6 @@ class TestPrograms:
 
 @pytest.fixture
 def snapshots(tmp_path):
-    """A portable snapshot and an RDB file of one server."""
     with EmbeddedServer() as server, reem.RedisInterface(server) as interface:
         kvs = reem.KeyValueStore(interface)
         kvs["foo"] = {"x": np.arange(3), "n": 1.5}
@@ -782,7 +780,6 @@ def holds_it(server: EmbeddedServer) -> bool:
 
 @pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
 def test_begins_with_a_snapshot(snapshots, name):
-    """In memory: each start begins with it anew. The file is not touched."""
     before = (snapshots / name).read_bytes()
     server = EmbeddedServer(password="p w", snapshot=snapshots / name)
     for _ in range(2):
@@ -795,7 +792,6 @@ def test_begins_with_a_snapshot(snapshots, name):
 
 @pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
 def test_a_snapshot_into_a_directory(snapshots, name):
-    """The first start takes it over; what is written is kept, by this object and by others."""
     data = snapshots / "data"
     server = EmbeddedServer(directory=data, snapshot=str(snapshots / name))
     for number in range(2):
@@ -812,7 +808,6 @@ def test_a_snapshot_into_a_directory(snapshots, name):
 
 
 async def test_a_snapshot_where_an_event_loop_runs(snapshots):
-    """Blocking, as in a notebook, and awaited."""
     with EmbeddedServer(snapshot=snapshots / "a.zip") as server:
         assert holds_it(server)
     async with EmbeddedServer(snapshot=snapshots / "a.zip") as server:

@@ -41,14 +41,12 @@ def opened(name, url, space="KeyValueStore", **options):
 
 
 def listen(front, key):
-    """Subscribe in either front."""
     if isinstance(front.interface, reem.RedisInterface):
         return reem.SilentSubscriber(key, front.interface).listen()
     return front.run(reem_async.SilentSubscriber(key, front.interface).listen())
 
 
 def edit(front, key):
-    """Read, change and write back in either front."""
     if isinstance(front.interface, reem.RedisInterface):
         with front.kvs[key] as value:
             value["n"] += 1
@@ -126,7 +124,6 @@ def assert_changes_are_refused(name, url, admin, kind, *words, changes=CHANGES):
 
 @pytest.fixture
 def stored(server, admin):
-    """Something that must not change."""
     with reem.RedisInterface(server.url) as interface:
         reem.KeyValueStore(interface)["foo"] = {"n": 1, "l": [1, 2], "image": np.zeros(9)}
 
@@ -155,7 +152,6 @@ def locked():
     ],
 )
 def test_a_refused_login_is_told_at_once_and_not_tried_again(locked, name, options, words):
-    """Within half a second, by exactly one attempt for each call."""
     process, client = locked
 
     def attempts():
@@ -189,7 +185,6 @@ def robot(server, admin):
 
 @both
 def test_what_a_user_may_not_do_is_named(robot, stored, admin, name):
-    """The command, the key or the channel, and where the rights are listed."""
     url = robot("~*", "&*", "+@all", "-json.set", "-json.numincrby", "-json.nummultby", "-json.arrappend")
     assert_changes_are_refused(name, url, admin, reem.NotAllowed, "foo", "json.", "deploy/users.acl")
     url = robot("~foo", "~{foo*", "&*", "+@all")
@@ -205,7 +200,6 @@ def test_what_a_user_may_not_do_is_named(robot, stored, admin, name):
 
 @both
 def test_a_channel_that_is_out_of_bounds_is_named(robot, stored, admin, name):
-    """Publishing writes nothing then, and subscribing fails at once."""
     url = robot("~*", "resetchannels", "&{bar}*", "+@all")
     before = content(admin)
     with opened(name, url, "PublishSpace") as front:
@@ -231,7 +225,6 @@ def test_without_the_right_to_use_json_one_hears_of_it_on_connecting(robot, name
 
 @both
 def test_nothing_is_written_to_a_full_server(server, stored, admin, name):
-    """Not even a part, and what makes room still works."""
     admin.config_set("maxmemory", 1)
     growing = {title: change for title, change in CHANGES.items() if title not in IN_PLACE}
     assert_changes_are_refused(name, server.url, admin, reem.ServerFull, "foo", "maxmemory", changes=growing)
@@ -292,7 +285,6 @@ def test_a_replica_takes_no_writes(server, stored, admin, name):
 
 @both
 def test_a_server_that_lacks_replicas_or_cannot_save_takes_no_writes(server, stored, admin, name):
-    """The reason is said."""
     admin.config_set("min-replicas-to-write", 1)
     try:
         assert_changes_are_refused(name, server.url, admin, reem.ServerReadOnly, "min-replicas-to-write")
@@ -325,7 +317,6 @@ def slow_to_load(tmp_path_factory):
 
 
 def test_a_server_that_is_loading_says_so(slow_to_load):
-    """Every call fails at once meanwhile, and works afterwards."""
     lines = ("appendonly no", "key-load-delay 500", "loading-process-events-interval-bytes 1024")
     with own_server(*lines, directory=slow_to_load, wait=False) as process:
         for name in FRONTS:
@@ -344,7 +335,6 @@ def test_a_server_that_is_loading_says_so(slow_to_load):
 
 @both
 def test_a_server_without_the_module_takes_documents_as_text(name):
-    """Nothing has to be said for that."""
     with own_server(json=False) as process, process.admin() as client:
         with opened(name, process.url) as front:
             front.write(["foo"], {"a": 1})
@@ -354,7 +344,6 @@ def test_a_server_without_the_module_takes_documents_as_text(name):
 
 
 def test_a_node_of_a_cluster_is_told_apart():
-    """Keys that it holds work; what to do is said for the others."""
     lines = ("cluster-enabled yes", "cluster-node-timeout 500", "cluster-announce-ip 127.0.0.1")
     with own_server(*lines) as one, own_server(*lines) as other, one.admin() as first, other.admin() as second:
         for name in FRONTS:

@@ -68,8 +68,6 @@ class Stored:
 
 
 class KindShip(reem_async.SpecialDatatypeShip):
-    """Fills its key with one of the types a ship may use."""
-
     def check_fit(self, value):
         return isinstance(value, Stored)
 
@@ -100,7 +98,6 @@ class KindShip(reem_async.SpecialDatatypeShip):
 
 @pytest.mark.parametrize("kind", [kind for kind in REDIS_TYPES if kind != "string" and not (PLAIN and "JSON" in kind)])
 async def test_ships_may_use_other_redis_types(servers, there, raws, tmp_path, kind):
-    """The snapshot needs no ship to save and restore them."""
     async with reem_async.RedisInterface(servers[0], ships=[KindShip()]) as writer:
         await reem_async.KeyValueStore(writer)["k"].write({"x": [Stored(kind)]})
     async with reem_async.RedisInterface(servers[0]) as here:
@@ -113,7 +110,6 @@ async def test_ships_may_use_other_redis_types(servers, there, raws, tmp_path, k
 
 
 async def test_a_type_that_cannot_be_saved_is_refused_by_name(servers, raws, tmp_path):
-    """And no file is left."""
     async with reem_async.RedisInterface(servers[0], ships=[KindShip()]) as here:
         await reem_async.KeyValueStore(here)["odd"].write({"x": Stored("stream")})
         with pytest.raises(BadData, match=r"odd\.x.*stream"):
@@ -122,7 +118,6 @@ async def test_a_type_that_cannot_be_saved_is_refused_by_name(servers, raws, tmp
 
 
 async def test_what_cannot_be_saved_is_named_and_all_else_is_saved(servers, there, raws, tmp_path):
-    """An overwritten registry, an array that is gone, a type that cannot be saved, a right that lacks."""
     admin = raws[0]
     async with reem_async.RedisInterface(servers[0], ships=[reem.NumpyShip(), KindShip()]) as here:
         kvs = reem_async.KeyValueStore(here)
@@ -152,7 +147,6 @@ async def test_what_cannot_be_saved_is_named_and_all_else_is_saved(servers, ther
 
 
 async def test_a_key_that_expires_is_restored_with_the_time_it_had_left(here, there, raws, tmp_path):
-    """Arrays and registry too; one that does not expire replaces one that does."""
     store, other = reem_async.KeyValueStore(here), reem_async.KeyValueStore(there)
     for name in ("fades", "stays"):
         await store[name].write({"a": np.arange(3)})
@@ -182,7 +176,6 @@ async def test_a_custom_ship_reads_what_was_restored(servers, raws, tmp_path):
 
 
 async def test_a_namespace_is_saved_alone_and_restored_into_any(servers, raws, tmp_path):
-    """Also where its name is special in patterns; what is outside is neither saved nor counted."""
     async with contextlib.AsyncExitStack() as stack:
         spaces = {
             name: await stack.enter_async_context(reem_async.RedisInterface(servers[0], namespace=name))
@@ -204,7 +197,6 @@ async def test_a_namespace_is_saved_alone_and_restored_into_any(servers, raws, t
 
 
 async def test_foreign_keys_are_left_alone_counted_and_named(here, there, raws, tmp_path):
-    """Other types, keys with a tag that no registry knows, what is left of a deleted document."""
     raw = raws[0]
     space = reem_async.PublishSpace(here)
     await space["foo"].write({"x": np.arange(3)})
@@ -227,7 +219,6 @@ async def test_foreign_keys_are_left_alone_counted_and_named(here, there, raws, 
 
 
 async def test_only_what_matches(here, there, raws, tmp_path):
-    """Of the server, and of the file; a plain name is not searched for."""
     kvs = reem_async.KeyValueStore(here)
     for name in ("arm1", "arm2", "base", "arm.1[x]"):
         await kvs[name].write({"x": np.arange(2)})
@@ -253,7 +244,6 @@ async def test_only_what_matches(here, there, raws, tmp_path):
 
 
 async def test_no_pair_is_torn_while_others_write(servers, here, there, raws, tmp_path):
-    """A number and arrays written together, the shape changing, are saved together."""
     stop, count = threading.Event(), 0
 
     def write():

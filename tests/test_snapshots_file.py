@@ -30,7 +30,6 @@ servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.
 
 
 async def test_any_unzip_opens_it(here, raws, tmp_path):
-    """And numpy reads the arrays in it."""
     array = np.arange(6).reshape(2, 3)
     await reem_async.KeyValueStore(here)["foo"].write({"x": array, "b": b"bytes"})
     await save(here, tmp_path / "a.zip")
@@ -46,7 +45,6 @@ async def test_any_unzip_opens_it(here, raws, tmp_path):
 
 
 async def test_a_damaged_file_is_refused_and_nothing_restored(here, there, raws, tmp_path):
-    """A bit changed, or the end missing, at every fiftieth of it; also near both ends."""
     await reem_async.KeyValueStore(here)["foo"].write({"x": np.arange(500), "y": [b"bytes" * 50], "z": "text" * 50})
     await reem_async.KeyValueStore(here)["bar"].write([1, 2, 3])
     await save(here, tmp_path / "a.zip")
@@ -86,7 +84,6 @@ async def test_other_files_are_refused(there, raws, tmp_path, content):
 
 
 def written(path, *entries, **facts):
-    """A snapshot of these entries, written by hand."""
     writer = ArchiveWriter(path, {**header("here", "", "*", "1"), **facts})
     for entry in entries:
         writer.add(entry)
@@ -124,7 +121,6 @@ async def test_a_document_that_is_none_stops_before_anything_of_it_is_written(th
 
 
 def test_values_in_parts():
-    """Whatever bytes are in them."""
     dice = random.Random(1)
     for _ in range(300):
         pieces = [
@@ -224,7 +220,6 @@ asyncio.run(main())
 
 
 async def test_killed_it_leaves_nothing_under_the_name(servers, here, raws, tmp_path):
-    """What it leaves is hidden, and removed by a later save."""
     kvs = reem_async.KeyValueStore(here)
     for number in range(30):
         await kvs[f"k{number:02}"].write(np.zeros(100_000))

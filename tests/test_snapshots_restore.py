@@ -32,7 +32,6 @@ servers, raws, here, there = snapshotkit.servers, snapshotkit.raws, snapshotkit.
 
 
 async def test_keys_that_are_there_are_not_replaced_unasked(here, there, raws, tmp_path):
-    """Nothing at all is written then; asked to, it leaves no array of the old value, and other keys alone."""
     kvs, copy = reem_async.KeyValueStore(here), reem_async.KeyValueStore(there)
     for name in ("a", "b", "c"):
         await kvs[name].write({"x": np.arange(3), "l": [np.arange(4)]})
@@ -81,7 +80,6 @@ async def test_a_foreign_key_in_the_way_is_never_replaced(here, there, raws, tmp
 
 
 async def test_subscribers_are_told(here, servers, raws, tmp_path):
-    """A mirror has the restored value, arrays included, and no update of this interface is missed afterwards."""
     space = reem_async.PublishSpace(here)
     await space["arm"].write({"joint": 1.5, "image": np.arange(3)})
     await save(here, tmp_path / "a.zip")
@@ -105,7 +103,6 @@ async def test_subscribers_are_told(here, servers, raws, tmp_path):
 
 
 async def test_progress_and_the_twins(servers, raws, tmp_path):
-    """The blocking front does the same."""
     with reem.RedisInterface(servers[0]) as here, reem.RedisInterface(servers[1]) as there:
         reem.KeyValueStore(here)["foo"] = {"x": np.arange(3)}
         told = []
@@ -135,7 +132,6 @@ async def test_progress_and_the_twins(servers, raws, tmp_path):
 
 
 async def test_a_program_with_few_rights_can_save_and_restore(servers, raws, tmp_path):
-    """Those it has anyway, and SCAN; an RDB file it cannot have, and is told so."""
     admin = raws[0]
     rules = ["reset", "on", ">secret", "~reem:*", "~{reem:*", "&reem:*", "&{reem:*", "-@all", "+scan"]
     sample = (ROOT / "deploy" / "users.acl").read_text().partition("user robot ")[2].partition("\n")[0]
@@ -174,7 +170,6 @@ async def test_a_program_with_few_rights_can_save_and_restore(servers, raws, tmp
 
 
 async def test_an_rdb_file_is_of_now(here, raws, tmp_path):
-    """Not one that the server saved before; and a server started on it has all of it."""
     await fill(here)
     raws[0].set("foreign", "x")
     first = await save_rdb(here, tmp_path / "a.rdb")
@@ -252,7 +247,6 @@ async def test_what_the_beginning_of_an_rdb_file_says(tmp_path, head, count):
 
 
 def test_the_modules_that_know_the_format_know_no_server():
-    """The file format and the plans are values and functions."""
     for name in ("archive", "files", "plans"):
         text = (ROOT / f"reem_async/tools/snapshots/{name}.py").read_text(encoding="utf-8")
         assert not any(word in text for word in ("asyncio", "anyio", "session", "transport", "import redis")), name

@@ -15,7 +15,6 @@ from .scoreboard import ROWS, Outcome, perform, run, tell
 
 
 def main() -> int:
-    """Run what the command line asks for; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__)
     parser.add_argument("--rows", default="", help="numbers of rows, such as 1,2,9; all if not given")
     parser.add_argument("--seed", type=int, default=None, help="what all chance comes from; printed, to replay a run")
@@ -71,7 +70,6 @@ def _show(outcomes: list[Outcome], seconds: float) -> None:
 
 
 def _plain(text: str) -> str:
-    """The text, with nothing in it taken for markup."""
     return text.replace("[", "\\[")
 
 

@@ -25,7 +25,6 @@ class Scanner:
         self._first = False
 
     def feed(self, data: bytes) -> None:
-        """Take note of the next bytes."""
         data, at = self._rest + data, 0
         while at < len(data):
             if self._skip:
@@ -66,7 +65,6 @@ class _Link:
         self.doomed = False  # the next reply is dropped and the connection reset
 
     def reset(self) -> None:
-        """End it with a RST to the client; the server still gets, and answers, what was sent."""
         _abort(self.client)
         self.swallowed = self.gone = True
         with contextlib.suppress(OSError, RuntimeError):
@@ -103,17 +101,14 @@ class Proxy:
 
     @property
     def url(self) -> str:
-        """What to connect to."""
         return f"redis://127.0.0.1:{self.port}"
 
     @property
     def commands(self) -> int:
-        """How many commands clients have sent."""
         return sum(self.names.values())
 
     @property
     def connections(self) -> int:
-        """How many connections are open."""
         return len(self._links)
 
     def drop_reply(self, marker: bytes) -> None:
@@ -121,7 +116,6 @@ class Proxy:
         self._marker = marker
 
     def reset(self) -> None:
-        """End all connections with a RST."""
         self._do(lambda: [link.reset() for link in list(self._links)])
 
     def settled(self, seconds: float = 10.0) -> bool:

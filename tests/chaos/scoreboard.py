@@ -78,7 +78,6 @@ class Run:
         self.failures: list[str] = []
 
     def size(self, full: Any, quick: Any) -> Any:
-        """Return how much to do at this scale."""
         return full if self.full else quick
 
     def at_most(self, what: str, figure: float, bound: float, unit: str = "") -> None:
@@ -111,7 +110,6 @@ def _shown(number: float) -> str:
 
 
 def tell(text: str) -> None:
-    """Show progress."""
     print(text, flush=True)
 
 
@@ -147,8 +145,6 @@ def perform(number: int, scale: str, seed: int) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of a row."""
-
     row: Row
     status: str
     figures: list[str]

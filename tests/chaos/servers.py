@@ -59,12 +59,10 @@ class PrivateServer:
 
     @property
     def url(self) -> str:
-        """Where it listens, without a password."""
         return f"redis://127.0.0.1:{self.port}"
 
     @property
     def pid(self) -> int:
-        """The process id of the server itself."""
         assert self._process is not None
         return self._process.pid
 
@@ -75,7 +73,6 @@ class PrivateServer:
         )
 
     def start(self) -> None:
-        """Start it; returns when it answers."""
         self._process = _Configured(self)
 
     def start_loading(self) -> None:

@@ -26,12 +26,10 @@ PAUSE = 0.005
 
 
 def frame(number: int) -> np.ndarray[Any, Any]:
-    """An array just so large that it goes through shared memory, and that shows in every item whose it is."""
     return np.full(LEAST // 8, number)
 
 
 def rss() -> float:
-    """The memory of this process that is in RAM, in MB."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
@@ -64,7 +62,6 @@ async def became(condition: Callable[[], Any], seconds: float) -> float | None:
 
 
 def state_of(interface: Any) -> str:
-    """The state of an interface."""
     state = getattr(interface, "state", None)
     if state is None:
         raise AssertionError("RedisInterface has no `state`: what became of a connection cannot be observed")
@@ -113,14 +110,12 @@ def program(name: str, *arguments: Any, module: str = "programs", flags: tuple[s
 
 
 def said(process: subprocess.Popen[str]) -> dict[str, Any]:
-    """Return the next thing a program says."""
     line = process.stdout.readline()
     assert line, f"the program ended with {process.wait(5)}"
     return json.loads(line)
 
 
 def order(process: subprocess.Popen[str], word: object) -> None:
-    """Tell a program to go on."""
     process.stdin.write(f"{word}\n")
     process.stdin.flush()
 
@@ -162,12 +157,10 @@ class Log:
         self._drawn = 0  # how many of the loop's own skipped updates have been met
 
     async def follow(self) -> None:
-        """Take updates until the loop ends."""
         async for update in self.updates:
             self.take(update)
 
     def take(self, update: Any) -> None:
-        """Note one update."""
         self.told += 1
         self.gaps += update.gap
         self.shared += shared_in(update.data) > 0

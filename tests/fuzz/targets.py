@@ -124,7 +124,6 @@ TARGETS = {each.__name__: each for each in (npy, notice, document, placeholder, 
 
 
 def blob(array):
-    """An array as it is stored."""
     return b"".join(bytes(piece) for piece in NumpyShip().pack(array))
 
 
@@ -207,7 +206,6 @@ def mutants(name, count, seed):
 
 
 def main(arguments):
-    """Run from a command line; see the package."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz")
     parser.add_argument("target", nargs="?", choices=list(TARGETS))
     parser.add_argument("--runs", type=int, default=100_000)

@@ -22,7 +22,6 @@ UPDATES = 40
 
 
 async def record(url: str, file: Path, compression: str) -> None:
-    """Record some updates of every kind there is in a file."""
     async with reem_async.RedisInterface(url, namespace=f"{compression}:") as interface:
         space = reem_async.PublishSpace(interface)
         async with Recorder(interface, ["*"], file, compression=compression, keyframe=0.2):
@@ -35,7 +34,6 @@ async def record(url: str, file: Path, compression: str) -> None:
 
 
 def main() -> None:
-    """Print what the reader found in each file; ends with an error if it found anything wrong."""
     with EmbeddedServer() as server, tempfile.TemporaryDirectory() as folder:
         for compression in ("zstd", "lz4", "none"):
             file = Path(folder) / f"{compression}.mcap"

@@ -11,7 +11,6 @@ from .measure import run
 
 
 def main() -> int:
-    """Run and print."""
     parser = argparse.ArgumentParser(prog="python -m tests.rates", description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0, help="to record (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="of what is published (default: %(default)s)")

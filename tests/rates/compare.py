@@ -23,8 +23,6 @@ _AHEAD = 200
 
 
 class Compared(NamedTuple):
-    """What was found of one key."""
-
     published: int
     recorded: int
     skipped: int
@@ -34,8 +32,6 @@ class Compared(NamedTuple):
 
 
 class Truth(NamedTuple):
-    """One call and what it led to."""
-
     number: int
     op: Op
     tree: Any
@@ -77,7 +73,6 @@ class Key:
         self._faults: list[str] = []
 
     def run(self) -> Compared:
-        """Compare all of it."""
         skips = collections.deque((time, number) for time, path, number in self._log.skipped() if self._is_ours(path))
         news = self._log.updates(patterns=[self._name])
         update = next(news, None)

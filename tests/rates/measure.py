@@ -107,7 +107,6 @@ async def _now(url: str) -> dict[str, Any]:
 
 
 def run(seed: int, seconds: float, instants: int, folder: Path) -> Outcome:
-    """Record for so many seconds, and compare; `instants` of each key."""
     with EmbeddedServer() as server:
         said, memory = _record(server.url, seed, seconds, folder)
         now = asyncio.run(_now(server.url))

@@ -14,8 +14,6 @@ __all__ = ["STREAMS", "Op", "Stream", "after"]
 
 
 class Op(NamedTuple):
-    """One call of a publisher: "set", "delete", "append" or "add", below the top-level key; `pause` seconds before."""
-
     kind: str
     path: tuple[Any, ...]
     value: Any = None
@@ -23,14 +21,11 @@ class Op(NamedTuple):
 
 
 class Stream(NamedTuple):
-    """A top-level key: how often, and what is published each time."""
-
     rate: float
     ops: Callable[[random.Random], Iterator[list[Op]]]
 
 
 def after(tree: Any, op: Op) -> Any:
-    """Return what a key holds after a call."""
     if op.kind == "delete":
         return removed(tree, op.path)
     value = op.value

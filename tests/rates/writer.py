@@ -17,7 +17,6 @@ __all__ = ["call"]
 
 
 def call(space: PublishSpace, name: str, op: Op) -> None:
-    """Make one call."""
     handle: Any = space[name]
     for key in op.path:
         handle = handle[key]
@@ -32,7 +31,6 @@ def call(space: PublishSpace, name: str, op: Op) -> None:
 
 
 def main() -> None:
-    """Publish, and write down when each call began and ended."""
     url, name, seed, seconds, file = sys.argv[1:]
     stream, times = STREAMS[name], []
     with RedisInterface(url, timeout=30) as interface:
