@@ -5,19 +5,16 @@ Starting Python and importing everything takes half a second, so most calls are 
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import json
-import os
-import pathlib
 import signal
 import socket
 import subprocess
 import sys
-import threading
 
 import numpy as np
 import pytest
+from clikit import REEM, CommandLine, finished
 from conftest import assert_same, nothing_sent
 from typer.testing import CliRunner
 
@@ -25,89 +22,6 @@ import reem as blocking
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli import build, commands
 from reem_async.tools.cli.commands import COMMANDS
-
-REEM = str(pathlib.Path(sys.executable).parent / "reem")
-TERMINAL = "import os, pty, sys; sys.exit(os.waitstatus_to_exitcode(pty.spawn(sys.argv[1:])))"
-
-
-class CommandLine:
-    """Runs `reem` against one server, in a namespace of its own."""
-
-    def __init__(self, url, namespace):
-        self.url, self.namespace = url, namespace
-
-    def environment(self, **changes):
-        left_out = ("REEM_PASSWORD", "FORCE_COLOR", "NO_COLOR", "COLUMNS", "LINES")
-        clean = {name: value for name, value in os.environ.items() if name not in left_out}
-        return {**clean, "REEM_URL": self.url, "PYTHONWARNINGS": "error", "TERM": "xterm-256color", **changes}
-
-    def words(self, command, *arguments):
-        return [REEM, command, "--namespace", self.namespace, *map(str, arguments)]
-
-    def __call__(self, command, *arguments, input=None, **changes):  # noqa: A002
-        """Run a command in this process."""
-        words, environment = self.words(command, *arguments)[1:], self.environment(**changes)
-        run = CliRunner().invoke(build(), words, input, environment, prog_name="reem")
-        assert run.exception is None or isinstance(run.exception, SystemExit), repr(run.exception)
-        return run
-
-    def process(self, command, *arguments, **changes):
-        """Run a command as a user does."""
-        words, environment = self.words(command, *arguments), self.environment(**changes)
-        run = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=30, check=False)
-        assert "Traceback" not in run.stderr, run.stderr
-        return run
-
-    def result(self, *arguments, **options):
-        run = self(*arguments, **options)
-        assert run.exit_code == 0, run.stderr
-        return run.stdout
-
-    def error(self, code, *arguments, **options):
-        """The one line of a command that must fail with this exit code."""
-        run = self(*arguments, **options)
-        assert run.exit_code == code, (run.stdout, run.stderr)
-        assert run.stdout == ""
-        if code != 2:
-            assert run.stderr.count("\n") == 1, run.stderr
-        return run.stderr
-
-    @contextlib.contextmanager
-    def running(self, command, *arguments, **options):
-        with subprocess.Popen(
-            self.words(command, *arguments),
-            env=self.environment(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            **options,
-        ) as process:
-            try:
-                yield process
-            finally:
-                process.kill()
-
-    def in_terminal(self, command, *arguments, keys=(), columns=100):
-        """What a terminal shows of a command, and its exit code; `keys` are (text seen, what is typed then)."""
-        with subprocess.Popen(
-            [sys.executable, "-c", TERMINAL, *self.words(command, *arguments)],
-            env=self.environment(COLUMNS=str(columns)),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            bufsize=0,
-        ) as process:
-            said, todo = b"", list(keys)
-            patience = threading.Timer(60.0, process.kill)
-            patience.start()
-            while data := process.stdout.read(4096):
-                said += data
-                while todo and todo[0][0] in said:
-                    process.stdin.write(todo.pop(0)[1])
-            patience.cancel()
-            code = process.wait(10)
-        assert not todo, said
-        assert b"Traceback" not in said, said.decode()
-        return said.decode(), code
 
 
 @pytest.fixture
@@ -133,10 +47,12 @@ def kvs(cli):
         yield store
 
 
+SNAPSHOT = [["snapshot", command] for command in ("save", "list", "restore")]
+
 # --- the whole -------------------------------------------------
 
 
-def test_help_has_every_command_under_its_heading_with_examples():
+def test_help_has_every_command_under_its_heading():
     """The lines of the table are those of the docstrings, so `reem --help` and `reem NAME --help` agree."""
     run = subprocess.run([REEM, "--help"], capture_output=True, text=True, timeout=30, check=True)
     for entry in COMMANDS:
@@ -146,8 +62,6 @@ def test_help_has_every_command_under_its_heading_with_examples():
         if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
             said = commands.help_text(thing.__doc__)
             assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])
-            assert "[bold]Examples:[/bold]\n" in said
-            assert f"    reem {entry.name}" in said
     assert "--install-completion" in run.stdout
     assert "\x1b" not in run.stdout
 
@@ -163,12 +77,20 @@ def test_help_needs_none_of_the_commands():
     assert loaded == str([f"reem_async.tools.cli{name}" for name in light])
 
 
-@pytest.mark.parametrize("entry", COMMANDS, ids=lambda entry: entry.name)
-def test_each_command_can_be_parsed(entry):
-    """Its options and arguments make sense to the library that parses them."""
-    command = commands.command_of(entry)
-    assert command.name == entry.name
-    assert command.help
+@pytest.mark.parametrize(
+    "words",
+    [*[[entry.name] for entry in COMMANDS if entry.attribute != "app"], *SNAPSHOT],
+    ids=" ".join,
+)
+def test_help_of_each_command_has_examples(words):
+    run = CliRunner().invoke(build(), [*words, "--help"], env={"COLUMNS": "100"}, prog_name="reem")
+    assert run.exit_code == 0
+    assert "Examples:" in run.stdout
+    assert f"reem {' '.join(words)}" in run.stdout.partition("Examples:")[2]
+
+
+def test_version():
+    assert CliRunner().invoke(build(), ["--version"], prog_name="reem").stdout.startswith("reem")
 
 
 def test_paragraphs_are_joined_and_indented_lines_are_kept():
@@ -187,17 +109,41 @@ def test_wrong_usage(cli):
     assert "redis://" in cli.error(2, "ls", "--url", "http://nowhere")
 
 
-def test_errors_are_one_line_that_names_the_remedy_and_no_password(cli):
-    run = cli.process("ls", REEM_URL="redis://:hidden-4711@127.0.0.1:1")
-    said = run.stderr
-    assert (run.returncode, run.stdout, said.count("\n")) == (1, "", 1)
-    assert said.startswith("reem ls: no server answers at 127.0.0.1:1")
-    assert "reem up" in said
-    assert "--url or REEM_URL" in said
-    assert "hidden" not in said
+@pytest.mark.parametrize(
+    "words",
+    [["ls"], ["snapshot", "save", "a.zip"], ["browse", "--no-open", "--port", "0"], ["record", "-o", "a.mcap"]],
+    ids=" ".join,
+)
+def test_no_server_is_one_line_that_names_the_remedy_and_no_password(tmp_path, words):
+    run = finished(*words, cwd=tmp_path, REEM_URL="redis://:hidden-4711@127.0.0.1:1")
+    assert (run.returncode, run.stdout, run.stderr.count("\n")) == (1, "", 1)
+    assert run.stderr.startswith(f"reem {words[0]}")
+    for part in ("no server answers at 127.0.0.1:1", "reem up", "--url or REEM_URL"):
+        assert part in run.stderr
+    assert "hidden" not in run.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refused_login_is_one_line_without_the_password(cli):
     said = cli.error(1, "ls", "--url", cli.url.replace("//", "//nobody:hidden-4711@"))
     assert "refused this user name and password" in said
     assert "hidden" not in said
+
+
+FILES = [
+    *[["log", "info"], ["log", "export"], ["play"], ["browse", "--no-open", "--log"]],
+    *[["snapshot", "restore"], ["snapshot", "list"], ["up", "--from"]],
+]
+
+
+@pytest.mark.parametrize("words", FILES, ids=" ".join)
+def test_a_file_that_is_not_there_or_is_none_is_named(cli, tmp_path, words):
+    file = tmp_path / "run.file"
+    for code in (3, 1):
+        run = CliRunner().invoke(build(), [*words, str(file)], env=cli.environment(COLUMNS="300"), prog_name="reem")
+        assert (run.exit_code, file.name in run.stderr) == (code, True), run.stderr
+        file.write_bytes(b"something else")
+    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.long
@@ -406,16 +352,7 @@ def test_delete(cli, kvs):
     cli.result("del", "foo")
     assert kvs.get("foo", "gone") == "gone"
     assert "nothing is stored at foo" in cli.error(3, "del", "foo")
-
-
-@pytest.mark.parametrize(("answer", "code"), [(b"n\n", 1), (b"y\n", 0)])
-def test_a_terminal_is_asked_before_a_whole_key_goes(cli, kvs, answer, code):
-    shown, got = cli.in_terminal("del", "cam_left", keys=[(b"[y/N]", answer)])
-    assert got == code
-    assert "Delete cam_left (float64[40,50]) at " in shown
-    assert kvs.get("cam_left", None) is None if code == 0 else kvs["cam_left"].read().shape == (40, 50)
-    if code == 0:
-        assert cli.in_terminal("del", "cam_right", "--yes") == ("", 0)
+    assert cli.in_terminal("del", "cam_right", "--yes") == ("", 0), "a terminal is asked otherwise: test_cli_odd.py"
 
 
 def test_subscribers_are_told_if_wanted(cli, kvs):

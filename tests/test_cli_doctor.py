@@ -6,18 +6,16 @@ import contextlib
 import json
 import re
 import socket
-import subprocess
 import urllib.parse
 
 import pytest
 import redis
-from conftest import PLAIN, eventually
-from test_cli import CommandLine
+from clikit import CommandLine
+from conftest import PLAIN
 
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
-from reem_async.server.programs import find_program
 from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts
 
@@ -168,36 +166,6 @@ def test_a_node_that_does_not_answer_is_a_finding_and_the_others_are_examined():
     assert servers[0] == (gone, FAIL)
     assert [status for _, status in servers[1:]] == [OK, OK]
     assert len([row for row in rows if row["check"] == "eviction"]) == 2
-
-
-def answers(port):
-    with socket.socket() as probe:
-        return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-@pytest.mark.long
-def test_a_server_without_json(tmp_path):
-    try:
-        program = find_program()
-    except ServerMissing as missing:
-        pytest.skip(f"needs a server of its own: {missing}")
-    if not program.modules:
-        pytest.skip("this server has JSON built in")
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    command = [program.path, "--port", str(port), "--bind", "127.0.0.1", "--save", ""]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=tmp_path) as process:
-        try:
-            eventually(lambda: answers(port))
-            cli = CommandLine(f"redis://127.0.0.1:{port}", "")
-            run = cli("doctor", "--json")
-        finally:
-            process.kill()
-    report = findings(run)
-    assert report["json"]["status"] == OK
-    assert "kept as text" in report["json"]["message"]
-    assert report["server"]["status"] == OK
-    assert {report[check]["status"] for check in ("small read", "1 MB array")} <= {OK, WARN}
 
 
 # --- what the facts mean -------------------------------------------------

@@ -12,10 +12,11 @@ import time
 
 import numpy as np
 import pytest
+from clikit import CommandLine
 from conftest import RawCluster, eventually, subscribed, subscriptions
-from test_cli import CommandLine
 
 import reem as blocking
+from examples.custom_ship import Scan, ScanShip
 from reem_async.connection import RedisInterface
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import announce, published
@@ -136,32 +137,16 @@ def test_echo_fetches_if_asked(space, listening):
     assert said.rstrip().endswith("foo  int64[5000] [7 7 7 ... 7 7 7]")
 
 
-class Scan:
-    """What only its own ship can read."""
-
-
-class ScanShip(blocking.BlobShip):
-    def check_fit(self, value):
-        return isinstance(value, Scan)
-
-    def pack(self, value):
-        return (b"1" * 50_000,)
-
-    def unpack(self, blob):
-        return Scan()
-
-    def get_label(self):
-        return "scan"
-
-
 @pytest.mark.parametrize("options", [(), ("--json",)])
 def test_echo_goes_on_beside_what_it_cannot_fetch(cli, raw, listening, options):
     """It ended at the first value of a custom type."""
-    with blocking.RedisInterface(cli.url, namespace=cli.namespace, ships=[ScanShip()]) as interface:
+    with blocking.RedisInterface(
+        cli.url, namespace=cli.namespace, ships=[ScanShip(), blocking.NumpyShip()]
+    ) as interface:
         space = blocking.PublishSpace(interface)
         space["a"] = 0
         with listening("echo", "a", "--fetch", "--timeout", "60", *options) as process:
-            space["a"] = Scan()
+            space["a"] = Scan("front", np.zeros((5000, 3)))
             first = process.stdout.readline()
             space["a"] = 2
             second = process.stdout.readline()

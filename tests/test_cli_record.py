@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import json
 import os
 import pty
@@ -10,12 +10,12 @@ import re
 import select
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
-from conftest import PLAIN, ROOT, assert_same, eventually, line_of
+from clikit import begins, finished, is_recording, started
+from conftest import PLAIN, ROOT, assert_same, eventually
 from test_recording import IMAGE
 from test_unreadable import Pose
 
@@ -24,54 +24,11 @@ from reem.recording import Recorder
 from reem.server import EmbeddedServer
 from reem_async.tools.recording import open_log
 
-APP = """
-import typer
-from reem_async.tools.cli import log, record
-app = typer.Typer(pretty_exceptions_enable=False)
-app.command()(record.record)
-app.command()(log.play)
-app.add_typer(log.app, name="log")
-app()
-"""
-REEM = [sys.executable, "-W", "error", "-c", APP]
-
-
-def environment(url):
-    return {**os.environ, "PYTHONPATH": str(ROOT), "REEM_URL": url, "COLUMNS": "200"}
-
 
 @pytest.fixture
 def reem(server_url, tmp_path):
-    def run(*arguments, **options):
-        command = [*REEM, *map(str, arguments)]
-        settings = {"env": environment(server_url), "cwd": tmp_path, "timeout": 30, **options}
-        return subprocess.run(command, capture_output=True, text=True, check=False, **settings)
-
-    return run
-
-
-@contextlib.contextmanager
-def started(url, cwd, *arguments, **options):
-    command = [*REEM, *map(str, arguments)]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, **options}
-    with subprocess.Popen(command, env=environment(url), cwd=cwd, **pipes) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def begins(process, *, as_json=False):
-    """Wait until `reem record` says that it has begun: before that, a signal leaves no recording."""
-    line = line_of((process.stdout if as_json else process.stderr).fileno())
-    assert line.startswith('{"seconds":' if as_json else "recording into "), line + process.communicate()[1]
-    return line
-
-
-def is_recording(file):
-    """Whether the first messages are in the file; that does not mean that the command has begun."""
-    with contextlib.suppress(OSError, ValueError), open_log(file) as log:
-        return bool(log.names())
+    """Runs a command to its end."""
+    return functools.partial(finished, cwd=tmp_path, REEM_URL=server_url, COLUMNS="200")
 
 
 @pytest.fixture
@@ -202,6 +159,10 @@ def test_samples_for_some_time(key, kvs, reem, tmp_path):
     kvs[key("a")] = {"joint": 1.5}
     (tmp_path / "keys.csv").write_text(f"{key('a')}.joint, 0.02\n")
     (tmp_path / "run.mcap").write_bytes(b"old")
+    run = reem("record", "--sample", "keys.csv")
+    assert (run.returncode, "--force" in run.stderr) == (2, True)
+    assert (tmp_path / "run.mcap").read_bytes() == b"old"
+    assert "none.csv" in reem("record", "--sample", "none.csv", "-o", "x.mcap").stderr
     run = reem("record", "--sample", "keys.csv", "--duration", "0.3", "--force")
     assert (run.returncode, run.stderr) == (0, "recording into run.mcap for 0.3 s\n")
     assert run.stdout.startswith("run.mcap: ")
@@ -224,25 +185,6 @@ def test_samples_that_are_late_or_fail_are_told(key, kvs, raw, reem, tmp_path):
     last = json.loads(run.stdout.splitlines()[-1])
     assert (last["messages"], last["failed"] > 0, "late" in last) == (0, True, True)
     assert f"none of the paths of the samples could be read: {last['failed']} readings failed" in run.stderr
-
-
-@pytest.mark.long
-def test_what_cannot_be(key, reem, tmp_path):
-    (tmp_path / "there.mcap").write_bytes(b"precious")
-    for arguments, code, text in (
-        (("record", key("a"), "-o", "there.mcap"), 2, "--force"),
-        (("record", "--sample", "none.csv", "-o", "x.mcap"), 3, "none.csv"),
-        (("play", "there.mcap"), 1, "not an MCAP file"),
-    ):
-        run = reem(*arguments)
-        assert (run.returncode, run.stdout if code > 1 else "") == (code, ""), run
-        assert text in run.stderr
-        assert "Traceback" not in run.stderr
-    assert (tmp_path / "there.mcap").read_bytes() == b"precious"
-    assert not (tmp_path / "x.mcap").exists()
-    run = reem("record", "--url", "redis://127.0.0.1:1", "-o", "x.mcap")
-    assert (run.returncode, "127.0.0.1:1" in run.stderr) == (1, True)
-    assert not (tmp_path / "x.mcap").exists()
 
 
 def test_on_a_terminal_a_line_is_written_over(key, server_url, pspace, tmp_path):
@@ -274,8 +216,7 @@ def test_a_ship_of_the_users_own_is_named_on_the_command_line(server_url, key, r
     """With it its values are recorded; without it they are counted, by `log info` and `play` too."""
     with RedisInterface(server_url, [Pose(), NumpyShip()]) as interface:
         KeyValueStore(interface)[key()] = {"n": 1, "pose": 1 + 2j, "array": IMAGE}
-    path = {**environment(server_url), "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
-    run = reem("record", key(), "--duration", "0.5", *ships, env=path)
+    run = reem("record", key(), "--duration", "0.5", *ships, PYTHONPATH=ROOT / "tests")
     assert run.returncode == 0, run.stderr
     assert ("1 unreadable or not recordable" in run.stdout) == (not ships)
     assert f"{key()}.pose 1" in reem("log", "info", "run.mcap").stdout or ships

@@ -7,45 +7,28 @@ import errno
 import json
 import os
 import pathlib
-import pty
 import re
-import shlex
 import signal
-import subprocess
-import sys
-from unittest import mock
 
 import numpy as np
 import pytest
 import redis
 import typer
-from conftest import ROOT, assert_same, eventually, line_of
+from clikit import environment, finished, in_terminal, running
+from conftest import assert_same, eventually, line_of
 from typer.testing import CliRunner
 
 import reem
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli.snapshot import app, period
+from reem_async.tools.cli import build
+from reem_async.tools.cli.snapshot import period
 from reem_async.tools.snapshots import files, portable, rdb
-from reem_async.tools.snapshots.archive import ArchiveWriter, header
-from reem_async.tools.snapshots.plans import KeyContent
-
-MAIN = """
-from reem_async.tools.cli.commands import Entry
-from reem_async.tools.cli.commands import command_of
-command_of(Entry("snapshot", "snapshot", "app", "", ""))(prog_name="reem snapshot")
-"""
-REEM = [sys.executable, "-W", "error", "-c", MAIN]  # not -X dev: asyncio would tell of each slow step
-
-
-def environment(**changes):
-    clean = {name: value for name, value in os.environ.items() if name not in ("REEM_URL", "FORCE_COLOR", "COLUMNS")}
-    return {**clean, "PYTHONPATH": str(ROOT), **changes}
 
 
 def snapshot(*arguments, code=0, **changes):
-    with mock.patch.dict(os.environ, environment(**changes), clear=True):
-        run = CliRunner().invoke(app, [str(word) for word in arguments], prog_name="reem snapshot")
+    words = ["snapshot", *map(str, arguments)]
+    run = CliRunner().invoke(build(), words, env=environment(**changes), prog_name="reem")
     assert isinstance(run.exception, (SystemExit, type(None))), run.exception
     assert run.exit_code == code, run.stdout + run.stderr
     assert "\x1b" not in run.stdout + run.stderr
@@ -81,15 +64,7 @@ def names(directory):
 def test_in_a_process_of_its_own(kvs, env, tmp_path):
     kvs["foo"] = 1
     for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 2), (["list"], 0)):
-        run = subprocess.run(
-            [*REEM, *words],
-            cwd=tmp_path,
-            env=environment(**env),
-            capture_output=True,
-            text=True,
-            timeout=30,
-            check=False,
-        )
+        run = finished("snapshot", *words, cwd=tmp_path, **env)
         assert (run.returncode, bool(run.stdout), bool(run.stderr)) == (code, not code, bool(code))
         assert "a.zip" in run.stdout + run.stderr
         assert "\x1b" not in run.stdout + run.stderr
@@ -205,13 +180,6 @@ def test_what_is_wrong_is_said_with_an_exit_code(kvs, env, tmp_path, monkeypatch
     assert names(tmp_path) == []
 
 
-def test_nobody_listens(tmp_path):
-    _, errors = snapshot("save", tmp_path / "a.zip", "--url", "redis://user:s3cret@127.0.0.1:1", code=1)
-    assert "reem up" in errors
-    assert "s3cret" not in errors
-    assert names(tmp_path) == []
-
-
 def test_without_the_right_to_an_rdb_file_a_portable_one_is_taken(kvs, server, tmp_path):
     kvs["foo"] = 1
     with redis.Redis.from_url(server.url) as admin:
@@ -225,19 +193,8 @@ def test_without_the_right_to_an_rdb_file_a_portable_one_is_taken(kvs, server, t
     assert len(names(tmp_path)) == 1
 
 
-@contextlib.contextmanager
-def periodic(*arguments, **changes):
-    with subprocess.Popen(
-        [*REEM, "save", *map(str, arguments)],
-        env=environment(**changes),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
+def periodic(*words, **changes):
+    return running("snapshot", "save", *words, env=environment(**changes))
 
 
 @pytest.mark.long
@@ -313,24 +270,6 @@ def test_what_cannot_be_deleted_does_not_make_it_unsaved(kvs, env, tmp_path, mon
     assert (len(json.loads(said)["deleted"]), len(names(tmp_path)), errors) == (3, 1, "")
 
 
-def test_a_listing_ends_with_its_reader(tmp_path):
-    """A traceback was what `| head -1` had for it."""
-    writer = ArchiveWriter(tmp_path / "a.zip", header("s", "", "*", "1"))
-    for number in range(3000):
-        writer.add(KeyContent(f"a_key_of_some_length_{number}", b"1", (), ()))
-    writer.finish([])
-    words = shlex.join([*REEM, "list", str(tmp_path / "a.zip")])
-    run = subprocess.run(
-        ["bash", "-c", f"{words} | head -1; exit ${{PIPESTATUS[0]}}"],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
-    assert (run.returncode, run.stdout.count("\n"), run.stderr) == (0, 1, "")
-
-
 @pytest.mark.long
 def test_by_period_it_outlives_the_server(tmp_path):
     server = EmbeddedServer()
@@ -364,23 +303,17 @@ def test_ctrl_c_leaves_no_half_file(kvs, env, tmp_path):
 def test_in_a_terminal(kvs, env, tmp_path):
     for number in range(20):
         kvs[f"k{number}"] = np.zeros(100_000)
-    said = b""
+    said = ""
     for words in (["save", tmp_path / "a.zip"], ["list", tmp_path], ["restore", "--replace", tmp_path / "a.zip"]):
-        here, there = pty.openpty()
-        variables = environment(**env, TERM="xterm-256color", COLUMNS="80")
-        with subprocess.Popen([*REEM, *map(str, words)], env=variables, stdout=there, stderr=there) as process:
-            os.close(there)
-            with contextlib.suppress(OSError):  # the end of a terminal
-                while data := os.read(here, 4096):
-                    said += data
-            os.close(here)
-        assert process.returncode == 0, said
-    assert b"\x1b[" in said
-    assert b"taken" in said
-    assert b"save" in said
-    assert b"restore" in said
-    assert b"%" in said
-    assert b"20 keys restored" in said
+        shown, code = in_terminal("snapshot", *words, **env, COLUMNS="80")
+        said += shown
+        assert code == 0, said
+    assert "\x1b[" in said
+    assert "taken" in said
+    assert "save" in said
+    assert "restore" in said
+    assert "%" in said
+    assert "20 keys restored" in said
 
 
 @pytest.mark.parametrize(
@@ -394,13 +327,3 @@ def test_periods(text, seconds):
 def test_bad_periods(text):
     with pytest.raises(typer.BadParameter, match="10m"):
         period(text)
-
-
-def test_help_has_examples():
-    for command in ("save", "list", "restore"):
-        said, _ = snapshot(command, "--help", COLUMNS="100")
-        assert "Examples:" in said
-        assert f"reem snapshot {command}" in said
-        assert "Traceback" not in said
-    said, _ = snapshot("--help")
-    assert all(command in said for command in ("save", "list", "restore"))

@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 import pytest
+from clikit import REEM, CommandLine
 from rich.console import Console
-from test_cli import REEM, CommandLine
 
 import reem as blocking
 from reem_async.pubsub.monitor import Event
@@ -117,26 +117,6 @@ def test_a_recording_of_nothing_warns(cli, tmp_path):
     assert run.returncode == 0
     assert "nothing was recorded" in run.stderr
     assert "reem top" in run.stderr
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["log", "info", "no.mcap"],
-        ["log", "export", "no.mcap"],
-        ["play", "no.mcap"],
-        ["record", "--sample", "no.csv"],
-        ["set", "x", "@no.npy"],
-        ["snapshot", "restore", "no.zip"],
-        ["up", "--from", "no.zip"],
-    ],
-    ids=" ".join,
-)
-def test_a_file_that_is_not_there_is_exit_code_3(cli, tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
-    run = subprocess.run([REEM, *words], env=cli.environment(), capture_output=True, text=True, timeout=30, check=False)
-    assert run.returncode == 3, run.stderr
-    assert words[-1].removeprefix("@") in run.stderr
 
 
 def test_a_server_on_the_port_is_named(cli, server_url):

@@ -7,8 +7,8 @@ import re
 
 import numpy as np
 import pytest
+from clikit import CommandLine
 from conftest import ROOT
-from test_cli import CommandLine
 from typer.testing import CliRunner
 
 import reem as blocking

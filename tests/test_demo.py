@@ -15,8 +15,8 @@ import urllib.request
 
 import numpy as np
 import pytest
+from clikit import REEM
 from conftest import eventually
-from test_cli import REEM
 
 import reem
 from reem_async.server.programs import find_program

@@ -12,11 +12,10 @@ import httpx
 import numpy as np
 import oldkit
 import pytest
+from clikit import CommandLine, begins
 from conftest import PATIENCE, PLAIN, assert_same, eventually
 from sentinelkit import Watched
-from test_cli import CommandLine
 from test_cli_browse import address_in, browsing
-from test_cli_record import begins
 from typer.testing import CliRunner
 
 import reem

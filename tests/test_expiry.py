@@ -8,8 +8,8 @@ import threading
 import numpy as np
 import pytest
 import redis
+from clikit import CommandLine
 from conftest import assert_same, eventually
-from test_cli import CommandLine
 
 import reem
 from reem_async.errors import BadKey, BadType, BadValue, MissingKey

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import redis
 from browserkit import client_of, live, served
+from clikit import CommandLine
 from conftest import PATIENCE, eventually
-from test_cli import CommandLine
 
 import reem
 import reem_async

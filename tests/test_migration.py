@@ -11,9 +11,9 @@ import numpy as np
 import oldkit
 import pytest
 import redis
+from clikit import CommandLine
 from conftest import assert_same, eventually, sized
 from oldkit import A, Cut, Pose, PoseShip, everything, replay, ships, stored
-from test_cli import CommandLine
 
 import reem
 import reem_async

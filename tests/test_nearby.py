@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import redis
 from chaos.proxy import Proxy
+from clikit import begins, started
 from conftest import FRONTS, eventually
-from test_cli_record import begins, started
 
 import reem
 from reem.errors import ConnectionLost, NotConnected

@@ -115,11 +115,12 @@ def test_the_hidden_file_of_a_program_at_work_is_not_deleted_by_the_next_one(tmp
     at_work = PartFile(tmp_path / "one.zip")
     os.write(at_work.descriptor, b"whole")
     (tmp_path / ".dead.zip.0123abcd.reem.part").write_bytes(b"half")
+    (tmp_path / ".c.zip.0123abcd.part").write_bytes(b"foreign")
     if not locks:  # then it is old that tells it
         os.utime(tmp_path / ".dead.zip.0123abcd.reem.part", (1, 1))
     written(tmp_path / "two.zip", b"two")
     at_work.finish()
-    assert content(tmp_path) == {"one.zip": b"whole", "two.zip": b"two"}
+    assert content(tmp_path) == {"one.zip": b"whole", "two.zip": b"two", ".c.zip.0123abcd.part": b"foreign"}
 
 
 def test_a_recording_that_is_running_is_not_replaced(tmp_path, locks):

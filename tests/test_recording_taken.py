@@ -12,8 +12,8 @@ import time
 
 import numpy as np
 import pytest
+from clikit import begins, is_recording, started
 from conftest import aeventually, line_of
-from test_cli_record import begins, is_recording, started
 
 import reem.recording
 import reem_async

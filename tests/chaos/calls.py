@@ -1,10 +1,9 @@
-"""Rows 2, 3 and 13: calls that are cancelled, whose reply is lost, and that are a great many at once."""
+"""Rows 2 and 3: calls that are cancelled, and whose reply is lost."""
 
 from __future__ import annotations
 
 import asyncio
 import collections
-import concurrent.futures
 import contextlib
 from typing import Any
 
@@ -225,36 +224,30 @@ PLACES = {
 }
 
 
+def _call(kind: str, token: str, kvs: Any, space: Any) -> Any:
+    """Make a call of the blocking front, or return the coroutine of one; not those of "edits"."""
+    place = (space if kind in ("told", "frames") else kvs)[TOP][PLACES[kind]]
+    if kind == "counts":
+        return place.increment()
+    if kind == "frames":
+        return place.write({"token": token, "array": frame(len(token))})
+    return place.append(_with_array(token) if kind == "arrays" else token)
+
+
 def _blocking_call(kind: str, token: str, kvs: reem.KeyValueStore, space: reem.PublishSpace) -> None:
-    if kind == "lists":
-        kvs[TOP][PLACES[kind]].append(token)
-    elif kind == "arrays":
-        kvs[TOP][PLACES[kind]].append(_with_array(token))
-    elif kind == "counts":
-        kvs[TOP][PLACES[kind]].increment()
-    elif kind == "told":
-        space[TOP][PLACES[kind]].append(token)
-    elif kind == "frames":
-        space[TOP][PLACES[kind]] = {"token": token, "array": frame(len(token))}
-    else:
-        with kvs[TOP][PLACES[kind]] as items:
-            items.append(token)
+    if kind != "edits":
+        _call(kind, token, kvs, space)
+        return
+    with kvs[TOP][PLACES[kind]] as items:
+        items.append(token)
 
 
 async def _async_call(kind: str, token: str, kvs: reem_async.KeyValueStore, space: reem_async.PublishSpace) -> None:
-    if kind == "lists":
-        await kvs[TOP][PLACES[kind]].append(token)
-    elif kind == "arrays":
-        await kvs[TOP][PLACES[kind]].append(_with_array(token))
-    elif kind == "counts":
-        await kvs[TOP][PLACES[kind]].increment()
-    elif kind == "told":
-        await space[TOP][PLACES[kind]].append(token)
-    elif kind == "frames":
-        await space[TOP][PLACES[kind]].write({"token": token, "array": frame(len(token))})
-    else:
-        async with kvs[TOP][PLACES[kind]].edit() as items:
-            items.append(token)
+    if kind != "edits":
+        await _call(kind, token, kvs, space)
+        return
+    async with kvs[TOP][PLACES[kind]].edit() as items:
+        items.append(token)
 
 
 MARKERS = {"counts": b"NUMINCRBY", "edits": b"EXEC"}
@@ -329,39 +322,3 @@ async def _lose_async(run: Run, count: int, losses: _Losses, proxy: Proxy, front
         ended = await asyncio.gather(*(_async_call(*call, *fronts) for call in calls), return_exceptions=True)
         for (kind, token), error in zip(calls, ended, strict=True):
             losses.outcome(PLACES[kind], "n" if kind == "counts" else token, error)
-
-
-# --- 13: a great many ------------------------------------------------------------------------------
-
-
-@row(13, "1,000 gets at once: asyncio, and 16 threads", "no error, every answer its own, at most 16 connections each")
-def many_at_once(run: Run) -> None:
-    """On asyncio all at the same moment; in the blocking front as many as there are threads."""
-    with PrivateServer() as server, server.raw() as raw:
-
-        def open_connections() -> int:
-            return len(raw.client_list()) - 1
-
-        async def all_at_once() -> None:
-            async with reem_async.RedisInterface(server.url) as interface:
-                kvs = reem_async.KeyValueStore(interface)
-                await kvs[TOP].write({f"s{n}": tagged(n) for n in range(SLOTS)})
-                calls = [kvs[TOP][f"s{n % SLOTS}"].read() for n in range(1000)]
-                values = await asyncio.gather(*calls, return_exceptions=True)
-                judge("asyncio", values)
-
-        def judge(front: str, values: list[Any]) -> None:
-            errors = [value for value in values if isinstance(value, BaseException)]
-            run.none(f"errors with {front}", errors)
-            if not errors:
-                pairs = [(value, n % SLOTS) for n, value in enumerate(values)]
-                run.none("wrong", [pair for pair in pairs if not has_tag(*pair)])
-            run.at_most("connections", open_connections(), 16)
-
-        asyncio.run(all_at_once())
-        with contextlib.closing(reem.RedisInterface(server.url)) as interface:
-            kvs = reem.KeyValueStore(interface)
-            with concurrent.futures.ThreadPoolExecutor(16) as pool:
-                futures = [pool.submit(kvs[TOP][f"s{n % SLOTS}"].read) for n in range(1000)]
-                values = [future.exception() or future.result() for future in futures]
-            judge("threads", values)

@@ -21,7 +21,7 @@ from reem_async.local.host import host, reason_against
 from reem_async.local.segment import HEAD, SLOTS, Segment
 from reem_async.plan.notices import Slot
 
-from .frame_programs import SIZE, shot
+from .programs import SIZE, shot
 from .scoreboard import NotBuilt, Run, row
 from .servers import PrivateServer
 from .tools import order, program, quantile, said
@@ -66,7 +66,7 @@ def greedy(run: Run) -> None:
     rate, count, keep = 100, run.size(500, 100), run.size(1000, 300)
     with PrivateServer() as server, contextlib.ExitStack() as stack:
         words = [("camera", rate), ("reader", 1), ("reader", keep), ("reader", 3)]
-        started = [program(name, server.url, it, module="frame_programs") for name, it in words]
+        started = [program(name, server.url, it) for name, it in words]
         camera, other, keeper, sleeper = (_Party(stack.enter_context(each)) for each in started)
         for party in (camera, other, keeper, sleeper):
             said(party.process)
@@ -240,7 +240,7 @@ def forged(run: Run) -> None:
     ):
         space, numbers = reem.PublishSpace(interface), itertools.count(1)
         space["cam"] = {"n": 0, "image": 0, "sum": 0}
-        with program("victims", server.url, module="frame_programs") as process:
+        with program("victims", server.url) as process:
             victim = said(process)["pid"]
 
             def honest(what: str) -> None:

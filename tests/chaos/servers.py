@@ -12,30 +12,12 @@ import time
 from pathlib import Path
 
 import redis
+from own_servers import Configured
 
-from reem_async.server.process import ServerProcess, ServerProgram
 from reem_async.server.programs import find_program
 
 # Below the ports that the kernel gives to clients: while the server is down, one of them could be given its port.
 PORTS = range(20_000, 32_000)
-
-
-class _Configured(ServerProcess):
-    """A server process with more lines of configuration; the later ones count."""
-
-    def __init__(self, it: PrivateServer, *, patient: bool = True) -> None:
-        self._lines, self._patient = it.lines, patient
-        program = find_program() if it.json else ServerProgram(find_program().path)
-        super().__init__(program, port=it.port, directory=it.directory, password=it.password)
-
-    def _config(self, *given):
-        return super()._config(*given) + "".join(f"{line}\n" for line in self._lines)
-
-    def _wait_until_ready(self, *given):
-        if self._patient:
-            super()._wait_until_ready(*given)
-        while not self.ask("PING"):  # until it answers anything at all
-            time.sleep(0.002)
 
 
 class PrivateServer:
@@ -44,17 +26,13 @@ class PrivateServer:
     Args:
         lines: More lines of its configuration.
         keep: Keep the data on disk, safely there before a write is answered.
-        password: What clients have to give.
-        json: Load the JSON module; without, only where the program has JSON in a module.
     """
 
-    def __init__(self, *lines: str, keep: bool = False, password: str | None = None, json: bool = True) -> None:
-        self.json = json
+    def __init__(self, *lines: str, keep: bool = False) -> None:
         self.lines = [*lines, *(["appendfsync always"] if keep else [])]
         self.port = _free_port()
-        self.password = password
         self.directory = Path(tempfile.mkdtemp(prefix="reem-chaos-")) if keep else None
-        self._process: _Configured | None = None
+        self._process: Configured | None = None
         self._stopped = False
 
     @property
@@ -68,24 +46,11 @@ class PrivateServer:
 
     def raw(self, **options) -> redis.Redis:
         """A plain client that speaks to it directly and knows no retries."""
-        return redis.Redis(
-            port=self.port, password=self.password, retry=None, socket_timeout=10, decode_responses=True, **options
-        )
+        return redis.Redis(port=self.port, retry=None, socket_timeout=10, decode_responses=True, **options)
 
     def start(self) -> None:
-        self._process = _Configured(self)
-
-    def start_loading(self) -> None:
-        """Start it; returns when it says anything, be it that it is still loading."""
-        self._process = _Configured(self, patient=False)
-
-    def wait(self, seconds: float = 20.0) -> None:
-        """Wait until it has loaded its data."""
-        deadline = time.monotonic() + seconds
-        assert self._process is not None
-        while not self._process.ask("PING").startswith(b"+PONG"):
-            assert time.monotonic() < deadline, "the server does not get ready"
-            time.sleep(0.01)
+        """Start it; returns when it answers."""
+        self._process = Configured(find_program(), self.lines, port=self.port, directory=self.directory)
 
     def kill(self) -> None:
         """kill -9; returns when it is gone."""

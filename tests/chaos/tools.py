@@ -94,9 +94,9 @@ def measured(times: list[float]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def program(name: str, *arguments: Any, module: str = "programs", flags: tuple[str, ...] = ("-W", "error")):
+def program(name: str, *arguments: Any):
     """Start one of the programs; both ways of talking to it are pipes."""
-    command = [sys.executable, *flags, "-m", f"tests.chaos.{module}", name, *map(str, arguments)]
+    command = [sys.executable, "-W", "error", "-m", "tests.chaos.programs", name, *map(str, arguments)]
     with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
             yield process
