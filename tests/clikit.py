@@ -27,6 +27,14 @@ def environment(**changes):
     return {**clean, **settings, **changes}
 
 
+def invoked(*words, input=None, **changes):  # noqa: A002
+    """Run a command in this process; `changes` are variables."""
+    words = [*map(str, words)]
+    run = CliRunner().invoke(build(), words, input, environment(**changes), prog_name="reem")
+    assert run.exception is None or isinstance(run.exception, SystemExit), repr(run.exception)
+    return subprocess.CompletedProcess(words, run.exit_code, run.stdout, run.stderr)
+
+
 def finished(*words, cwd=None, **changes):
     """Run a command to its end, without a traceback; `changes` are variables."""
     command, env = [REEM, *map(str, words)], environment(**changes)
@@ -69,23 +77,20 @@ class CommandLine:
 
     def __call__(self, command, *arguments, input=None, **changes):  # noqa: A002
         """Run a command in this process."""
-        words, env = self.words(command, *arguments)[1:], self.environment(**changes)
-        run = CliRunner().invoke(build(), words, input, env, prog_name="reem")
-        assert run.exception is None or isinstance(run.exception, SystemExit), repr(run.exception)
-        return run
+        return invoked(*self.words(command, *arguments)[1:], input=input, **{"REEM_URL": self.url, **changes})
 
     def process(self, command, *arguments, **changes):
         return finished(*self.words(command, *arguments)[1:], **{"REEM_URL": self.url, **changes})
 
     def result(self, *arguments, **options):
         run = self(*arguments, **options)
-        assert run.exit_code == 0, run.stderr
+        assert run.returncode == 0, run.stderr
         return run.stdout
 
     def error(self, code, *arguments, **options):
         """The one line of a command that must fail with this exit code."""
         run = self(*arguments, **options)
-        assert run.exit_code == code, (run.stdout, run.stderr)
+        assert run.returncode == code, (run.stdout, run.stderr)
         assert run.stdout == ""
         if code != 2:
             assert run.stderr.count("\n") == 1, run.stderr

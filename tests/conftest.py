@@ -22,6 +22,7 @@ import signal
 import struct
 import subprocess
 import sys
+import textwrap
 import time
 import uuid
 import zlib
@@ -668,10 +669,10 @@ def line_of(descriptor, patience=60.0):
     return line.decode()
 
 
-def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False):
+def python(code, *arguments, flags=("-X", "dev", "-W", "error"), start=False, **changes):
     """Run code in another Python; returns the finished process, or with `start` the running one."""
-    command = [sys.executable, *flags, "-c", code, *map(str, arguments)]
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+    command = [sys.executable, *flags, "-c", textwrap.dedent(code), *map(str, arguments)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"} | changes
     if start:
         return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import contextlib
 import socket
 import subprocess
-import time
 
 import redis
+from conftest import eventually
 
 from reem_async.server import EmbeddedServer
 from reem_async.server.programs import find_program
@@ -99,14 +99,6 @@ class Watched:
     def pid(self, port):
         """The process that listens there."""
         return next(server.pid for server in self.servers if server.port == port)
-
-
-def eventually(condition, timeout=20.0):
-    deadline = time.monotonic() + timeout
-    while not (value := condition()):
-        assert time.monotonic() < deadline, "did not come true"
-        time.sleep(0.02)
-    return value
 
 
 def _free_port():

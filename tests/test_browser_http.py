@@ -6,7 +6,6 @@ import asyncio
 import io
 import itertools
 import os
-import pathlib
 import socket
 import threading
 import time
@@ -17,6 +16,7 @@ import pytest
 import redis
 from browserkit import client_of, live, served
 from conftest import assert_same, eventually, python
+from picturekit import resident
 from PIL import Image
 
 import reem
@@ -102,18 +102,13 @@ def test_long_texts_are_not_fetched_for_the_tree_but_for_the_view(ask, kvs, key)
     assert ask.json("node", path=f"{key()}.t")["full"] == "x" * 100_000
 
 
-def test_the_snippet_of_a_path_reads_it(ask, robot):
-    for front, code in ask.json("node", path=f'{robot}["a.b"]["c d"]')["snippets"].items():
-        done = python(code + "print(value)")
-        assert done.returncode == 0, (front, done.stderr)
-        assert done.stdout.strip() == "5", front
-
-
-def test_the_snippet_of_a_key_that_no_path_leads_to_reads_what_holds_it(ask, kvs, key):
+def test_the_snippets_of_a_path_are_programs_that_read_it(ask, robot, kvs, key):
+    """Also of a key that no path leads to: they read what holds it."""
     kvs[key()] = {"d": {"a\\b": [5, 6]}}
-    for front, code in ask.json("node", path=f'{key()}.d["a\\\\b"][1]')["snippets"].items():
-        done = python(code + "print(value)")
-        assert (done.returncode, done.stdout.strip()) == (0, "6"), (front, done.stderr)
+    for path, said in ((f'{robot}["a.b"]["c d"]', "5"), (f'{key()}.d["a\\\\b"][1]', "6")):
+        for front, code in ask.json("node", path=path)["snippets"].items():
+            done = python(code + "print(value)")
+            assert (done.returncode, done.stdout.strip()) == (0, said), (front, done.stderr)
 
 
 def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
@@ -467,11 +462,6 @@ def test_a_server_that_goes_away_is_said_and_so_is_its_return(tmp_path):
 # --- size -------------------------------------------------
 
 
-def memory_of(pid):
-    lines = pathlib.Path(f"/proc/{pid}/status").read_text().splitlines()
-    return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) << 10
-
-
 @pytest.mark.alone
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the memory is read from /proc")
 def test_ten_thousand_keys_and_eight_megabytes():
@@ -488,10 +478,10 @@ def test_ten_thousand_keys_and_eight_megabytes():
                 lambda: "key_09999.b" in [row["address"] for row in ask.json("search", q="key_09999.b")["found"]]
             )
             look(ask)
-            before = memory_of(os.getpid())
+            before = resident()
             for _ in range(10):
                 look(ask)
-            assert memory_of(os.getpid()) - before < 60 << 20
+            assert resident() - before < 60 << 20
             assert source.history.bytes < 16 << 20
 
 

@@ -14,13 +14,12 @@ import sys
 
 import numpy as np
 import pytest
-from clikit import REEM, CommandLine, finished
+from clikit import REEM, CommandLine, finished, invoked
 from conftest import assert_same, nothing_sent
-from typer.testing import CliRunner
 
 import reem as blocking
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli import build, commands
+from reem_async.tools.cli import commands
 from reem_async.tools.cli.commands import COMMANDS
 
 
@@ -83,14 +82,14 @@ def test_help_needs_none_of_the_commands():
     ids=" ".join,
 )
 def test_help_of_each_command_has_examples(words):
-    run = CliRunner().invoke(build(), [*words, "--help"], env={"COLUMNS": "100"}, prog_name="reem")
-    assert run.exit_code == 0
+    run = invoked(*words, "--help", COLUMNS="100")
+    assert run.returncode == 0
     assert "Examples:" in run.stdout
     assert f"reem {' '.join(words)}" in run.stdout.partition("Examples:")[2]
 
 
 def test_version():
-    assert CliRunner().invoke(build(), ["--version"], prog_name="reem").stdout.startswith("reem")
+    assert invoked("--version").stdout.startswith("reem")
 
 
 def test_paragraphs_are_joined_and_indented_lines_are_kept():
@@ -140,8 +139,8 @@ FILES = [
 def test_a_file_that_is_not_there_or_is_none_is_named(cli, tmp_path, words):
     file = tmp_path / "run.file"
     for code in (3, 1):
-        run = CliRunner().invoke(build(), [*words, str(file)], env=cli.environment(COLUMNS="300"), prog_name="reem")
-        assert (run.exit_code, file.name in run.stderr) == (code, True), run.stderr
+        run = invoked(*words, file, REEM_URL=cli.url, COLUMNS="300")
+        assert (run.returncode, file.name in run.stderr) == (code, True), run.stderr
         file.write_bytes(b"something else")
     assert list(tmp_path.iterdir()) == [file]
 
@@ -289,7 +288,7 @@ def test_get_into_files(cli, kvs, tmp_path):
 
     def got(path, name):
         run = cli("get", path, "-o", tmp_path / name)
-        assert (run.exit_code, run.stdout) == (0, ""), run.stderr
+        assert (run.returncode, run.stdout) == (0, ""), run.stderr
         assert str(tmp_path / name) in run.stderr
         return tmp_path / name
 
@@ -365,7 +364,7 @@ def test_subscribers_are_told_if_wanted(cli, kvs):
         cli.result("set", "foo.number", "3", "--publish")
         assert next(updates).data == 3
         run = cli("pub", "foo.number", "4", "--count", "3", "--rate", "200")
-        assert (run.exit_code, run.stdout) == (0, "")
+        assert (run.returncode, run.stdout) == (0, "")
         assert run.stderr.startswith("publishing foo.number at 200 Hz\npublished 3 times")
         assert [next(updates).data for _ in range(3)] == [4, 4, 4]
         assert cli("pub", "foo.number", "5").stderr == ""

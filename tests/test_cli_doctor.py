@@ -39,7 +39,7 @@ def findings(run):
 def test_a_server_as_it_should_be(own):
     url, admin = own
     run = CommandLine(url, "robot:")("doctor", "--json")
-    assert run.exit_code == 0, run.stderr
+    assert run.returncode == 0, run.stderr
     report = findings(run)
     statuses = {name: row["status"] for name, row in report.items()}
     assert statuses.pop("small read") in (OK, WARN)  # a matter of the machine
@@ -81,12 +81,12 @@ def test_nobody_there():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     run = CommandLine(f"redis://:hidden-4711@127.0.0.1:{port}", "")("doctor", "--json")
-    assert run.exit_code == 1
+    assert run.returncode == 1
     report = findings(run)
     assert report["server"]["status"] == FAIL
     assert "reem up" in report["server"]["message"]
     assert report["libraries"]["status"] == OK
-    assert "hidden" not in run.output
+    assert "hidden" not in run.stdout + run.stderr
 
 
 def test_a_user_who_may_do_little(own):
@@ -97,7 +97,7 @@ def test_a_user_who_may_do_little(own):
     parts = urllib.parse.urlsplit(url)
     cli = CommandLine(f"redis://guest:hidden-4711@127.0.0.1:{parts.port}", "robot:")
     run = cli("doctor", "--json")
-    assert run.exit_code == 0, run.output
+    assert run.returncode == 0, run.stdout + run.stderr
     report = findings(run)
     for name in ("1 MB array", "clock", "memory", "eviction", "subscribers", "persistence"):
         assert report[name]["status"] == UNKNOWN, name
@@ -105,7 +105,7 @@ def test_a_user_who_may_do_little(own):
     assert report["subscribers"]["remedy"] == "ask as an administrator, or allow +config|get"
     assert report["small read"]["status"] in (OK, WARN)
     assert "with password, without TLS" in report["access"]["message"]
-    assert "hidden" not in run.output
+    assert "hidden" not in run.stdout + run.stderr
     said = cli.error(1, "ls")
     assert "the user may not do this" in said
     assert "scan" in said
@@ -142,7 +142,7 @@ def test_every_node_of_a_cluster_is_examined_and_named(cluster):
         finally:
             admin.config_set("maxmemory", "0")
             admin.config_set("maxmemory-policy", "noeviction")
-    assert run.exit_code == 0, run.output
+    assert run.returncode == 0, run.stdout + run.stderr
     rows = [json.loads(line) for line in run.stdout.splitlines()]
     nodes = {f"127.0.0.1:{node.port}" for node in cluster.nodes}
     for check in ("server", "json", "access", "small read", "1 MB array", "clock", "memory", "subscribers"):
@@ -160,7 +160,7 @@ def test_a_node_that_does_not_answer_is_a_finding_and_the_others_are_examined():
         gone = f"127.0.0.1:{cluster.nodes[1].port}"
         cluster.nodes[1].stop()
         run = CommandLine(cluster.url, "")("doctor", "--json", "--no-write")
-    assert run.exit_code == 1
+    assert run.returncode == 1
     rows = [json.loads(line) for line in run.stdout.splitlines()]
     servers = [(row["node"], row["status"]) for row in rows if row["check"] == "server"]
     assert servers[0] == (gone, FAIL)

@@ -233,7 +233,7 @@ def test_stored_changes_are_counted_and_told_in_json(cli, space, listening):
 
 def test_waiting_in_vain(cli):
     run = cli("echo", "foo", "--timeout", "0.2")
-    assert (run.exit_code, run.stdout) == (4, "")
+    assert (run.returncode, run.stdout) == (4, "")
     assert "0 updates of 0 paths" in run.stderr
 
 

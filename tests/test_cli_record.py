@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import os
 import pty
@@ -14,7 +13,7 @@ import time
 
 import numpy as np
 import pytest
-from clikit import begins, finished, is_recording, started
+from clikit import begins, finished, invoked, is_recording, started
 from conftest import PLAIN, ROOT, assert_same, eventually
 from test_recording import IMAGE
 from test_unreadable import Pose
@@ -26,9 +25,16 @@ from reem_async.tools.recording import open_log
 
 
 @pytest.fixture
-def reem(server_url, tmp_path):
-    """Runs a command to its end."""
-    return functools.partial(finished, cwd=tmp_path, REEM_URL=server_url, COLUMNS="200")
+def reem(server_url, tmp_path, monkeypatch):
+    """Runs a command to its end, in this process but for the one that lowers its priority."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(command, *words, **changes):
+        return (finished if command == "record" else invoked)(
+            command, *words, REEM_URL=server_url, COLUMNS="200", **changes
+        )
+
+    return run
 
 
 @pytest.fixture

@@ -14,23 +14,19 @@ import numpy as np
 import pytest
 import redis
 import typer
-from clikit import environment, finished, in_terminal, running
+from clikit import environment, finished, in_terminal, invoked, running
 from conftest import assert_same, eventually, line_of
-from typer.testing import CliRunner
 
 import reem
 from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
-from reem_async.tools.cli import build
 from reem_async.tools.cli.snapshot import period
 from reem_async.tools.snapshots import files, portable, rdb
 
 
 def snapshot(*arguments, code=0, **changes):
-    words = ["snapshot", *map(str, arguments)]
-    run = CliRunner().invoke(build(), words, env=environment(**changes), prog_name="reem")
-    assert isinstance(run.exception, (SystemExit, type(None))), run.exception
-    assert run.exit_code == code, run.stdout + run.stderr
+    run = invoked("snapshot", *arguments, **changes)
+    assert run.returncode == code, run.stdout + run.stderr
     assert "\x1b" not in run.stdout + run.stderr
     return run.stdout, run.stderr
 

@@ -48,7 +48,7 @@ def robot(cli):
 
 def test_top_shows_keys_and_points_out_two_publishers(cli, robot):
     run = cli("top", "--timeout", "1.5", "--json")
-    assert run.exit_code == 0
+    assert run.returncode == 0
     rows = {row["path"]: row for row in map(json.loads, run.stdout.splitlines())}
     assert len(rows) == len(run.stdout.splitlines()) == 2
     assert (rows["arm"]["publishers"], rows["cam"]["publishers"]) == (2, 1)

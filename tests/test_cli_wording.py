@@ -7,14 +7,12 @@ import re
 
 import numpy as np
 import pytest
-from clikit import CommandLine
+from clikit import CommandLine, invoked
 from conftest import ROOT
-from typer.testing import CliRunner
 
 import reem as blocking
 from examples.custom_ship import Scan, ScanShip
 from reem import NumpyShip
-from reem_async.tools.cli import build
 
 APART = ("tools/cli", "tools/browser", "tools/notebook.py")  # themselves, addresses of the page, HTML
 CORE = [
@@ -84,8 +82,8 @@ def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):
         (("restore", "a.zip"), 1, "(--replace) replaces them, into= (--into) gives"),
     ]:
         words = ["snapshot", *words, "--namespace", cli.namespace]
-        run = CliRunner().invoke(build(), words, env=cli.environment(), prog_name="reem")
-        assert run.exit_code == code, run.stderr
+        run = invoked(*words, REEM_URL=cli.url)
+        assert run.returncode == code, run.stderr
         assert advice in run.stderr
     assert "there is no option foo; see redis-py's connection options" in cli.error(
         2, "get", "a", "--url", "redis://localhost?foo=1"

@@ -86,7 +86,7 @@ def command(url, tmp_path):
         )
         assert done.exception is None or isinstance(done.exception, SystemExit), repr(done.exception)
         texts = [text.replace(str(tmp_path), "HERE") for text in (done.stdout, done.stderr)]
-        return done.exit_code, *[re.sub(r"\d+\.\d+ s", "N s", text) for text in texts]
+        return done.returncode, *[re.sub(r"\d+\.\d+ s", "N s", text) for text in texts]
 
     return run
 

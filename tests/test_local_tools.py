@@ -41,7 +41,7 @@ def beside(server_url, key):
 
 def local_finding(url, *words, namespace=""):
     run = CommandLine(url, namespace)("doctor", "--no-write", "--json", *words)
-    assert run.exit_code == 0, run.output
+    assert run.returncode == 0, run.stdout + run.stderr
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "local"]
     return row
 

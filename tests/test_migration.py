@@ -455,12 +455,12 @@ def test_the_command_shows_first_and_converts_with_yes(own, raw, monkeypatch):
     replay(raw, "reem_0_1_2")
     before, cli = everything(raw), CommandLine(own.url, "")
     shown = cli("migrate", "--ship", "oldkit:PoseShip")
-    assert (shown.exit_code, everything(raw)) == (0, before)
+    assert (shown.returncode, everything(raw)) == (0, before)
     assert "`reem migrate --yes` does it" in shown.stdout
     assert "cam.image2: kept" in shown.stderr
     assert "mixed\t.image\t2 old Redis keys removed" in shown.stdout.replace("  ", "\t")
     without = cli("migrate")
-    assert (without.exit_code, everything(raw)) == (1, before)
+    assert (without.returncode, everything(raw)) == (1, before)
     assert "pose is left as it is" in without.stderr
     rows = [
         json.loads(line) for line in cli("migrate", "--json", "--yes", "--ship", "oldkit:PoseShip").stdout.splitlines()
@@ -468,7 +468,7 @@ def test_the_command_shows_first_and_converts_with_yes(own, raw, monkeypatch):
     assert {row["name"]: row["problem"] for row in rows}["pose"] == ""
     assert not any(row["dry_run"] for row in rows)
     again = cli("migrate", "--yes")
-    assert (again.exit_code, again.stdout) == (0, "Nothing to do: no key was written by REEM 0.1 or older.\n")
+    assert (again.returncode, again.stdout) == (0, "Nothing to do: no key was written by REEM 0.1 or older.\n")
     with reem.RedisInterface(own, ships=ships()) as interface:
         check(reem.KeyValueStore(interface), "reem_0_1_2")
 
@@ -477,7 +477,7 @@ def test_the_command_shows_first_and_converts_with_yes(own, raw, monkeypatch):
 def test_a_ship_that_is_none_is_wrong_usage(own, raw, name, monkeypatch):
     monkeypatch.syspath_prepend(str(oldkit.ROOT / "tests"))
     run = CommandLine(own.url, "")("migrate", "--ship", name)
-    assert run.exit_code == 2
+    assert run.returncode == 2
     assert name in run.stderr
 
 
@@ -497,7 +497,7 @@ def test_the_doctor_counts_old_keys(own, raw):
 
     def finding():
         run = cli("doctor", "--json", "--no-write")
-        return run.exit_code, next(
+        return run.returncode, next(
             row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "old data"
         )
 

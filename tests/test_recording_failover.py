@@ -15,8 +15,8 @@ import signal
 import numpy as np
 import pytest
 from clusterkit import Move, kill_primary, owner, whole_again
-from conftest import aeventually, assert_same
-from sentinelkit import Watched, eventually
+from conftest import aeventually, assert_same, eventually
+from sentinelkit import Watched
 from test_recording_stored import is_followed, news, recording
 
 import reem_async

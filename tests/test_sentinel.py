@@ -9,9 +9,9 @@ import signal
 import socket
 
 import pytest
-from conftest import FRONTS, aeventually
+from conftest import FRONTS, aeventually, eventually
 from loadkit import Load
-from sentinelkit import Watched, eventually
+from sentinelkit import Watched
 
 import reem
 import reem_async

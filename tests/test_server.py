@@ -23,7 +23,7 @@ import anyio.to_thread
 import numpy as np
 import pytest
 import redis
-from conftest import SLOW_MACHINE
+from conftest import eventually, python
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
@@ -44,23 +44,6 @@ def client(server: EmbeddedServer, **options) -> redis.Redis:
     return redis.Redis.from_url(server.url, retry=ONCE, **options)
 
 
-def environment(**changes: str) -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": str(ROOT), **changes}
-
-
-def python(code: str, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-X", "dev", "-W", "error", "-c", textwrap.dedent(code), *arguments],
-        env=environment(**changes),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    done.stderr = SLOW_MACHINE.sub("", done.stderr)
-    return done
-
-
 def alive(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -73,15 +56,6 @@ def alive(pid: int) -> bool:
         return False
     except FileNotFoundError:  # no /proc: a Mac; or as above
         return not pathlib.Path("/proc/self").exists()
-
-
-def wait_until(condition, seconds: float = 10) -> bool:
-    deadline = time.monotonic() + seconds
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def sees(word: str) -> bool:
@@ -112,17 +86,6 @@ class TestUse:
             with redis.Redis(unix_socket_path=server.socket_path) as c:
                 assert c.execute_command("JSON.GET", "a", "$.b") == b"[[1,2.5]]"
                 assert c.info()["process_id"] == server.pid
-
-    def test_both_fronts_have_the_same_object(self):
-        assert reem.server.EmbeddedServer is EmbeddedServer
-
-    @pytest.mark.alone
-    def test_is_up_soon(self):
-        _server_programs.find_program()
-        begin = time.monotonic()
-        with EmbeddedServer():
-            print(f"up after {time.monotonic() - begin:.3f} s")
-            assert time.monotonic() - begin < 5
 
     async def test_async_with(self):
         async with EmbeddedServer() as server, redis.asyncio.Redis.from_url(server.url) as c:
@@ -190,13 +153,6 @@ class TestUse:
                 getattr(server, name)
         assert repr(server) == "<EmbeddedServer not started>"
 
-    def test_several_side_by_side(self):
-        with EmbeddedServer() as a, EmbeddedServer() as b, EmbeddedServer() as c:
-            assert len({s.port for s in (a, b, c)}) == len({s.socket_path for s in (a, b, c)}) == 3
-            with client(a) as to_a, client(b) as to_b:
-                to_a.set("k", "v")
-                assert to_b.get("k") is None
-
     def test_from_many_threads_one_server(self):
         server = EmbeddedServer()
         pids = []
@@ -220,7 +176,7 @@ class TestUse:
         server = EmbeddedServer()
         server.start()
         os.kill(server.pid, signal.SIGKILL)
-        assert wait_until(lambda: not server.running)
+        eventually(lambda: not server.running)
         assert not server.running
         assert (server.directory / "server.log").exists()  # for a look at why
         server.start()
@@ -413,7 +369,7 @@ class TestData:
                 c.set("bytes", bytes(100_000))
                 if round_ == 1:
                     c.execute_command("BGREWRITEAOF")
-                    assert wait_until(lambda: not c.info("persistence")["aof_rewrite_in_progress"])
+                    eventually(lambda: not c.info("persistence")["aof_rewrite_in_progress"])
         assert folder.exists()
 
     def test_a_relative_directory(self, tmp_path, monkeypatch):
@@ -427,7 +383,7 @@ class TestData:
         "kept",
         [
             # An fsync that takes long holds the file up, not the answers: at most two seconds of them.
-            lambda c: wait_until(lambda: not c.info("persistence")["aof_buffer_length"], 3),
+            lambda c: eventually(lambda: not c.info("persistence")["aof_buffer_length"], 3),
             lambda c: c.execute_command("WAITAOF", 1, 0, 10_000)[0] == 1,
         ],
         ids=["two seconds later", "WAITAOF"],
@@ -440,7 +396,7 @@ class TestData:
                 c.rpush("list", number)
             assert kept(c)
         os.kill(server.pid, signal.SIGKILL)
-        assert wait_until(lambda: not server.running)
+        eventually(lambda: not server.running)
         server.start()
         with client(server) as c:
             assert c.llen("list") == 500
@@ -487,10 +443,7 @@ class TestEnd:
 
     @contextlib.contextmanager
     def owner(self, then: str = "time.sleep(60)", *arguments: str):
-        code = textwrap.dedent(self.OWNER).format(then=then)
-        with subprocess.Popen(
-            [sys.executable, "-c", code, *arguments], env=environment(), stdout=subprocess.PIPE, text=True
-        ) as process:
+        with python(textwrap.dedent(self.OWNER).format(then=then), *arguments, flags=(), start=True) as process:
             try:
                 pid, port, path, watchdog = process.stdout.readline().split()
                 yield process, int(pid), int(port), pathlib.Path(path), int(watchdog)
@@ -504,8 +457,8 @@ class TestEnd:
                 assert c.ping()
             process.send_signal(number)
             process.wait()
-            assert wait_until(lambda: not alive(pid) and not alive(watchdog))
-            assert wait_until(lambda: not path.parent.exists())
+            eventually(lambda: not alive(pid) and not alive(watchdog))
+            eventually(lambda: not path.parent.exists())
 
     def test_killed_owner_with_a_forked_child_that_lives_on(self):
         then = "import os\nif os.fork() == 0: time.sleep(5); os._exit(0)\ntime.sleep(60)"
@@ -513,8 +466,8 @@ class TestEnd:
             time.sleep(0.3)
             process.kill()
             process.wait()
-            assert wait_until(lambda: not alive(pid), 3)
-            assert wait_until(lambda: not path.parent.exists(), 3)
+            eventually(lambda: not alive(pid), 3)
+            eventually(lambda: not path.parent.exists(), 3)
 
     def test_killed_owner_keeps_the_data(self, tmp_path):
         with self.owner("time.sleep(60)", str(tmp_path)) as (process, _, port, _, _):
@@ -534,7 +487,7 @@ class TestEnd:
             os.kill(watchdog, signal.SIGKILL)
             process.kill()
             process.wait()
-            assert wait_until(lambda: not alive(pid))
+            eventually(lambda: not alive(pid))
         with contextlib.suppress(FileNotFoundError):
             (path.parent / "server.log").unlink()
             path.parent.rmdir()
@@ -572,25 +525,32 @@ class TestEnd:
         gc.collect()
         assert not alive(pid)
 
+    ENDS = (
+        "server.stop()",
+        "",
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()",
+        "asyncio.run(use())",
+        "os.kill(server.pid, 9); time.sleep(0.2)",
+        "fork(use_fork)",
+        "atexit.register(lambda: server.running or os._exit(9))",
+    )
+    MORE_ENDS = (
+        "server.stop(); server.stop()",
+        "del server",
+        "with server: pass",
+        "threading.Thread(target=sys.exit).start()",
+        "t = threading.Thread(target=server.stop); t.start()",
+        "more = [EmbeddedServer() for _ in range(2)]; [s.start() for s in more]",
+        "fork(sys.exit)",
+        "fork(lambda: (server.stop(), sys.exit()))",
+    )
+
     @pytest.mark.parametrize(
         ("then", "code"),
         [
-            ("server.stop()", 0),
-            ("server.stop(); server.stop()", 0),
-            ("", 0),
-            ("del server", 0),
-            ("with server: pass", 0),
             ("sys.exit(3)", 3),
-            ("threading.Thread(target=sys.exit).start()", 0),
-            ("t = threading.Thread(target=server.stop); t.start()", 0),
-            ("threading.Thread(target=time.sleep, args=(60,), daemon=True).start()", 0),
-            ("asyncio.run(use())", 0),
-            ("os.kill(server.pid, 9); time.sleep(0.2)", 0),
-            ("more = [EmbeddedServer() for _ in range(2)]; [s.start() for s in more]", 0),
-            ("fork(sys.exit)", 0),
-            ("fork(lambda: (server.stop(), sys.exit()))", 0),
-            ("fork(use_fork)", 0),
-            ("atexit.register(lambda: server.running or os._exit(9))", 0),
+            *[(then, 0) for then in ENDS],
+            *[pytest.param(then, 0, marks=pytest.mark.long) for then in MORE_ENDS],
         ],
     )
     def test_no_noise_on_any_way_out(self, then, code):
