@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import os
-import resource
 import signal
 import sys
 import threading
@@ -15,7 +14,6 @@ import numpy as np
 from slotkit import in_slot
 
 import reem
-import reem_async
 from reem_async.local import host, path, reader, segment  # noqa: F401 - users without rights cannot import them later
 from reem_async.store import publish
 
@@ -187,105 +185,7 @@ def exit_in_thread(url, key):
     say(seen.wait(PATIENCE))
 
 
-def exit_in_callback(url, key):
-    """`sys.exit` while a callback has a frame in its hands."""
-    interface, held = reem.RedisInterface(url), threading.Event()
-    space = reem.PublishSpace(interface)
-
-    def see(data, updated_path):
-        if data is not None and in_slot(data["image"]):
-            held.set()
-            threading.Event().wait()
-
-    KEPT.append(reem.CallbackSubscriber(key, interface, see))
-    KEPT[0].listen()
-    space[key] = frame(1)
-    say(held.wait(PATIENCE))
-    sys.exit(0)
-
-
-def exit_at_exit(url, key):
-    """`atexit` publishes and hears of it."""
-    import atexit
-
-    pair = Pair(url, key)
-    pair.publish(1)
-    atexit.register(lambda: say(in_slot(pair.publish(2)["image"])))
-
-
-def exit_asyncio(url, key):
-    """asyncio.run ends around frames that are kept."""
-
-    async def main():
-        interface = reem_async.RedisInterface(url, local="early")
-        mirror = reem_async.SilentSubscriber(key, interface)
-        await mirror.listen()
-        for n in range(5):
-            await reem_async.PublishSpace(interface)[key].write(frame(n))
-            while (mirror.value() or {"n": None})["n"] != n:
-                await asyncio.sleep(0.001)
-            KEPT.append(mirror.value())
-        KEPT.extend([interface, mirror])
-        say(in_slot(KEPT[0]["image"]))
-
-    asyncio.run(main())
-
-
 EXITS = [name for name in dict(globals()) if name.startswith("exit_")]
-
-
-# --- limits -----------------------------------------------------------------------------------------
-
-MANY = 400_000
-"""Items of an image, 3 MB: its segment has 19."""
-
-
-def limit(kind, left):
-    """Leave so much: descriptors, or bytes of addresses."""
-    if kind == "descriptors":
-        descriptors = sorted(int(each) for each in os.listdir("/proc/self/fd"))[:-1]  # but that of the listing
-        room, which = descriptors[-1] + 1 + left, resource.RLIMIT_NOFILE
-        for free in set(range(room - left)) - set(descriptors):  # the lowest are given first
-            os.dup2(0, free)
-    else:
-        with open("/proc/self/statm", encoding="ascii") as file:
-            room, which = int(file.read().split()[0]) * resource.getpagesize() + left, resource.RLIMIT_AS
-    resource.setrlimit(which, (room, resource.getrlimit(which)[1]))
-
-
-def no_limits():
-    """For what is done at the end."""
-    for which in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS):
-        resource.setrlimit(which, (resource.getrlimit(which)[1],) * 2)
-
-
-def limited_publisher(url, key, kind, left):
-    """Publish, when told to, under a limit, and then without."""
-    with reem.RedisInterface(url) as interface:
-        space, kvs = reem.PublishSpace(interface), reem.KeyValueStore(interface)
-        kvs[key] = frame(0, MANY)  # all connections and buffers are there
-        space[key] = frame(0, 10)  # so small that there is no segment yet
-        say("ready")
-        sys.stdin.readline()
-        limit(kind, int(left))
-        space[key] = frame(1, MANY)
-        say("published")
-        sys.stdin.readline()
-        no_limits()
-
-
-def limited_reader(url, key, kind, left):
-    """Follow under a limit."""
-    with reem.RedisInterface(url) as interface:
-        kvs, mirror = reem.KeyValueStore(interface), reem.SilentSubscriber(key, interface)
-        mirror.listen()
-        until(lambda: mirror.value() is not None)
-        assert len(kvs[key].read()["image"]) == MANY
-        limit(kind, int(left))
-        say("ready")
-        until(lambda: mirror.value()["n"] == 1)
-        say(in_slot(mirror.value()["image"]), is_whole(mirror.value()))
-        no_limits()
 
 
 # --- another user -----------------------------------------------------------------------------------

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import threading
 
 import numpy as np
 import pytest
 import redis
-from conftest import PATIENCE, aeventually, assert_same, eventually
+from conftest import PATIENCE, aeventually, assert_same
 
-import reem
 import reem_async
 from reem_async.errors import ServerFull
 from reem_async.local.host import reason_against
@@ -112,35 +110,8 @@ def is_settled(follower):
 
 
 @pytest.mark.parametrize("what", FIRST)
-def test_early_the_first_array_under_a_new_key_is_told_without_a_gap(what, open_front, server_url, key):
+async def test_early_the_first_array_under_a_new_key_is_told_without_a_gap(what, server_url, key):
     """Nor is there one when the key was deleted behind the publisher's back: what it takes for granted is not there."""
-    space, told, (path, value) = open_front("PublishSpace", local="early"), [], FIRST[what]
-    with reem.RedisInterface(server_url) as interface:
-        watch = reem.SilentSubscriber(key("cam"), interface).watch(reem.Last(100))
-        watch.listen()
-
-        def follow():
-            with contextlib.suppress(reem.InterfaceClosed):
-                for update in watch:
-                    told.append(update)  # noqa: PERF402 - it is looked at meanwhile
-
-        thread = threading.Thread(target=follow)
-        thread.start()
-        for _ in range(3):
-            for _ in range(3):
-                before = len(told)
-                space.write([key("cam"), *path], value)
-                eventually(lambda before=before: len(told) > before)
-            del reem.KeyValueStore(interface)[key("cam")]
-        eventually(lambda: is_settled(watch._core._link.follower))
-    thread.join()
-    assert any(each.early for each in told)
-    assert not any(each.gap for each in told)
-    assert not any(each.missed for each in told)
-
-
-@pytest.mark.parametrize("what", FIRST)
-async def test_early_the_first_array_under_a_new_key_is_told_without_a_gap_to_asyncio(what, server_url, key):
     path, value = FIRST[what]
     async with (
         reem_async.RedisInterface(server_url, local="early") as one,

@@ -18,7 +18,6 @@ from slotkit import at_step
 from reem_async.local import host as local_host
 from reem_async.local import path as local_path
 from reem_async.local import reader as local_reader
-from reem_async.local import segment as local_segment
 from reem_async.local.host import host, reason_against
 from reem_async.local.path import LocalPath
 from reem_async.local.reader import LocalReader
@@ -60,15 +59,30 @@ def check_all_slots(segment):
 # --- what goes wrong on the way
 
 
-def test_whatever_keeps_a_slot_from_being_written_leaves_the_update_to_the_server(monkeypatch):
+@pytest.mark.parametrize(
+    "step", ["lock_for_writing", "os.memfd_create", "os.posix_fallocate", "fcntl.fcntl", "mmap.mmap"]
+)
+def test_whatever_keeps_a_slot_from_being_written_leaves_the_update_to_the_server(monkeypatch, step):
+    def refused(*_):
+        raise OSError(errno.ENOMEM, "cannot allocate memory")
+
     path = LocalPath()
+    with monkeypatch.context() as patched:
+        patched.setattr(f"reem_async.local.segment.{step}", refused)
+        assert path.put(KEYS, [b"x"], [1]) is None
     assert path.put(KEYS, [b"x"], [1]) is not None
 
-    def refused(*_):
-        raise OSError(errno.ENOLCK, "no locks available")
 
-    monkeypatch.setattr(local_segment, "lock_for_writing", refused)
-    assert path.put(KEYS, [b"x"], [1]) is None
+def test_a_slot_that_cannot_be_mapped_is_left_to_the_server(monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.ENOMEM, "cannot allocate memory")
+
+    segment = Segment(1000)
+    slot = put(segment, b"x")
+    with monkeypatch.context() as patched:
+        patched.setattr("reem_async.local.reader.mmap.mmap", refused)
+        assert LocalReader().view(slot, 1) is None
+    assert bytes(LocalReader().view(slot, 1)) == b"x"
 
 
 def test_a_buffer_of_more_bytes_than_it_says_does_not_reach_the_next_slot():
@@ -108,29 +122,6 @@ def test_what_was_short_for_a_moment_is_tried_again(monkeypatch):
 
 
 # --- between any two steps
-
-
-@pytest.mark.parametrize("times", [1, 2])
-def test_handlers_of_signals_that_publish_in_the_middle_get_slots_of_their_own(times):
-    """The locks do not keep two calls of one process apart: torn frames are what they would make."""
-    segment, reader, place, reached = Segment(20_000), LocalReader(), 0, True
-    while reached:
-        place += 1
-        inner, outer = [], []
-        reached = at_step(
-            place,
-            lambda inner=inner: inner.extend(put(segment, b"i" * 20_000) for _ in range(times)),
-            lambda outer=outer: outer.append(segment.put([b"o" * 10_000, b"o" * 10_000], [20_000])),
-        )
-        for slot in inner:
-            view = reader.view(slot, 20_000)
-            assert view is None or bytes(view) == b"i" * 20_000
-        ((number, stamp),) = outer
-        view = reader.view(Slot("", os.getpid(), segment.descriptor, segment.inode, number, stamp), 20_000)
-        assert view is None or bytes(view) == b"o" * 20_000
-    assert place > 50
-    del view
-    check_all_slots(segment)
 
 
 def test_a_call_that_is_refused_a_slot_leaves_it_to_who_has_it():

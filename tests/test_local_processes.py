@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 
-import localkit
 import orjson
 import pytest
 from conftest import PATIENCE, ROOT, SLOW_MACHINE, eventually, line_of
@@ -84,45 +83,6 @@ def test_a_child_of_a_publisher_has_memory_of_its_own(server_url, key):
 def test_an_interpreter_that_ends_while_frames_are_looked_at_says_nothing(name, server_url, key):
     with started(name, server_url, key("cam")) as process:
         assert line(process) == "True"
-
-
-# --- limits -----------------------------------------------------------------------------------------
-
-TIGHT = {"descriptors": [0, 1, 2], "memory": [16 << 20]}
-AMPLE = {"descriptors": 20, "memory": 200 << 20}
-CASES = [(kind, left, False) for kind in TIGHT for left in TIGHT[kind]] + [(kind, AMPLE[kind], True) for kind in AMPLE]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("kind", "left", "shared"), CASES)
-def test_a_publisher_that_has_no_descriptors_or_memory_left_goes_through_the_server(
-    kind, left, shared, server_url, key, mirror
-):
-    with started("limited_publisher", server_url, key("cam"), kind, left) as process:
-        assert line(process) == "ready"
-        eventually(lambda: mirror.value() is not None)
-        order(process, "go")
-        assert line(process) == "published"
-        eventually(lambda: mirror.value()["n"] == 1)
-        assert is_whole(mirror.value())
-        if shared or left == 0 or kind == "memory":  # between, it may just do
-            assert in_slot(mirror.value()["image"]) == shared
-        order(process, "end")
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("kind", "left", "shared"), CASES)
-def test_a_reader_that_has_no_descriptors_or_memory_left_has_the_server_s(kind, left, shared, server_url, key, pspace):
-    pspace[key("cam")] = frame(0, localkit.MANY)
-    with started("limited_reader", server_url, key("cam"), kind, left) as process:
-        assert line(process) == "ready"
-        local = pspace.interface._direct.session.local
-        eventually(lambda: local.is_to_ask(keys_of(key("cam"))))  # it has not listened yet when that was asked
-        pspace[key("cam")] = frame(1, localkit.MANY)
-        found, whole = line(process).split()
-        assert whole == "True"
-        if shared or left == 0 or kind == "memory":
-            assert found == str(shared)
 
 
 # --- another user -----------------------------------------------------------------------------------

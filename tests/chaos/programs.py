@@ -17,8 +17,7 @@ import zlib
 from typing import Any
 
 import numpy as np
-from slotkit import in_slot
-from slots import resident
+from slotkit import in_slot, resident
 
 import reem
 import reem_async
