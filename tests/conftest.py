@@ -122,7 +122,6 @@ ONE_SERVER = {
     "test_a_plain_client_for_asyncio": "the same",
     "test_the_state_server_of_a_robot": "the same",
     "test_a_server_on_the_port_is_named": "the same",
-    "test_ctrl_c_between_a_reply_and_its_waiter_costs_no_connection": "steps through the transport of one server",
     "test_a_store_and_its_transport_keep_a_bounded_number_of_keys": "looks into the transport of one server",
     "test_a_large_array_waits_for_small_calls_that_are_under_way": "the same",
     "test_what_is_stored_is_of_one_instant_though_another_task_comes_first": "the same",

@@ -45,18 +45,17 @@ def stopped(server):
 
 
 @pytest.mark.alone
-async def test_an_asyncio_call_to_a_stopped_server_ends_in_time(server):
-    async with reem_async.RedisInterface(server, timeout=0.3) as interface:
-        store = reem_async.KeyValueStore(interface)
-        await store["foo"].write(1)
-        with stopped(server):
-            begin = time.monotonic()
-            with pytest.raises(ConnectionLost, match=r"0\.3 s"):
-                await store["foo"].read()
-            assert 0.25 < time.monotonic() - begin < 0.9
-            assert PLAIN or interface.state == "lost"  # there the write had a connection of its own, which is idle
-        assert await store["foo"].read() == 1
-        assert interface.state == "connected"
+def test_a_call_to_a_stopped_server_ends_in_time(server, open_front):
+    front = open_front(url=server.url, timeout=0.3)
+    front.write(["foo"], 1)
+    with stopped(server):
+        begin = time.monotonic()
+        with pytest.raises(ConnectionLost, match=r"0\.3 s"):
+            front.read(["foo"])
+        assert 0.25 < time.monotonic() - begin < 0.9
+        assert PLAIN or front.interface.state == "lost"  # there the write had a connection of its own, which is idle
+    assert front.read(["foo"]) == 1
+    assert front.interface.state == "connected"
 
 
 async def test_a_dead_connection_is_given_up_though_calls_go_on(server):
@@ -74,21 +73,6 @@ async def test_a_dead_connection_is_given_up_though_calls_go_on(server):
             answers = await asyncio.gather(*calls, return_exceptions=True)
     assert isinstance(answers[0], ConnectionLost)
     assert answers[-10:] == [1] * 10
-
-
-@pytest.mark.alone
-def test_a_blocking_call_to_a_stopped_server_ends_in_time(server):
-    with reem.RedisInterface(server, timeout=0.3) as interface:
-        store = reem.KeyValueStore(interface)
-        store["foo"] = 1
-        with stopped(server):
-            begin = time.monotonic()
-            with pytest.raises(ConnectionLost, match=r"0\.3 s"):
-                store["foo"].read()
-            assert 0.25 < time.monotonic() - begin < 0.9
-            assert interface.state == "lost"
-        assert store["foo"].read() == 1
-        assert interface.state == "connected"
 
 
 async def test_the_limit_of_one_call_is_its_own(server):
@@ -218,14 +202,9 @@ def killed(server):
 
 
 async def test_a_restarted_server_is_told_apart(tmp_path):
-    first = EmbeddedServer(directory=tmp_path).__enter__()
-    port = first.port
-    with contextlib.ExitStack() as until_closed:
-        await _restarted(first, port, tmp_path, until_closed)
-
-
-async def _restarted(first, port, directory, until_closed):
-    async with reem_async.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
+    async with contextlib.AsyncExitStack() as stack:
+        first = EmbeddedServer(directory=tmp_path).__enter__()
+        interface = await stack.enter_async_context(reem_async.RedisInterface(f"redis://127.0.0.1:{first.port}"))
         store = reem_async.KeyValueStore(interface)
         changes = interface.states()
         await store["foo"].write(1)
@@ -237,10 +216,11 @@ async def _restarted(first, port, directory, until_closed):
                 await store["foo"].read()
             with contextlib.suppress(Exception):
                 first.__exit__(None, None, None)
-            until_closed.enter_context(EmbeddedServer(port=port, directory=directory))
-            update = await asyncio.wait_for(anext(updates), PATIENCE)
-            assert (update.gap, update.missed) == (True, None)
-            await aeventually(lambda: interface.state == "connected")
+            with EmbeddedServer(port=first.port, directory=tmp_path):
+                update = await asyncio.wait_for(anext(updates), PATIENCE)
+                assert (update.gap, update.missed) == (True, None)
+                await aeventually(lambda: interface.state == "connected")
+                await interface.close()
     told = [change async for change in changes]
     assert [change.state for change in told] == ["connected", "lost", "reconnecting", "connected", "closed"]
     assert [change.restarted for change in told] == [False, False, False, True, False]
@@ -248,8 +228,6 @@ async def _restarted(first, port, directory, until_closed):
 
 
 async def test_a_connection_cut_by_the_server_is_no_restart(server, raw):
-    import redis
-
     async with reem_async.RedisInterface(server.url) as interface:
         await reem_async.KeyValueStore(interface)["foo"].write(1)
         changes, heard = interface.states(), []

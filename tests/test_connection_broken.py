@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import gc
 import os
 import signal
 import sys
@@ -14,7 +13,7 @@ import time
 import numpy as np
 import pytest
 import redis
-from conftest import FRONTS, aeventually, eventually
+from conftest import FRONTS, aeventually
 from own_servers import caller, liar
 from test_connection import stopped
 
@@ -136,36 +135,6 @@ def test_a_connection_that_is_given_back_as_the_interface_is_closed_does_not_sta
     transport._give(line)
     assert line.closed
     assert not transport._idle
-
-
-def test_an_interrupt_as_a_connection_is_given_back_leaves_none_behind(server, clients):
-    """It was kept among those under way, also after the interface was closed."""
-    interface = reem.RedisInterface(server)
-    at = reem.KeyValueStore(interface)["a"]
-    at.write(1)
-    code, armed = BlockingTransport._give.__code__, False
-
-    def trace(frame, event, arg):
-        nonlocal armed
-        if armed and frame.f_code is code:
-            armed = False
-            raise KeyboardInterrupt
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        for _ in range(10):
-            armed = True
-            with contextlib.suppress(KeyboardInterrupt):
-                at.read()
-            assert not armed
-            sys.settrace(trace)
-    finally:
-        sys.settrace(before)
-    gc.collect()
-    assert len(interface._direct.session.transport._lines) <= 1
-    interface.close()
-    eventually(lambda: clients() == 0)
 
 
 @pytest.mark.parametrize("name", FRONTS)

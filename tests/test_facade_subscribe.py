@@ -11,37 +11,14 @@ import time
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, assert_same, eventually, python, subscribed
+from conftest import PATIENCE, assert_same, eventually
 
-import reem
 from reem import (
     CallbackSubscriber,
-    KeyValueStore,
     PublishSpace,
     RedisInterface,
     SilentSubscriber,
 )
-
-
-@contextlib.contextmanager
-def in_thread(work):
-    """Runs work beside the test; fails if it fails or does not end."""
-    failures = []
-
-    def run():
-        try:
-            work()
-        except BaseException as failure:
-            failures.append(failure)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    yield thread
-    thread.join(PATIENCE)
-    assert not thread.is_alive(), "still waiting"
-    if failures:
-        raise failures[0]
-
 
 # --- callbacks -------------------------------------------------------------------------------------
 
@@ -128,68 +105,7 @@ def test_a_callback_may_close_its_own_subscriber(interface, pspace, key):
     assert seen == [1]
 
 
-# --- loops -----------------------------------------------------------------------------------------
-
-
-def test_subscribers_are_iterators(interface, pspace, key):
-    """`for update in subscriber`, and a break leaves it usable."""
-    got = []
-    with SilentSubscriber(key(), interface) as subscriber:
-
-        def loop():
-            for update in subscriber:
-                got.append(update.data)
-                if update.data == "last":
-                    break
-
-        with in_thread(loop):
-            time.sleep(0.1)
-            pspace[key()] = {"n": 1}
-            eventually(lambda: {"n": 1} in got)
-            pspace[key()] = "last"
-        assert subscriber.value() == "last"
-        pspace[key()] = "after"
-        eventually(lambda: subscriber.value() == "after")
-
-
-def test_an_update_arrives_once_a_loop_is_waiting(kvs, pspace, key, raw):
-    """Also where nothing was stored before."""
-    before = subscribed(raw)
-    got = []
-    with in_thread(lambda: got.append(next(iter(kvs[key()].watch())))):
-        eventually(lambda: subscribed(raw) - before)
-        time.sleep(0.1)
-        pspace[key()] = "first"
-    assert (got[0].initial, got[0].data) == (False, "first")
-
-
 # --- connections, processes and endings ------------------------------------------------------------
-
-
-def test_close_ends_loops_that_wait_in_other_threads(server_url, key):
-    """They end by themselves or by InterfaceClosed; none hangs."""
-    interface = RedisInterface(server_url)
-    KeyValueStore(interface)[key()] = 1
-    mirror = SilentSubscriber(key(), interface)
-    mirror.listen()
-    started = []
-
-    def loop(updates):
-        with contextlib.suppress(reem.InterfaceClosed):
-            for update in updates:
-                started.append(update)  # noqa: PERF402
-
-    threads = [
-        threading.Thread(target=loop, args=(each,), daemon=True)
-        for each in (mirror, KeyValueStore(interface)[key()].watch(), KeyValueStore(interface)[key()].watch())
-    ]
-    for thread in threads:
-        thread.start()
-    eventually(lambda: len(started) >= 2)
-    interface.close()
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert not any(thread.is_alive() for thread in threads)
 
 
 def test_leaving_the_with_block_ends_the_callbacks(interface, pspace, key):
@@ -205,27 +121,6 @@ def test_leaving_the_with_block_ends_the_callbacks(interface, pspace, key):
         time.sleep(0.2)
         assert heard == [1]
         eventually(lambda: set(threading.enumerate()) <= running | before)
-
-
-def test_a_subscriber_in_another_process(key, pspace, server_url):
-    """Ready when listen() returned."""
-    code = (
-        "import sys, time, reem\n"
-        "url, key = sys.argv[1:]\n"
-        "with reem.RedisInterface(url) as interface, reem.SilentSubscriber(key, interface) as mirror:\n"
-        "    print('listening', flush=True)\n"
-        "    while not mirror.value(): time.sleep(0.001)\n"
-        "    print(mirror['image'].read().sum(), flush=True)\n"
-    )
-    process = python(code, server_url, key(), start=True)
-    try:
-        assert process.stdout.readline() == "listening\n", process.communicate()[1]
-        pspace[key()] = {"image": np.arange(5)}
-        out, errors = process.communicate(timeout=PATIENCE)
-        assert (out, errors) == ("10\n", "")
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):

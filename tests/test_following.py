@@ -119,20 +119,17 @@ def test_no_publish_after_listen_is_missed(following, pspace, key):
 @pytest.mark.parametrize("local", ["auto", "off"])
 def test_large_updates_arrive_whole(following, server_url, key, local):
     """A full camera image, looked at in the publisher's memory or fetched rather than carried in the notice."""
-    with reem.RedisInterface(server_url, local=local) as publishing:
-        _large_updates_arrive_whole(following, reem.PublishSpace(publishing), key)
-
-
-def _large_updates_arrive_whole(following, pspace, key):
     mirror = following.mirror(key())
-    for n in range(3):
-        image = np.full((640, 480, 3), float(n))
-        pspace[key()] = {"image": image, "n": n}
-        following.until(lambda n=n: (mirror.value() or {}).get("n") == n)
+    with reem.RedisInterface(server_url, local=local) as publishing:
+        pspace = reem.PublishSpace(publishing)
+        for n in range(3):
+            image = np.full((640, 480, 3), float(n))
+            pspace[key()] = {"image": image, "n": n}
+            following.until(lambda n=n: (mirror.value() or {}).get("n") == n)
+            assert_same(mirror["image"].read(), image)
+        pspace[key()]["n"] = 99
+        following.until(lambda: mirror["n"].read() == 99)
         assert_same(mirror["image"].read(), image)
-    pspace[key()]["n"] = 99
-    following.until(lambda: mirror["n"].read() == 99)
-    assert_same(mirror["image"].read(), image)
 
 
 # --- channels --------------------------------------------------------------------------------------
@@ -252,6 +249,19 @@ def test_a_loop_begins_with_what_is_there_and_then_tells_every_update(following,
     assert not second.gap
     assert not third.gap
     assert updates.dropped == 0
+
+
+def test_subscribers_are_iterators(following, pspace, key):
+    """As `watch()` is, and a loop that was left leaves them usable."""
+    begin = iter if following.module is reem else aiter
+    for subscriber in (following.mirror(key()), following.calls(key(), lambda data, updated_path: None)):
+        pspace[key()] = 0
+        updates = begin(subscriber)
+        assert following.take(updates)[0].initial
+        pspace[key()] = 1
+        assert following.take(updates)[0].data == 1
+        pspace[key()] = 2
+        following.until(lambda subscriber=subscriber: subscriber.value() == 2)
 
 
 def overfilled(following, kvs, pspace, key, **options):

@@ -10,7 +10,7 @@ import random
 import time
 
 import pytest
-from conftest import PATIENCE
+from conftest import PATIENCE, aeventually, eventually
 
 import reem
 import reem_async
@@ -20,13 +20,6 @@ from reem_async.plan.reads import RawRead
 from reem_async.plan.shapes import ShapeCache
 from reem_async.pubsub.manager import manager_of
 from reem_async.session import _Numbers
-
-
-async def aeventually(condition):
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end
-        await asyncio.sleep(0.02)
 
 
 def listeners(interface):
@@ -116,10 +109,7 @@ def test_a_dropped_watch_of_the_blocking_front_is_unsubscribed(server_url, key):
             break
         gc.collect()
         manager = interface._followers.session.subscriptions
-        end = time.monotonic() + PATIENCE
-        while manager._topics and time.monotonic() < end:
-            time.sleep(0.02)
-        assert not manager._topics
+        eventually(lambda: not manager._topics)
         assert not manager._subscribed
 
 

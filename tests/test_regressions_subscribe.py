@@ -6,20 +6,15 @@ import asyncio
 import contextlib
 import logging
 import os
-import random
-import signal
-import sys
 import threading
-import time
 
 import numpy as np
-import orjson
 import pytest
 from conftest import PATIENCE, aeventually, assert_same, homes, python, subscribed
 
 import reem
 import reem_async
-from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace, RedisInterface
+from reem_async import CallbackSubscriber, Every, KeyValueStore, PublishSpace, RedisInterface
 from reem_async import SilentSubscriber as Mirror
 from reem_async.errors import BadType, InterfaceClosed, PathRefused, QueueFull
 
@@ -149,33 +144,6 @@ async def test_closing_while_listen_waits_ends_it_and_leaves_the_interface_usabl
     assert any(ended)
 
 
-@pytest.mark.parametrize("kind", ["watch", "mirror"])
-def test_closing_while_a_blocking_listen_waits_ends_it(server_url, kvs, key, kind):
-    """From another thread."""
-    kvs[key()] = {"big": "x" * 4_000_000}
-    with reem.RedisInterface(server_url) as interface:
-        store = reem.KeyValueStore(interface)
-        for number in range(6):
-            made = store[key()].watch() if kind == "watch" else reem.SilentSubscriber(key(), interface)
-            ended = []
-
-            def listen(made=made, ended=ended):
-                try:
-                    made.listen()
-                except BaseException as failure:
-                    ended.append(failure)
-
-            thread = threading.Thread(target=listen, daemon=True)
-            thread.start()
-            thread.join(0.002 * number)
-            made.close()
-            thread.join(PATIENCE)
-            assert not thread.is_alive()
-            assert all(isinstance(error, InterfaceClosed) for error in ended), ended
-        with reem.SilentSubscriber(key(), interface) as mirror:
-            assert mirror.value() == kvs[key()].read()
-
-
 @pytest.mark.parametrize("module", [reem, reem_async])
 async def test_closing_a_subscriber_after_its_interface_is_quiet(server_url, key, module):
     """The interface has closed it already."""
@@ -293,37 +261,6 @@ async def test_an_update_of_over_32_megabytes_is_mirrored_and_small_ones_arrive_
         assert subscribed(raw) - others == connection
 
 
-async def test_a_mirror_beside_a_publisher_of_large_and_small_never_goes_back(ainterface, server_url, akvs, key):
-    """Large values go another way than small ones, and still it sees what the server went through, to the end."""
-
-    def publish(start):
-        for number in range(start, start + 12):
-            if number % 12 == 8:
-                space[key()] = {"n": number, "image": np.full(40_000, float(number))}
-            elif number % 4 == 2:
-                space[key()]["image"] = np.full(20_000, float(number))
-            else:
-                space[key()]["n"] = number
-
-    await akvs[key()].write({"n": 0, "image": np.zeros(1)})
-    updates, seen = akvs[key()].watch(Last(100_000)), []
-    with reem.RedisInterface(server_url) as interface:
-        space = reem.PublishSpace(interface)
-        async with Mirror(key(), ainterface) as mirror, Mirror(f"{key()}.n", ainterface) as counter, updates:
-            for start in range(0, 1200, 12):
-                publishing = asyncio.create_task(asyncio.to_thread(publish, start))
-                while not publishing.done():
-                    seen.append((mirror["n"].read(), counter.value()))
-                    await asyncio.sleep(0)
-                await publishing
-                last = start + 11
-                await aeventually(lambda last=last: mirror["n"].read() == counter.value() == last)
-                await aeventually(lambda last=last: mirror["image"].read()[0] == last - 1)
-            assert_same(mirror.value(), await akvs[key()].read())
-    for counts in ([update.data["n"] for update in taken(updates)], *map(list, zip(*seen, strict=True))):
-        assert counts == sorted(counts)
-
-
 async def test_a_callback_subscriber_fetches_a_large_update_once(ainterface, binterface, key, raw):
     """Its value and its calls have one follower."""
     calls = []
@@ -402,65 +339,6 @@ def test_a_coroutine_function_is_refused_as_a_callback_of_the_blocking_front(int
         reem.CallbackSubscriber(key(), interface, callback)
 
 
-def test_two_threads_that_share_a_loop_both_get_updates(kvs, pspace, key):
-    """Each update goes to one of them."""
-    updates = kvs[key()].watch(Every(100))
-    updates.listen()
-    got = []
-    threads = [threading.Thread(target=lambda: got.append(next(updates).value), daemon=True) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    time.sleep(0.05)  # both wait by now
-    pspace[key()] = 1
-    pspace[key()] = 2
-    for thread in threads:
-        thread.join(PATIENCE)
-        assert not thread.is_alive()
-    assert sorted(got) == [1, 2]
-    updates.close()
-
-
-# --- hostile input --------------------------------------------------------------------------------
-
-
-async def test_hostile_notices_do_not_cost_the_connection(ainterface, apspace, server_url, key, raw):
-    """Arrays that claim to be huge, random bytes, deep nesting: a doubt, no more."""
-
-    def notice(path, text, *blobs):
-        parts = [["numpy", f".a{index}", len(blob)] for index, blob in enumerate(blobs)]
-        fields = [1, "x", random.Random(len(text)).getrandbits(40), 0.0, path, "set", len(text), parts]
-        return orjson.dumps(fields) + b"\n" + text + b"".join(blobs)
-
-    def npy(descr, shape):
-        text = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape!r}, }}\n".encode()
-        return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text
-
-    shapes = [("|S0", (2**40,)), ("<U0", (2**36,)), ("|V0", (2**40,)), ("<f8", (0, 2**47, 2**47)), ("|S0", (3,))]
-    hostile = [notice([], b'"$ship numpy .a0 0"', npy(descr, shape)) for descr, shape in shapes]
-    hostile += [notice([], b"[" * depth + b"]" * depth) for depth in (500, 1000, 7000)]
-    hostile += [notice([], b'{"a":' * depth + b"1" + b"}" * depth) for depth in (500, 1000)]
-    hostile += [notice(["a"] * 3000, b"1"), notice([0] * 3000, b"1"), notice([], b"{"), notice([], b"")]
-    hostile += [b"[" * 5000, b"[" * 5000 + b"]" * 5000 + b"\n", b"", b"\n", b"[1]\n", b"[]\n" * 10]
-    dice = random.Random(7)
-    good = notice([], b'{"a":[1,2]}')
-    for _ in range(60):
-        hostile.append(dice.randbytes(dice.randrange(200)))
-        spoilt = bytearray(good)
-        spoilt[dice.randrange(len(good))] = dice.randrange(256)
-        hostile.append(bytes(spoilt))
-    others = subscribed(raw)
-    await apspace[key()].write({"n": 0})
-    async with Mirror(key(), ainterface) as mirror:
-        connection = subscribed(raw) - others
-        assert len(connection) == 1
-        for payload in hostile:
-            assert raw.publish("{" + key() + "}:notices", payload) == 1
-            await asyncio.sleep(0)
-        await apspace[key()].write({"n": 1})
-        await aeventually(lambda: mirror.value() == {"n": 1})
-        assert subscribed(raw) - others == connection
-
-
 async def test_a_follower_of_an_index_that_is_too_far_from_the_end_sees_nothing(ainterface, apspace, key):
     """Where the server would say the first item; also when the list has shrunk under it."""
     await apspace[key()].write([10, {"x": 20}])
@@ -474,49 +352,3 @@ async def test_a_follower_of_an_index_that_is_too_far_from_the_end_sees_nothing(
         await apspace[key()].write([40])
         await aeventually(lambda: near.value() is None)
         assert far.value() is None
-
-
-# --- Ctrl-C ---------------------------------------------------------------------------------------
-
-
-def interrupting(module, went):
-    """A profiler that presses Ctrl-C in this module, in front of the step that tells a waiting task."""
-
-    def profiler(frame, event, arg):
-        its = event == "c_call" and arg.__name__ == "set_result" and frame.f_code.co_filename.endswith(module)
-        if its and not went:
-            went.append(module)
-            signal.raise_signal(signal.SIGINT)
-
-    return profiler
-
-
-@pytest.mark.parametrize("module", ["streams.py", "wire.py"])
-def test_ctrl_c_between_a_reply_and_its_waiter_costs_no_connection(server_url, key, caplog, module):
-    """asyncio.run cancels its task within the handler of the signal, thus between any two steps."""
-    went, afterwards = [], []
-
-    async def program():
-        async with asyncio.timeout(PATIENCE), RedisInterface(server_url) as interface:
-            space, store = PublishSpace(interface), KeyValueStore(interface)
-            await space[key()].write(0)
-            async with store[key()].watch(Last(10)) as updates:
-                writing = asyncio.create_task(write(space))
-                sys.setprofile(interrupting(module, went))
-                try:
-                    while True:
-                        await (anext(updates) if module == "streams.py" else store[key()].read())
-                finally:
-                    sys.setprofile(None)
-                    writing.cancel()
-                    afterwards.append(await store[key()].read() > 0)
-
-    async def write(space):
-        for number in range(1, 1000):
-            await space[key()].write(number)
-            await asyncio.sleep(0.01)
-
-    with pytest.raises(KeyboardInterrupt):
-        asyncio.run(program())
-    assert (went, afterwards) == ([module], [True])
-    assert caplog.records == []

@@ -6,10 +6,8 @@ import ast
 import asyncio
 import gc
 import json
-import struct
 import threading
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,16 +109,6 @@ def test_a_ship_carries_its_type_at_any_place(open_front, key, raw, ship, numpy_
     assert_no_orphans(raw, key())
     front.write([key()], {"at": 1})
     assert keys_of(raw, key()) == set()
-
-
-def test_the_label_and_the_place_show_in_the_document(open_front, key, raw, ship):
-    """JSON.GET tells what is there."""
-    front = open_front(ships=[ship])
-    front.write([key()], {"at": Pose(1, 2)})
-    text = json.loads(raw.execute_command("JSON.GET", key()))["at"]
-    assert text.startswith("$ship ")
-    assert "pose" in text
-    assert ".at" in text
 
 
 def test_the_list_of_ships_replaces_the_default_one(open_front, key, raw, ship):
@@ -265,28 +253,6 @@ def test_a_ship_may_return_falsy_values(open_front, key):
     assert front.read([key()]) == {"at": None, "l": [None]}
 
 
-@pytest.mark.parametrize("kind", list(SHIPS))
-def test_subscribers_see_ships_too(server_url, key, kind):
-    """Mirrors and callbacks of the blocking front."""
-    ship = SHIPS[kind]()
-    with reem.RedisInterface(server_url, ships=[ship, reem.NumpyShip()]) as interface:
-        seen = []
-
-        def hear(data, updated_path):
-            seen.append(data["at"])
-
-        with (
-            reem.SilentSubscriber(key(), interface) as mirror,
-            reem.CallbackSubscriber(key(), interface, hear, {}),
-        ):
-            reem.PublishSpace(interface)[key()] = {"at": Pose(1.0, 2.0), "image": np.arange(2)}
-            eventually(lambda: seen and mirror.value())
-            assert mirror["at"].read() == Pose(1.0, 2.0)
-            reem.PublishSpace(interface)[key()]["at"] = Pose(3.0, 4.0)
-            eventually(lambda: mirror["at"].read() == Pose(3.0, 4.0))
-            eventually(lambda: seen[-1] == Pose(3.0, 4.0))
-
-
 async def test_an_async_subscriber_sees_ships_too(server_url, key):
     """With the coroutine methods."""
     async with reem_async.RedisInterface(server_url, ships=[AsyncPoseShip()]) as interface:
@@ -350,97 +316,6 @@ async def test_a_ship_that_asks_for_what_was_cancelled_makes_one_value_unreadabl
         (task,) = [task for task in asyncio.all_tasks() if task.get_name() == f"reem ships {key()}"]
     assert task.cancelled()
     assert not caplog.text
-
-
-def npy(header, content=bytes(64), version=b"\x01\x00", length=None):
-    """A file as numpy.save would write it, but for what is wrong with it."""
-    text = header.encode("latin-1")
-    return b"\x93NUMPY" + version + struct.pack("<H", len(text) if length is None else length) + text + content
-
-
-def described(descr="'<i8'", shape="(8,)", order="False"):
-    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n"
-
-
-SPOILT = {
-    "nothing": b"",
-    "text": b"short",
-    "magic alone": b"\x93NUMPY",
-    "no header": npy("", b""),
-    "objects": npy(described("'|O'")),
-    "objects in a struct": npy(described("[('a', '|O')]")),
-    "longdouble": npy(described("'<f16'")),
-    "huge void": npy(described("'|V999999999'")),
-    "no dtype": npy(described("'zzz'")),
-    "dtype of nothing": npy(described("None")),
-    "code as dtype": npy(described("__import__('os').system('touch /tmp/reem-was-here')")),
-    "code as header": npy("__import__('os').system('touch /tmp/reem-was-here')"),
-    "negative shape": npy(described(shape="(-1,)")),
-    "large shape": npy(described(shape="(10**9,)")),
-    "overflowing shape": npy(described(shape="(4611686018427387904, 4)")),
-    "shape of floats": npy(described(shape="(8.0,)")),
-    "shape of bools": npy(described("'<i8'", "(True,)", "False"), bytes(64)),
-    "33 dimensions": npy(described(shape=f"({'1,' * 65})")),
-    "shape of no tuple": npy(described(shape="8")),
-    "too few bytes": npy(described(), bytes(63)),
-    "too many bytes": npy(described(), bytes(65)),
-    "header too long": npy(described(), length=65535),
-    "deep header": npy("(" * 5000 + ")" * 5000),
-    "unknown version": npy(described(), version=b"\x09\x00"),
-    "not a dict": npy("['<i8']"),
-    "missing field": npy("{'descr': '<i8', 'shape': (8,)}"),
-    "nul bytes": bytes(200),
-}
-
-
-@pytest.mark.parametrize("spoilt", list(SPOILT))
-def test_what_somebody_else_put_in_place_of_an_array_is_not_trusted(front, key, raw, spoilt):
-    """Whatever lies where the bytes should be is checked before it is used; nothing is ever evaluated."""
-    front.write([key()], {"image": np.arange(8), "n": 1})
-    (place,) = keys_of(raw, key()) - {"{" + key() + "}:ships"}
-    raw.set(place, SPOILT[spoilt])
-    for path in ([key()], [key(), "image"]):
-        with pytest.raises(BadData) as caught:
-            front.read(path)
-        assert key() in str(caught.value)
-        assert "image" in str(caught.value)
-        assert len(str(caught.value)) < 1000
-    assert front.read([key(), "n"]) == 1
-    assert not Path("/tmp/reem-was-here").exists()
-    front.write([key(), "image"], np.arange(2))
-    assert_same(front.read([key()]), {"image": np.arange(2), "n": 1})
-
-
-@pytest.mark.parametrize("kind", ["hash", "list", "set"])
-def test_another_redis_type_in_place_of_an_array_is_not_trusted(front, key, raw, kind):
-    """It is an error of REEM's, not a wrong value."""
-    front.write([key()], {"image": np.arange(8), "n": 1})
-    (place,) = keys_of(raw, key()) - {"{" + key() + "}:ships"}
-    raw.unlink(place)
-    {"hash": lambda: raw.hset(place, "a", 1), "list": lambda: raw.rpush(place, 1), "set": lambda: raw.sadd(place, 1)}[
-        kind
-    ]()
-    with pytest.raises(reem.ReemError, match=key()):
-        front.read([key()])
-    assert front.read([key(), "n"]) == 1
-
-
-@pytest.mark.parametrize(
-    "words",
-    ["", " ", "numpy", "numpy ", "numpy .image", "numpy .gone 64 int64[8]", "numpy  64 x", "x" * 5000, "numpy \n"],
-)
-def test_a_placeholder_that_reem_did_not_write_is_not_trusted(front, key, raw, words):
-    """Neither on read nor when it is replaced, and whatever it names is not deleted."""
-    raw.set(key("precious"), "kept")
-    front.write([key()], {"n": 1})
-    raw.execute_command("JSON.SET", key(), "$.image", json.dumps("$ship " + words))
-    with pytest.raises(BadData, match=key()):
-        front.read([key()])
-    assert front.read([key(), "n"]) == 1
-    front.write([key()], {"image": np.arange(2)})
-    assert_same(front.read([key()]), {"image": np.arange(2)})
-    assert_no_orphans(raw, key())
-    assert raw.get(key("precious")) == "kept"
 
 
 def test_an_array_whose_bytes_are_gone_is_bad_data(front, key, raw):

@@ -12,7 +12,7 @@ from conftest import PATIENCE, eventually
 import reem
 from reem_async.transport.blocking import BlockingTransport
 from reem_async.transport.options import Options
-from reem_async.transport.state import StateChange, States
+from reem_async.transport.state import States
 
 
 def ends(work):
@@ -75,26 +75,6 @@ def test_a_callback_that_is_interrupted_silences_no_later_one():
     states.closed()
     assert kept
     assert heard == ["lost", "connected", "closed"]
-
-
-def test_an_interrupt_on_the_way_to_a_callback_leaves_the_change_to_the_next():
-    class Interrupted(States):
-        """Ctrl-C comes once as the step that asks for the next change is done."""
-
-        def _next(self, turn):
-            result = super()._next(turn)
-            if isinstance(result, StateChange) and not interrupted:
-                interrupted.append(result)
-                raise KeyboardInterrupt
-            return result
-
-    interrupted, heard = [], []
-    states = Interrupted()
-    states.call(lambda change: heard.append(change.state))
-    with pytest.raises(KeyboardInterrupt):
-        states.opened("there", "1")
-    states.closed()
-    assert heard == ["connected", "closed"]
 
 
 def test_changes_are_told_in_order_while_a_callback_waits_for_another_thread():

@@ -7,29 +7,13 @@ import pickle
 
 import numpy as np
 import pytest
-from conftest import ROOT, assert_no_orphans, assert_same, python
-from redis.crc import key_slot
+from conftest import assert_no_orphans, assert_same
 
 import reem
 import reem_async
-from reem_async.errors import Conflict, MissingKey, NotConnected, WriteOnly
+from reem_async.errors import Conflict, NotConnected, WriteOnly
 
 # --- asyncio only ----------------------------------------------------------------------------------
-
-
-async def test_write_read_delete_length_and_type_are_awaited(akvs, key):
-    """The five calls of an accessor."""
-    await akvs[key()].write({"number": 100.0, "string": "REEM"})
-    assert await akvs[key()].read() == {"number": 100.0, "string": "REEM"}
-    await akvs[key()]["bar"].write([1, 2])
-    assert await akvs[key()]["bar"].read() == [1, 2]
-    assert await akvs[key()].length() == 3
-    assert await akvs[key()]["bar"].type() is list
-    await akvs[key()]["bar"].delete()
-    assert await akvs[key()].read() == {"number": 100.0, "string": "REEM"}
-    await akvs[key()].delete()
-    with pytest.raises(MissingKey):
-        await akvs[key()].delete()
 
 
 async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):
@@ -90,12 +74,6 @@ async def test_many_edits_at_once_lose_nothing(akvs, key):
     assert await akvs[key()]["n"].read() == 40
 
 
-async def test_many_calls_run_at_once_on_one_interface(akvs, key):
-    """Each gets its own reply."""
-    await akvs[key()].write({str(n): n for n in range(200)})
-    assert await asyncio.gather(*(akvs[key()][str(n)].read() for n in range(200))) == list(range(200))
-
-
 async def test_a_cancelled_call_harms_no_other(akvs, key):
     """Its reply is dropped, not handed to the next caller."""
     await akvs[key()].write({str(n): n for n in range(50)} | {"image": np.zeros(100_000)})
@@ -133,15 +111,6 @@ async def test_async_handles_can_be_pickled(akvs, apspace, key):
     assert await akvs[key()].read() == {"a": 1}
 
 
-async def test_async_low_level_twins(ainterface, akvs, key):
-    """Writer, Reader and Publisher take the manual's path strings."""
-    await reem_async.Writer(key(), ainterface).send_to_redis(".", {"a": {}})
-    await reem_async.Writer(key(), ainterface).send_to_redis(".a.b", np.arange(3))
-    assert_same(await reem_async.Reader(key(), ainterface).read_from_redis(".a.b"), np.arange(3))
-    await reem_async.Publisher(top_key_name=key(), interface=ainterface).send_to_redis(".a.b", 5)
-    assert await akvs[key()].read() == {"a": {"b": 5}}
-
-
 async def test_the_interface_need_not_be_initialized(server_url, key):
     """The first call connects; `KeyValueStore` also takes the address itself."""
     kvs = reem_async.KeyValueStore(server_url)
@@ -175,25 +144,6 @@ def test_types_are_python_types(front, key):
         assert front.type([key(), name]) is expected
         front.write([key(name)], value)
         assert front.type([key(name)]) is expected
-
-
-def test_a_namespace_prefixes_every_key_and_keeps_programs_apart(open_front, key, raw):
-    """All keys of one document live in one cluster slot, with and without a namespace."""
-    one, two, none = (open_front(namespace=key("one:")), open_front(namespace=key("two:")), open_front())
-    for value, front in enumerate((one, two)):
-        front.write([key("k")], {"n": value, "image": np.full(3, value)})
-    none.write([key("k")], {"image": np.full(3, 9)})
-    assert_same(one.read([key("k")]), {"n": 0, "image": np.full(3, 0)})
-    assert_same(two.read([key("k")]), {"n": 1, "image": np.full(3, 1)})
-    names = list(raw.scan_iter(match=f"*{key('k')}*", count=1000))
-    mine = [name for name in names if key("one:") in name]
-    assert len(mine) == 3
-    assert all(name.lstrip("{").startswith(key("one:")) for name in mine)
-    for group in (mine, [name for name in names if key("one:") not in name and key("two:") not in name]):
-        assert len(group) == 3
-        assert len({key_slot(name.encode()) for name in group}) == 1
-    one.delete([key("k")])
-    assert not [name for name in raw.scan_iter(match=f"*{key('k')}*", count=1000) if key("one:") in name]
 
 
 def test_the_schema_switch_of_the_first_reem_is_taken_and_does_nothing(front, key):
@@ -231,20 +181,3 @@ def test_nobody_listening_is_said_with_a_remedy():
     with pytest.raises(NotConnected, match=r"(?s)reem up.*compose|compose.*reem up"):
         interface.initialize()
     interface.close()
-
-
-def test_two_processes_share_the_store(kvs, key, server_url):
-    """A blocking writer here, an async program there."""
-    kvs[key()] = {"image": np.arange(12.0).reshape(3, 4)}
-    code = (
-        "import asyncio, sys, reem_async\n"
-        "async def main(url, key):\n"
-        "    async with reem_async.RedisInterface(url) as interface:\n"
-        "        kvs = reem_async.KeyValueStore(interface)\n"
-        "        image = await kvs[key]['image'].read()\n"
-        "        await kvs[key]['twice'].write(image * 2)\n"
-        "asyncio.run(main(*sys.argv[1:]))\n"
-    )
-    done = python(code, server_url, key())
-    assert (done.returncode, done.stderr) == (0, ""), f"in {ROOT}"
-    assert_same(kvs[key()]["twice"].read(), np.arange(12.0).reshape(3, 4) * 2)

@@ -189,21 +189,6 @@ async def test_a_store_write_is_not_published(ainterface, akvs, apspace, key):
         assert [path for path in heard if path != f"{key()}.b"] == []
 
 
-# --- channels --------------------------------------------------------------------------------------
-
-
-async def test_namespaces_do_not_hear_each_other(server_url, key):
-    """A channel is prefixed like a key."""
-    async with contextlib.AsyncExitStack() as stack:
-        one, two = [
-            await stack.enter_async_context(RedisInterface(server_url, namespace=key(name))) for name in ("1:", "2:")
-        ]
-        mirrors = [await stack.enter_async_context(Mirror(key("c"), each)) for each in (one, two)]
-        await PublishSpace(one)[key("c")].write(1)
-        await PublishSpace(two)[key("c")].write(2)
-        await aeventually(lambda: [mirror.value() for mirror in mirrors] == [1, 2])
-
-
 # --- callbacks -------------------------------------------------------------------------------------
 
 
@@ -223,19 +208,6 @@ async def test_a_callback_may_use_reem(ainterface, akvs, apspace, key):
 
 
 # --- loops -----------------------------------------------------------------------------------------
-
-
-async def test_a_loop_below_a_path(akvs, apspace, key):
-    """`kvs["foo"]["bar"].watch()` hears of foo.bar and of a fresh foo."""
-    await akvs[key()].write({"bar": 1, "other": 1})
-    updates = akvs[key()]["bar"].watch()
-    assert (await following(updates)).data == 1
-    await apspace[key()]["other"].write(2)
-    await apspace[key()]["bar"].write(3)
-    assert (await following(updates)).data == 3
-    await apspace[key()].write({"bar": 4})
-    update = await following(updates)
-    assert (update.data, update.path) == (4, key())
 
 
 async def test_without_a_value_a_loop_begins_with_the_first_publish(akvs, apspace, key, raw):
@@ -272,26 +244,6 @@ async def test_updates_of_one_publisher_arrive_in_order_and_once(akvs, apspace, 
         last[update.publisher] = update.sequence
     assert seen == {"a": list(range(100)), "b": list(range(100))}
     assert len(last) == 2
-
-
-@pytest.mark.parametrize("make", [Mirror, lambda *args: CallbackSubscriber(*args, lambda data, updated_path: None)])
-async def test_subscribers_are_async_iterators(ainterface, apspace, key, make):
-    """`async for update in subscriber` as with watch()."""
-    got = []
-    async with make(key(), ainterface) as subscriber, asyncio.timeout(PATIENCE):
-
-        async def loop():
-            async for update in subscriber:
-                got.append(update.data)
-                if update.data == "last":
-                    return
-
-        task = asyncio.create_task(loop())
-        await asyncio.sleep(0.1)
-        await apspace[key()].write({"n": 1})
-        await aeventually(lambda: {"n": 1} in got)
-        await apspace[key()].write("last")
-        await task
 
 
 async def test_a_cancelled_wait_swallows_no_update(akvs, apspace, key):

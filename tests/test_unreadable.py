@@ -33,19 +33,15 @@ class Pose(BlobShip):
     """A ship that followers lack."""
 
     def check_fit(self, value):
-        """Whether it is a complex number."""
         return isinstance(value, complex)
 
     def pack(self, value):
-        """As text."""
         return [str(value).encode()]
 
     def unpack(self, data):
-        """From text."""
         return complex(bytes(data).decode())
 
     def get_label(self):
-        """Its name."""
         return "pose"
 
 
@@ -91,7 +87,6 @@ DAMAGES = {
     "no right": (_forbid, "the user may not do this"),
 }
 DAMAGED_NOW = {"no right"}
-FOLLOWERS = "watch", "pattern", "subscriber", "mirror", "page", "recorder"
 
 
 class Followers:
@@ -106,14 +101,12 @@ class Followers:
         self.updates = {"watch": [], "pattern": []}
 
     async def start(self):
-        """Begin all."""
         for each in (self.watch, self.pattern, self.subscriber, self.mirror):
             await each.listen()
         await self.recorder.start()
         await self.page.start()
 
     def seen(self):
-        """What each has now."""
         for name, updates in self.updates.items():
             queue = getattr(self, name).queue
             updates += iter(queue.take, reem_async.concurrency.queues.EMPTY)
@@ -128,7 +121,6 @@ class Followers:
         }
 
     async def close(self):
-        """End all."""
         for each in (self.watch, self.pattern, self.subscriber, self.mirror, self.page):
             await each.close()
         await self.recorder.stop()

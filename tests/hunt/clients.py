@@ -25,26 +25,10 @@ Address = tuple[str, dict[str, Any]]
 
 
 class Client:
-    """One interface with its two stores."""
+    """One interface with its two stores. Calls are made on the PublishSpace if they are to be `published`."""
 
     def __init__(self, label: str, address: Address, namespace: str) -> None:
         self.label, self.address, self.namespace = label, address, namespace
-
-    def perform(self, op: Op, published: bool) -> Any:
-        """Make a call, on the PublishSpace if it is to be `published`."""
-        raise NotImplementedError
-
-    def keys(self) -> list[str]:
-        """Return the top-level keys."""
-        raise NotImplementedError
-
-    def renew(self) -> None:
-        """Close the interface, and make another one."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Close the interface."""
-        raise NotImplementedError
 
 
 class Blocking(Client):
@@ -55,7 +39,6 @@ class Blocking(Client):
         self.open()
 
     def open(self) -> None:
-        """Make the interface."""
         url, options = self.address
         self.interface = reem.RedisInterface(url, namespace=self.namespace, timeout=5, **options)
         self.kvs, self.space = reem.KeyValueStore(self.interface), reem.PublishSpace(self.interface)
@@ -92,16 +75,13 @@ class Blocking(Client):
         return None
 
     def keys(self) -> list[str]:
-        """Return the top-level keys."""
         return self.kvs.keys()
 
     def renew(self) -> None:
-        """Close the interface, and make another one."""
         self.interface.close()
         self.open()
 
     def close(self) -> None:
-        """Close the interface."""
         self.interface.close()
 
 
@@ -142,15 +122,12 @@ class Elsewhere(Client):
         self.inner, self.pool = inner, ThreadPoolExecutor(1)
 
     def perform(self, op: Op, published: bool) -> Any:
-        """Make a call."""
         return self.pool.submit(self.inner.perform, op, published).result(LIMIT)
 
     def keys(self) -> list[str]:
-        """Return the top-level keys."""
         return self.inner.keys()
 
     def close(self) -> None:
-        """End the thread."""
         self.pool.shutdown()
 
 
@@ -170,19 +147,15 @@ class Asyncio(Client):
         self.kvs, self.space = reem_async.KeyValueStore(self.interface), reem_async.PublishSpace(self.interface)
 
     def begin(self, coroutine: Coroutine[Any, Any, Any]) -> Future[Any]:
-        """Run a coroutine in the loop."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
 
     def run(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
-        """Run a coroutine in the loop, and wait for what it returns."""
         return self.begin(coroutine).result(LIMIT)
 
     def perform(self, op: Op, published: bool) -> Any:
-        """Make a call."""
         return self.run(self.call(op, published))
 
     async def call(self, op: Op, published: bool) -> Any:
-        """Make a call."""
         store: Any = self.space if published else self.kvs
         if op.name == "get_dotted":
             return await store.get(dotted(op.path))
@@ -222,16 +195,13 @@ class Asyncio(Client):
         return bool(self.run(run()))
 
     def keys(self) -> list[str]:
-        """Return the top-level keys."""
         return list(self.run(self.kvs.keys()))
 
     def renew(self) -> None:
-        """Close the interface, and make another one."""
         self.run(self.interface.close())
         self.run(self._open())
 
     def close(self) -> None:
-        """Close the interface, and end the loop."""
         with contextlib.suppress(Exception):
             self.run(self.interface.close())
         self.loop.call_soon_threadsafe(self.loop.stop)

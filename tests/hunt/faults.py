@@ -20,25 +20,21 @@ from .model import Op
 def interrupted(rng: random.Random, call: Callable[[], Any]) -> Any:
     """Make a call with Ctrl-C, which raises KeyboardInterrupt, some time after it began."""
 
-    def stop(*_: Any) -> None:
+    def stop() -> None:
         raise KeyboardInterrupt
 
-    return _handled(rng, call, stop)
+    return handled(rng, call, stop)
 
 
 def handled(rng: random.Random, call: Callable[[], Any], action: Callable[[], None]) -> Any:
     """Make a call, and take an action some time after it began, if it has not ended."""
-    return _handled(rng, call, lambda *_: action())
-
-
-def _handled(rng: random.Random, call: Callable[[], Any], handler: Callable[..., None]) -> Any:
     seconds = 10 ** rng.uniform(-5, -2.5)
     armed = [True]
 
-    def ring(*given: Any) -> None:
+    def ring(*_: Any) -> None:
         if armed[0]:
             armed[0] = False
-            handler(*given)
+            action()
 
     before = signal.signal(signal.SIGALRM, ring)
     try:

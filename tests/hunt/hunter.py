@@ -414,7 +414,8 @@ class Hunter:
 
     def _follow(self) -> None:
         self._drop_followers(self.rng.randrange(MOST_FOLLOWERS))
-        names = [name for name in map(self._name, range(10)) if _published(name) and dotted((name,))]
+        some = [self.rng.choice(NAMESPACES[:2]) + self.rng.choice(TOPS) for _ in range(10)]
+        names = [name for name in some if _published(name) and dotted((name,))]
         for name in names[: MOST_FOLLOWERS - len(self.followers)]:
             self.counts["followed"] += 1
             below = self.inputs.path(self.documents.get(name, ABSENT)) if self.rng.random() < 0.5 else ()
@@ -422,9 +423,6 @@ class Hunter:
             self.followers.append(
                 Follower(name, path, self.documents.get(name, ABSENT), self.ears[0].interface, self.ears[1])
             )
-
-    def _name(self, _: int) -> str:
-        return str(self.rng.choice(NAMESPACES[:2]) + self.rng.choice(TOPS))
 
     def _drop_followers(self, left: int) -> None:
         while len(self.followers) > left:
