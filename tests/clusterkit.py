@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import signal
@@ -31,6 +32,18 @@ def owner(cluster, key):
             if first <= slot_of(key) <= last:
                 return next(node for node in cluster.nodes if node.port == row)
     raise AssertionError(f"nobody has {key}")
+
+
+def on_each_node(cluster, key, count=1):
+    """So many new names for each node."""
+    found = {node.port: [] for node in cluster.nodes}
+    numbers = itertools.count()
+    while min(map(len, found.values())) < count:
+        name = key(f"k{next(numbers)}")
+        there = found[owner(cluster, name).port]
+        if len(there) < count:
+            there.append(name)
+    return [name for names in found.values() for name in names]
 
 
 def _ranges(client):

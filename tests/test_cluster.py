@@ -8,7 +8,7 @@ import pickle
 
 import numpy as np
 import pytest
-from clusterkit import Move, agreed, owner, raw_of, slot_of
+from clusterkit import Move, agreed, on_each_node, owner, raw_of, slot_of
 from conftest import FRONTS, Keys, aeventually, eventually, python
 
 import reem
@@ -29,16 +29,6 @@ def front(request, cluster):
     opened = FRONTS[request.param](cluster, timeout=0.5)
     yield opened
     opened.close()
-
-
-def on_each_node(cluster, key):
-    """One name for each node."""
-    found = {}
-    number = 0
-    while len(found) < len(cluster.nodes):
-        found.setdefault(owner(cluster, key(f"k{number}")).port, key(f"k{number}"))
-        number += 1
-    return list(found.values())
 
 
 # --- the embedded cluster -------------------------------------------------
@@ -113,24 +103,6 @@ def test_a_cluster_that_cannot_be_is_refused(wrong):
 
 
 # --- addresses -------------------------------------------------
-
-
-@pytest.mark.parametrize("package", [reem, reem_async])
-@pytest.mark.parametrize(
-    ("url", "options", "word"),
-    [
-        ("redis+cluster://127.0.0.1:7000/3", {}, "db=3"),
-        ("redis+cluster://127.0.0.1:7000", {"db": 1}, "db=1"),
-        ("redis+cluster://", {}, "host"),
-        ("redis+cluster://user:secret@127.0.0.1:7000,h:x", {}, "h:x"),
-        ("redis+sentinel://user:secret@127.0.0.1:26379", {}, "service"),
-    ],
-)
-def test_addresses_that_mean_nothing_are_refused_without_a_password_in_the_text(package, url, options, word):
-    """Nothing is connected for it."""
-    with pytest.raises(BadValue, match=word) as refusal:
-        package.RedisInterface(url, **options)
-    assert "secret" not in str(refusal.value)
 
 
 def test_the_password_is_not_shown(cluster):
@@ -209,12 +181,6 @@ def moving(cluster, front, key):
     move.finish()
 
 
-def test_before_anything_has_left_calls_go_on(front, moving):
-    """Reading and writing what is there."""
-    front.write((moving.name, "n"), 2)
-    assert front.read((moving.name,))["n"] == 2
-
-
 def test_what_has_left_is_found_where_it_went(front, moving):
     """Read, written, counted, and read again."""
     moving.take(*moving.all_keys())
@@ -237,26 +203,6 @@ def test_a_transaction_over_keys_here_and_there_waits_until_they_are_together(fr
     moving.take(*moving.all_keys())
     value = front.read((moving.name,))
     assert (value["n"], value["image"].tolist()) == (1, [0, 0, 0, 0])
-
-
-def test_a_publisher_never_writes_to_a_key_that_has_left(cluster, moving):
-    """Servers would let it: they do not look at the keys of a transaction that publishes."""
-    moving.take(*moving.all_keys())
-    with reem.RedisInterface(cluster) as interface:
-        reem.PublishSpace(interface)[moving.name] = {"n": 3}
-        reem.PublishSpace(interface)[moving.name]["n"] = 4
-        assert moving.left() == []
-        assert reem.KeyValueStore(interface)[moving.name].read() == {"n": 4}
-
-
-def test_a_publisher_waits_for_keys_that_are_here_and_there(cluster, moving):
-    """Neither node gets anything."""
-    moving.take(moving.name)
-    with reem.RedisInterface(cluster, timeout=0.2) as interface:
-        with pytest.raises(NotConnected, match="nothing was applied"):
-            reem.PublishSpace(interface)[moving.name]["n"] = 3
-        assert reem.KeyValueStore(interface)[moving.name]["n"].read() == 1
-        assert moving.name not in moving.left()
 
 
 LARGE = np.full((100, 1000), 7.0)
@@ -291,17 +237,6 @@ def test_a_large_array_is_published_to_a_moving_slot_or_refused(cluster, key, go
         assert np.array_equal(value["image"], image)
 
 
-def test_a_new_key_of_a_moving_slot_is_made_where_the_slot_goes(front, cluster, key):
-    """As nothing of it is here."""
-    name = key()
-    move = Move(cluster, name).begin()
-    front.write((name,), {"n": 1})
-    assert move.left() == []
-    assert front.read((name, "n")) == 1
-    move.finish()
-    assert front.read((name, "n")) == 1
-
-
 def test_nodes_that_do_not_agree_are_named_as_the_reason(front, cluster, key):
     """Each sends to the other, until time is over."""
     agreed(cluster)
@@ -313,20 +248,6 @@ def test_nodes_that_do_not_agree_are_named_as_the_reason(front, cluster, key):
     first.say("CLUSTER", "SETSLOT", str(slot_of(key())), "NODE", first.id)
     front.write((key(),), 1)
     assert front.read((key(),)) == 1
-
-
-def test_a_slot_that_has_moved_is_followed_by_every_kind_of_call(front, cluster, key):
-    """Plain commands, transactions, and those that watch."""
-    name = key()
-    front.write((name,), {"n": 1, "l": [1], "image": np.zeros(3)})
-    Move(cluster, name).begin().finish()
-    assert front.read((name, "n")) == 1
-    Move(cluster, name).begin().finish()
-    front.write((name, "image"), np.ones(3))
-    Move(cluster, name).begin().finish()
-    front.multiply((name, "n"), 3)
-    Move(cluster, name).begin().finish()
-    assert front.read((name,))["image"].tolist() == [1, 1, 1]
 
 
 def test_an_edit_goes_to_where_the_key_is_now(cluster, key):
@@ -365,22 +286,6 @@ async def test_a_follower_goes_where_the_slot_goes_and_says_that_there_is_a_gap(
         assert not changes
 
 
-async def test_who_begins_to_follow_a_moving_slot_is_told_or_served(cluster, key):
-    """Not served while the document is away from the channel; served when both are together."""
-    name = key()
-    async with reem_async.RedisInterface(cluster) as interface:
-        await reem_async.KeyValueStore(interface)[name].write({"n": 1})
-        move = Move(cluster, name).begin()
-        move.take(name)
-        mirror = reem_async.SilentSubscriber(name, interface)
-        with reem_async.timeout(0.2), pytest.raises(NotConnected, match="nothing is followed"):
-            await mirror.listen()
-        move.finish()
-        mirror = reem_async.SilentSubscriber(name, interface)
-        await mirror.listen()
-        assert mirror.value() == {"n": 1}
-
-
 @pytest.mark.parametrize("gone", ["{}", "{{{}}}:ships"], ids=["document", "registry"])
 async def test_who_follows_a_key_in_parts_is_not_advised_to_do_what_it_does(cluster, key, gone):
     """It is connected with the URL of the cluster already."""
@@ -417,34 +322,6 @@ async def test_leaving_and_coming_back_to_channels_of_one_node_keeps_the_connect
 
 
 # --- many keys -------------------------------------------------
-
-
-async def test_a_monitor_hears_of_new_keys_from_their_first_update_on(cluster, key):
-    """Of every node, in order, and what it does not hear it says."""
-    async with reem_async.RedisInterface(cluster) as interface, reem_async.RedisInterface(cluster) as watching:
-        space = reem_async.PublishSpace(interface)
-        there = on_each_node(cluster, key)
-        for name in there:
-            await space[name].write(0)
-        monitor = Monitor(watching, [key("*")])
-        exact = Monitor(watching, [key("exact")])
-        await monitor.listen()
-        await exact.listen()
-        names = [*there, *(key(f"new{number}") for number in range(12)), key("exact")]
-        for number in range(1, 41):
-            for name in names:
-                await space[name].write(number)
-        heard = {name: [] for name in names}
-        async with asyncio.timeout(10):
-            while min(len(values) and values[-1] for values in heard.values()) < 40:
-                event = await anext(monitor)
-                values = heard[event.name]
-                assert not values or event.value > values[-1]
-                assert event.gap or event.value == (values[-1] if values else 0) + 1
-                values.append(event.value)
-            assert [(await anext(exact)).value for _ in range(40)] == list(range(1, 41))
-        await monitor.close()
-        await exact.close()
 
 
 async def test_a_key_that_is_found_late_has_a_gap(cluster, key, monkeypatch):

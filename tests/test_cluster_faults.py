@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from clusterkit import Move, kill_primary, owner, raw_of, whole_again
+from clusterkit import kill_primary, owner, raw_of, whole_again
 from conftest import aeventually
 from loadkit import Load
 
@@ -19,39 +18,11 @@ import reem_async
 from reem_async.errors import NotConnected
 from reem_async.server.cluster import EmbeddedCluster
 
-SECONDS = float(os.environ.get("REEM_FAULT_SECONDS", "2"))
-"""How long slots go back and forth; the full check is 60."""
-
 
 @pytest.fixture(scope="module")
 def cluster():
     with EmbeddedCluster(node_timeout=0.5) as running:
         yield running
-
-
-async def test_slots_that_move_back_and_forth_cost_no_write_and_no_reader_sees_a_wrong_value(cluster):
-    """Key by key, as every tool for it does, with all that REEM stores of a key."""
-    load, moves = Load(cluster, "robot"), 0
-    async with load.running():
-        end = time.monotonic() + SECONDS
-        while time.monotonic() < end:
-            for key in ("robot", "robot:count"):
-                await asyncio.to_thread(_moved_slowly, cluster, key)
-                moves += 1
-            await asyncio.sleep(0.02)
-    assert load.unknown == load.uncounted == 0
-    assert load.refused == 0
-    assert moves > 3
-    assert load.gaps >= 1
-    assert load.reads > 10
-
-
-def _moved_slowly(cluster, key):
-    move = Move(cluster, key).begin()
-    while keys := move.all_keys():
-        move.take(keys[0])
-        time.sleep(0.002)
-    move.finish()
 
 
 async def test_a_killed_primary_is_replaced_and_all_go_on(cluster):

@@ -204,7 +204,8 @@ def killed(server):
 async def test_a_restarted_server_is_told_apart(tmp_path):
     async with contextlib.AsyncExitStack() as stack:
         first = EmbeddedServer(directory=tmp_path).__enter__()
-        interface = await stack.enter_async_context(reem_async.RedisInterface(f"redis://127.0.0.1:{first.port}"))
+        port = first.port
+        interface = await stack.enter_async_context(reem_async.RedisInterface(f"redis://127.0.0.1:{port}"))
         store = reem_async.KeyValueStore(interface)
         changes = interface.states()
         await store["foo"].write(1)
@@ -216,7 +217,7 @@ async def test_a_restarted_server_is_told_apart(tmp_path):
                 await store["foo"].read()
             with contextlib.suppress(Exception):
                 first.__exit__(None, None, None)
-            with EmbeddedServer(port=first.port, directory=tmp_path):
+            with EmbeddedServer(port=port, directory=tmp_path):
                 update = await asyncio.wait_for(anext(updates), PATIENCE)
                 assert (update.gap, update.missed) == (True, None)
                 await aeventually(lambda: interface.state == "connected")

@@ -10,7 +10,6 @@ import threading
 
 import httpx
 import numpy as np
-import oldkit
 import pytest
 from clikit import CommandLine, begins
 from conftest import PATIENCE, PLAIN, assert_same, eventually
@@ -20,7 +19,6 @@ from typer.testing import CliRunner
 
 import reem
 from reem_async.errors import ServerMissing
-from reem_async.plan import Plan
 from reem_async.server.cluster import EmbeddedCluster
 from reem_async.tools.cli import build
 
@@ -38,24 +36,19 @@ def value_of(number):
     return {"n": number, "array": np.arange(number * 1000.0), "list": [1, "two", None]}
 
 
-@pytest.fixture(scope="module", params=["cluster", "sentinels"] if PLAIN else ["cluster", "sentinels", "plain cluster"])
+@pytest.fixture(scope="module", params=["cluster", "sentinels"])
 def kind(request):
     """Several servers of some kind: what there is on one of them is tested in the files of each command."""
     return request.param
 
 
 @pytest.fixture(scope="module")
-def is_plain(kind):
-    return PLAIN or kind == "plain cluster"
-
-
-@pytest.fixture(scope="module")
-def url(kind, is_plain, request, tmp_path_factory):
+def url(kind, request, tmp_path_factory):
     with contextlib.ExitStack() as stack:
         try:
             if kind == "sentinels":
-                yield Watched(tmp_path_factory.mktemp("sentinels"), stack, json=not is_plain).url
-            elif is_plain:
+                yield Watched(tmp_path_factory.mktemp("sentinels"), stack, json=not PLAIN).url
+            elif PLAIN:
                 yield stack.enter_context(EmbeddedCluster(replicas=0, json=False)).url
             else:
                 yield request.getfixturevalue("cluster").url
@@ -139,25 +132,6 @@ def test_snapshots_hold_everything_and_bring_it_back(interface, command, tmp_pat
         assert_same(kvs[name].read(), value_of(number))
 
 
-def test_what_old_versions_have_stored_is_converted(interface, command, is_plain):
-    if is_plain:
-        pytest.skip("what old versions have stored are documents of the module")
-    kvs, core = reem.KeyValueStore(interface), interface._followers
-    only = {"mixed", "deep", "number", "replaced", "writer"}
-    for words in oldkit.recorded("reem_0_1_2", only, SPACE):
-        interface._wait(core.session.run(Plan([words], lambda replies: replies)))
-    before = lines(command("migrate"))
-    assert before == lines(command("migrate"))
-    assert before[-1] == "5 keys would be converted. Nothing was changed; `reem migrate --yes` does it."
-    assert lines(command("migrate", "--yes")) == [*before[:-1], "5 keys converted."]
-    assert len(lines(command("migrate", "--yes"))) == 1
-    for name in only:
-        assert_same(kvs[name].read(), oldkit.STORED[name])
-    assert sorted(kvs.keys()) == sorted([*NAMES, *only])
-    for number, name in enumerate(NAMES):
-        assert_same(kvs[name].read(), value_of(number))
-
-
 def test_whatever_is_published_is_heard_recorded_and_played(interface, command, going_on, tmp_path):
     kvs, space, file = reem.KeyValueStore(interface), reem.PublishSpace(interface), tmp_path / "run.mcap"
     with going_on("echo", "--json") as echo, going_on("record", "-o", file) as record:
@@ -179,42 +153,6 @@ def test_whatever_is_published_is_heard_recorded_and_played(interface, command, 
     assert command("play", "--rate", "20", file)[0] == 0
     for number, name in enumerate(NAMES):
         assert_same(kvs[name].read(), {**value_of(number), "n": 3})
-
-
-def test_live_commands_count_what_is_published_and_what_is_stored(interface, going_on):
-    """`reem hz` and `reem top`, of keys on every node."""
-    kvs, space, published, stored = (
-        reem.KeyValueStore(interface),
-        reem.PublishSpace(interface),
-        NAMES[:12],
-        NAMES[12:24],
-    )
-    ended = threading.Event()
-
-    def work():
-        for number in range(10**6):
-            for name in published:
-                space[name]["n"] = number
-            for name in stored:
-                kvs[name]["n"] = -number
-            if ended.wait(0.05):
-                return
-
-    worker = threading.Thread(target=work)
-    worker.start()
-    try:
-        with going_on("hz", "--every", "0.5", "--json") as hz, going_on("top", "--every", "0.5", "--json") as top:
-            counts, keys = Lines(hz), Lines(top)
-            wanted = {f"{name}.n" for name in published} | {f"{name}.n (stored)" for name in stored}
-            eventually(lambda: wanted <= {row["path"] for row in counts.rows() if row["hz"]}, STARTING)
-            eventually(lambda: set(published) <= {row["path"] for row in keys.rows() if row["hz"]}, STARTING)
-            assert {row["path"] for row in keys.rows()} == set(published), "what a store writes is not heard"
-            for process in (hz, top):
-                process.send_signal(signal.SIGINT)
-            assert (hz.wait(PATIENCE), top.wait(PATIENCE)) == (0, 0)
-    finally:
-        ended.set()
-        worker.join()
 
 
 def test_the_page_shows_every_key(interface, url):

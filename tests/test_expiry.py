@@ -16,12 +16,6 @@ from reem_async.errors import BadKey, BadType, BadValue, MissingKey
 from reem_async.server import EmbeddedServer
 
 
-def call(front, path, name, *arguments):
-    """Call a method of an accessor in either front."""
-    result = getattr(front.at(path), name)(*arguments)
-    return front.run(result) if hasattr(front, "run") else result
-
-
 def left(raw, key):
     """All Redis keys of a test, with the milliseconds they have."""
     return {name: raw.pttl(name) for name in raw.scan_iter(match=f"*{key()}*", count=1000)}
@@ -32,15 +26,15 @@ def test_all_of_a_key_expires_at_once(open_front, key, raw, space):
     """Document, arrays, registry and note; `persist` ends it."""
     front = open_front(space)
     front.write([key()], {"label": "cup", "crop": np.zeros((100, 100)), "parts": [np.arange(3), b"bytes"]})
-    call(front, [key()], "expire", 50)
+    front.wait(front.at([key()]).expire(50))
     names = left(raw, key)
     assert len(names) == 5 + (space == "PublishSpace")
     assert all(0 < milliseconds <= 50_000 for milliseconds in names.values()), names
     front.write([key(), "label"], "cup, red")
     assert 0 < raw.pttl(key()) <= 50_000, "a later write keeps it"
-    call(front, [key()], "persist")
+    front.wait(front.at([key()]).persist())
     assert {time for name, time in left(raw, key).items() if not name.endswith(":last")} == {-1}
-    call(front, [key()], "expire", np.float32(0.05))
+    front.wait(front.at([key()]).expire(np.float32(0.05)))
     eventually(lambda: not left(raw, key))
 
 
@@ -69,10 +63,10 @@ def test_followers_are_told_of_an_expiry_as_of_a_deletion(kvs, key):
 def test_what_cannot_expire_is_refused(front, key, raw, path, seconds, error):
     front.write([key()], {"n": 1})
     with pytest.raises(error, match=key()):
-        call(front, [key(), *path], "expire", seconds)
+        front.wait(front.at([key(), *path]).expire(seconds))
     assert raw.pttl(key()) == -1
     with pytest.raises(MissingKey, match=key("absent")):
-        call(front, [key("absent")], "expire", 1)
+        front.wait(front.at([key("absent")]).expire(1))
 
 
 def test_no_array_outlives_its_document_while_others_change_the_shape(interface, server_url, key, raw):

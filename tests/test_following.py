@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import threading
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, aeventually, assert_same, eventually, nothing_sent, subscribed
+from conftest import FRONTS, assert_same, eventually, nothing_sent, subscribed
 
 import reem
 import reem_async
@@ -18,18 +17,12 @@ from reem_async.errors import QueueFull, ReadOnly
 
 
 class Following:
-    """What follows through one front; an event loop of the asyncio front goes on while the test waits."""
+    """What follows through one front, and is closed at the end."""
 
     def __init__(self, front, stack):
-        self.front = front
-        self.stack = stack
-        self.module = reem_async if hasattr(front, "run") else reem
-
-    def wait(self, result):
-        return self.front.run(result) if hasattr(self.front, "run") else result
-
-    def until(self, condition):
-        return self.front.run(aeventually(condition)) if hasattr(self.front, "run") else eventually(condition)
+        self.front, self.stack = front, stack
+        self.module = reem_async if isinstance(front, FRONTS["asyncio"]) else reem
+        self.until, self.take = front.until, front.take
 
     def mirror(self, channel):
         return self._begun(self.module.SilentSubscriber(channel=channel, interface=self.front.interface))
@@ -38,38 +31,12 @@ class Following:
         return self._begun(self.module.CallbackSubscriber(channel, self.front.interface, function, kwargs))
 
     def _begun(self, subscriber):
-        self.wait(subscriber.listen())
-        self.stack.callback(lambda: self.wait(subscriber.close()))
+        self.front.wait(subscriber.listen())
+        self.stack.callback(lambda: self.front.wait(subscriber.close()))
         return subscriber
 
     def watch(self, channel, **options):
         return self.front.at((channel,)).watch(**options)
-
-    def take(self, updates, count=1):
-        """The next updates, or a failure in place of waiting for ever."""
-        return self.front.run(self._taken(updates, count)) if hasattr(self.front, "run") else _taken(updates, count)
-
-    async def _taken(self, updates, count):
-        return [await asyncio.wait_for(anext(updates), PATIENCE) for _ in range(count)]
-
-
-def _taken(updates, count):
-    got, failures = [], []
-
-    def work():
-        try:
-            while len(got) < count:
-                got.append(next(updates))
-        except BaseException as failure:
-            failures.append(failure)
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    thread.join(PATIENCE)
-    assert not thread.is_alive(), "still waiting"
-    if failures:
-        raise failures[0]
-    return got
 
 
 @pytest.fixture
@@ -307,5 +274,5 @@ def test_all_subscribers_of_an_interface_share_one_connection(following, kvs, ps
     assert len(subscribed(raw) - before) == 1
     pspace[key("c3")] = 5
     following.until(lambda: [mirror.value() for mirror in mirrors[3::5]] == [5] * 4)
-    following.wait(following.front.interface.close())
+    following.front.wait(following.front.interface.close())
     eventually(lambda: not subscribed(raw) - before)

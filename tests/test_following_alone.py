@@ -100,18 +100,6 @@ async def test_a_value_of_a_ship_that_is_lacking_ends_nobodys_following(server, 
         assert (interface.state, interface.unreadable) == ("connected", 1)
 
 
-async def test_a_value_of_a_ship_that_is_lacking_is_an_error_only_as_long_as_it_is_there(server, other):
-    async with reem_async.RedisInterface(server) as interface:
-        kvs, theirs = reem_async.KeyValueStore(interface), reem_async.KeyValueStore(other)
-        await theirs["cam"].write({"n": 2, "blob": b"x" * 20_000})
-        async with kvs["cam"].mirror(largest=1000):
-            pass
-        with pytest.raises(reem_async.errors.BadData, match="lacks"):
-            await kvs["cam"].read()
-        await theirs["cam"].write({"n": 3})
-        assert await kvs["cam"].read() == {"n": 3}
-
-
 # --- who is cancelled, or refused
 
 
@@ -228,25 +216,6 @@ async def test_who_may_not_touch_keys_is_warned_that_he_hears_of_no_store(server
 
 
 # --- one key of many
-
-
-async def test_a_value_that_cannot_be_read_is_told_as_such_and_mended(server, other, caplog):
-    """It is said once that it cannot; the others are told meanwhile."""
-    theirs = reem_async.KeyValueStore(other)
-    await theirs["cam"].write({"image": np.arange(3)})
-    await theirs["ok"].write(1)
-    await other.client.set("{cam}.image", "garbage")
-    async with reem_async.RedisInterface(server) as interface:
-        with contextlib.ExitStack() as stack:
-            told = await gathered(stack, reem_async.KeyValueStore(interface).watch())
-            await aeventually(lambda: sorted(each.path for each in told) == ["cam", "ok"])
-            assert isinstance(told[0].data["image"], reem_async.Unreadable)
-            await asyncio.sleep(1.2)  # another look
-            await theirs["cam"].write({"n": 5})
-            await aeventually(lambda: told[-1].path == "cam" and told[-1].data == {"n": 5})
-            await reem_async.PublishSpace(other)["cam"]["n"].write(6)
-            await aeventually(lambda: told[-1].data == {"n": 6})
-    assert len([record for record in caplog.records if "cam.image cannot be read" in record.message]) == 1
 
 
 @pytest.mark.parametrize("late", [False, True])

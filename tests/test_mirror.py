@@ -11,6 +11,7 @@ import threading
 import numpy as np
 import pytest
 from conftest import FRONTS, aeventually, assert_same, eventually, nothing_sent
+from test_ships import Pose, PoseShip
 
 import reem
 import reem_async
@@ -28,17 +29,13 @@ class Mirrored:
     def __init__(self, front, path, **options):
         self.front = front
         self.mirror = front.at(path).mirror(**options)
-        self.wait(self.mirror.listen)
-
-    def wait(self, call, *arguments):
-        result = call(*arguments)
-        return self.front.run(result) if hasattr(self.front, "run") else result
+        front.wait(self.mirror.listen())
 
     def until(self, predicate, timeout=10.0):
-        return self.wait(self.mirror.wait_until, predicate, timeout)
+        return self.front.wait(self.mirror.wait_until(predicate, timeout))
 
     def close(self):
-        self.wait(self.mirror.close)
+        self.front.wait(self.mirror.close())
 
 
 @pytest.fixture
@@ -76,15 +73,6 @@ def test_a_mirror_answers_from_memory_what_anybody_stored_or_published(mirrored,
         mirror["joint"] = 1
     raw.delete(top)
     assert it.until(lambda value: value is None) is None
-
-
-def test_a_copy_may_be_changed_by_who_has_it(mirrored, kvs, key):
-    """Nobody else sees that."""
-    kvs[key()] = {"l": [1]}
-    mirror = mirrored((key(),)).mirror
-    mirror.value()["l"].append(2)
-    mirror["l"].read().append(3)
-    assert mirror.value() == {"l": [1]}
 
 
 def test_waiting_ends_at_once_later_or_in_vain(mirrored, kvs, key):
@@ -132,37 +120,11 @@ def test_a_predicate_sees_each_published_state(mirrored, pspace, key):
         it.until(lambda value: not value["pressed"])
 
 
-class Pose:
-    """Something of a user's own that can be changed."""
-
-    def __init__(self, x):
-        self.x = x
-
-
-class PoseShip(reem.SpecialDatatypeShip):
-    """Carries it."""
-
-    def get_label(self):
-        return "pose"
-
-    def check_fit(self, value):
-        return isinstance(value, Pose)
-
-    def write(self, key, value, client):
-        client.set(key, str(value.x))
-
-    def read(self, key, client):
-        client.get(key)
-
-    def interpret_read(self, responses):
-        return Pose(float(responses[0]))
-
-
 def test_objects_of_a_users_own_ship_are_copied_too(server_url, key):
     """A reader that changes one changes it in no mirror and for no other subscriber."""
     with reem.RedisInterface(server_url, ships=[PoseShip(), reem.NumpyShip()]) as interface:
         kvs = reem.KeyValueStore(interface)
-        kvs[key()] = {"pose": Pose(1.0), "image": np.zeros(3)}
+        kvs[key()] = {"pose": Pose(1.0, 2.0), "image": np.zeros(3)}
         with kvs[key()].mirror() as mirror, kvs[key()].watch() as watch:
             for pose in (mirror.value()["pose"], mirror["pose"].read(), next(watch).data["pose"]):
                 assert pose.x == 1.0
@@ -255,9 +217,8 @@ def test_a_mirror_that_does_not_follow_yet_says_so(front, key):
     with pytest.raises(Stale, match="listen"):
         mirror.value()
     assert mirror.age == float("inf")
-    wait = getattr(front, "run", lambda result: result)
     with pytest.raises(Stale, match="listen"):
-        wait(mirror.wait_until(lambda value: True, 1.0))
+        front.wait(mirror.wait_until(lambda value: True, 1.0))
 
 
 async def test_a_cut_connection_is_an_error_until_the_copy_is_there_again(ainterface, akvs, key):
@@ -329,14 +290,3 @@ def test_threads_read_one_mirror(kvs, key):
         for reader in readers:
             reader.join()
         assert not torn
-
-
-def test_closing_the_interface_ends_a_mirror_quietly(server_url, key):
-    """In whichever order."""
-    interface = reem.RedisInterface(server_url)
-    mirror = reem.KeyValueStore(interface)[key()].mirror()
-    mirror.listen()
-    interface.close()
-    mirror.close()
-    with pytest.raises(Stale):
-        mirror.value()

@@ -83,16 +83,12 @@ def in_place_of(server, answer):
         thread.join()
 
 
-def test_localhost_means_the_socket(server, connect):
-    front = connect(server.port)
+@pytest.mark.parametrize("host", ["localhost", "redis://localhost:{port}/0"])
+def test_localhost_means_the_socket(server, connect, host):
+    front = connect(server.port, host.format(port=server.port))
     goes_on(front)
     assert all(ways(server))
     assert front.interface.hostname == f"localhost:{server.port}"
-
-
-def test_so_it_does_in_a_url(server, connect):
-    goes_on(connect(server.port, f"redis://localhost:{server.port}/0"))
-    assert all(ways(server))
 
 
 def test_subscribers_use_it_too(server):
@@ -216,18 +212,12 @@ def test_a_silent_server_is_waited_for_once(server, connect):
     assert all(ways(server))  # it was not given up
 
 
-@pytest.mark.parametrize(
-    "host",
-    ["robot.example", "192.0.2.1", "rediss://localhost", "unix:///tmp/redis.sock"],
-)
-def test_elsewhere_nothing_is_looked_for(host, recwarn):
-    options = Options(host, 1.0, {})
-    look_nearby(options)
-    assert options.nearby is None
+ELSEWHERE = [Options(host, 1.0, {}) for host in ("192.0.2.1", "rediss://localhost", "unix:///tmp/redis.sock")]
 
 
-def test_nor_for_one_of_several_servers():
-    options = NodeOptions(Options("localhost", 1.0, {}), ("localhost", 7000))
+@pytest.mark.parametrize("options", [*ELSEWHERE, NodeOptions(Options("localhost", 1.0, {}), ("localhost", 7000))])
+def test_elsewhere_nothing_is_looked_for(options):
+    """Nor for one of several servers."""
     look_nearby(options)
     assert options.nearby is None
 

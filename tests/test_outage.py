@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import os
 import pickle
 import random
@@ -56,18 +55,13 @@ def server(tmp_path):
 
 @pytest.fixture(params=list(FRONTS))
 def publisher(request, server):
-    """Makes either front with a PublishSpace of a policy; `front.eventually` waits, and has the event loop go on."""
+    """Makes either front with a PublishSpace of a policy."""
     with contextlib.ExitStack() as stack:
 
         def make(policy, url=server.url, **options):
             front = stack.enter_context(contextlib.closing(FRONTS[request.param](url, "PublishSpace", **options)))
             front.kvs = type(front.kvs)(front.interface, policy)
 
-            def going_on():
-                if request.param == "asyncio":
-                    front.run(asyncio.sleep(0.005))
-
-            front.eventually = lambda condition: eventually(lambda: going_on() or condition())
             return front
 
         yield make
@@ -121,12 +115,12 @@ def test_the_newest_of_each_place_is_sent_when_the_server_is_back(publisher, ser
     assert front.kvs.dropped - before == 3
     assert front.kvs.waiting >= 4
     server.start()
-    front.eventually(lambda: front.kvs.waiting == 0)
+    front.until(lambda: front.kvs.waiting == 0)
     assert_same(reader()["robot"].read(), {"pose": {"x": 5, "y": 6}, "image": np.full(40_000, 7.0)})
     assert front.kvs.dropped - before == 3
     front.write(["robot", "pose", "x"], 9)
     assert reader()["robot"]["pose"]["x"].read() == 9
-    front.eventually(lambda: "the server answers again" in caplog.text)
+    front.until(lambda: "the server answers again" in caplog.text)
     assert caplog.text.count("until the server is back") == 1
 
 
@@ -141,7 +135,7 @@ def test_closing_in_an_outage_does_not_say_that_the_server_answers(publisher, se
         return False
 
     outages._answers = closed_meanwhile
-    front.eventually(lambda: outages._asking is False)
+    front.until(lambda: outages._asking is False)
     assert "the server answers again" not in caplog.text
 
 
@@ -156,7 +150,7 @@ def test_updates_are_dropped_and_counted(publisher, server, reader, caplog):
     front.delete(["a"])
     assert (front.kvs.dropped - before, front.kvs.waiting) == (6, 0)
     server.start()
-    front.eventually(lambda: "the server answers again" in caplog.text)
+    front.until(lambda: "the server answers again" in caplog.text)
     assert reader()["a"].read() == 1
     front.write(["a"], 7)
     assert reader()["a"].read() == 7
@@ -207,7 +201,7 @@ def test_what_may_have_been_applied_is_not_sent_again(publisher, server, reader)
         assert other["a"].read() == 1
         other["a"] = 2
         front.write(["b"], 1)
-        front.eventually(lambda: front.kvs.waiting == 0 and "b" in other)
+        front.until(lambda: front.kvs.waiting == 0 and "b" in other)
         assert other["a"].read() == 2
 
 
@@ -225,7 +219,7 @@ def test_a_server_that_hangs_is_waited_for_once(publisher, server, reader):
         assert front.kvs.dropped == 1 + 98
     finally:
         os.kill(server.pid, signal.SIGCONT)
-    front.eventually(lambda: front.kvs.waiting == 0)
+    front.until(lambda: front.kvs.waiting == 0)
     assert {name: reader()[name].read() for name in "bc"} == {"b": 1, "c": 1}
 
 
@@ -248,7 +242,7 @@ def test_an_outage_ends_for_several_keys_that_are_published_all_the_time(publish
         publish()
         proxy.delay = 0.01
         server.start()
-        front.eventually(lambda: publish() or "the server answers again" in caplog.text)
+        front.until(lambda: publish() or "the server answers again" in caplog.text)
         publish()
         assert [reader()[name].read() for name in names] == [number] * 3
         assert front.kvs.waiting == 0
@@ -287,7 +281,7 @@ def test_what_depends_on_what_is_there_raises_and_comes_behind_what_is_kept(publ
     front.write(["l"], [3])
     server.start()
     front.append(["l"], 4)
-    front.eventually(lambda: front.kvs.waiting == 0)
+    front.until(lambda: front.kvs.waiting == 0)
     assert reader()["l"].read() == [3, 4]
 
 
@@ -304,8 +298,8 @@ def test_what_is_refused_afterwards_is_logged_and_counted(publisher, server, tmp
     front.write(["a", "b", "c"], 1)
     front.delete(["a", "b", "d"])
     server.start()
-    front.eventually(lambda: front.kvs.waiting == 0)
-    front.eventually(lambda: "the server answers again" in caplog.text)
+    front.until(lambda: front.kvs.waiting == 0)
+    front.until(lambda: "the server answers again" in caplog.text)
     assert front.kvs.dropped - before == 1
     assert "a.b.c: kept in an outage, and refused now" in caplog.text
 
@@ -324,7 +318,7 @@ def test_memory_is_bounded(publisher, server, reader, monkeypatch):
     front.write(["b"], "x" * 20_000)
     assert front.kvs.dropped - before + front.kvs.waiting - waiting == 21
     server.start()
-    front.eventually(lambda: front.kvs.waiting == 0)
+    front.until(lambda: front.kvs.waiting == 0)
     assert "n19" in reader()["a"].read()
     assert "n0" not in reader()["a"].read()
 
@@ -335,7 +329,7 @@ def test_closing_gives_up_what_is_kept(publisher, server, caplog):
     lose(front, server)
     front.write(["a"], 1)
     before, left = front.kvs.dropped, front.kvs.waiting
-    front.interface.close() if isinstance(front.kvs, reem.PublishSpace) else front.run(front.interface.close())
+    front.wait(front.interface.close())
     assert left >= 1
     assert (front.kvs.dropped, front.kvs.waiting) == (before + left, 0)
     assert f"{left} kept updates were not sent" in caplog.text
@@ -381,33 +375,14 @@ def test_a_number_is_not_used_again_if_the_server_goes_away_between_two_kept_upd
         assert held == [0, 0, 0]  # before each is sent, the second twice
 
 
-def test_no_thread_to_be_had_does_not_keep_an_interface_from_being_closed(server, reader):
-    """The next call starts one."""
-    with reem.RedisInterface(server.url) as interface:
-        space = reem.PublishSpace(interface, outage="newest")
-        server.stop()
-        usual = threading.stack_size(1 << 50)  # more than there are addresses
-        try:
-            with pytest.raises(RuntimeError, match="can't start new thread"):
-                space["a"] = 1
-        finally:
-            threading.stack_size(usual)
-        space["a"] = 2
-        server.start()
-        eventually(lambda: space.waiting == 0)
-        assert reader()["a"].read() == 2
-
-
 def test_an_update_of_several_is_kept_by_its_entries(publisher, server, reader):
     front = publisher("newest")
     front.write(["a"], {"x": 0, "y": 0, "z": 0})
     lose(front, server)
-    call = front.kvs["a"].update({"x": 1, "y": 1})
-    if call is not None:
-        front.run(call)
+    front.wait(front.kvs["a"].update({"x": 1, "y": 1}))
     front.write(["a", "y"], 2)
     server.start()
-    front.eventually(lambda: front.kvs.waiting == 0)
+    front.until(lambda: front.kvs.waiting == 0)
     assert reader()["a"].read() == {"x": 1, "y": 2, "z": 0}
 
 
@@ -478,79 +453,9 @@ def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):
     assert space.outage == "drop"
     server.stop()
     for call in (lambda: space["a"].write(1), lambda: handle.write(1)):
-        result = call()
-        if result is not None:
-            front.run(result)
+        front.wait(call())
     assert space.dropped == 1
-    closing = space.interface.close()
-    if closing is not None:
-        front.run(closing)
-
-
-def test_a_camera_goes_on_through_a_restart(server, reader, caplog):
-    """A blocking loop that knows nothing of it; each frame has one number, is told, or is counted."""
-    with reem.RedisInterface(server.url, timeout=0.5) as interface:
-        space = reem.PublishSpace(interface, outage="newest")
-        space["camera"] = {"number": -1, "image": np.zeros((48, 64), np.uint8)}
-        over = threading.Event()
-        frames, errors = [0], []
-
-        def camera():
-            try:
-                while not over.wait(0.01):
-                    frames[0] += 1
-                    space["camera"] = {"number": frames[0], "image": np.full((48, 64), frames[0] % 256, np.uint8)}
-            except BaseException as error:
-                errors.append(error)
-
-        thread = threading.Thread(target=camera)
-        thread.start()
-        try:
-            for _ in range(2):
-                begun = frames[0]
-                eventually(lambda begun=begun: frames[0] > begun + 10)
-                server.stop()
-                begun = frames[0]
-                eventually(lambda begun=begun: frames[0] > begun + 20 and space.waiting)
-                server.start()
-                eventually(lambda: space.waiting == 0)
-            begun = frames[0]
-            eventually(lambda: frames[0] > begun + 5)
-        finally:
-            over.set()
-            thread.join()
-        assert not errors
-        eventually(lambda: not space.waiting and not space._core._outages._asking)
-        seen = reader()["camera"].read()
-        assert seen["number"] == frames[0]
-        assert seen["image"][0, 0] == frames[0] % 256
-        note = interface.client.get("{camera}:last")
-        assert int(note.split()[1]) == frames[0] + 1
-        assert 30 < space.dropped <= frames[0]
-    assert caplog.text.count("until the server is back") == 2
-    assert all(record.levelno == logging.WARNING for record in caplog.records if record.name == "reem.publish")
-
-
-def test_a_child_leaves_what_is_kept_to_its_parent(server, reader):
-    """It has neither the thread that would send it, nor is it the same publisher."""
-    with reem.RedisInterface(server.url) as interface:
-        space = reem.PublishSpace(interface, outage="newest")
-        space["a"] = 0
-        server.stop()
-        space["a"] = 1
-        space["a"] = 2
-        child = os.fork()
-        if child == 0:
-            status = 1
-            with contextlib.suppress(BaseException):
-                space["b"] = 1
-                status = 0 if space.waiting == 1 else 2
-            os._exit(status)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-        assert space.waiting == 1
-        server.start()
-        eventually(lambda: space.waiting == 0)
-        assert reader()["a"].read() == 2
+    front.wait(space.interface.close())
 
 
 def _appends(space):

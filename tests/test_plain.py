@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
-import threading
 
 import numpy as np
 import orjson
@@ -190,20 +189,6 @@ def test_what_has_taken_the_place_of_a_document_is_not_deleted(front, raw):
     raw.delete("seen")
 
 
-def test_what_is_no_string_is_left_alone(front, raw):
-    raw.delete("row")
-    raw.rpush("row", 1)
-    for call in (
-        lambda: front.read(["row"]),
-        lambda: front.write(["row"], 1),
-        lambda: front.write(["row", "a"], 1),
-        lambda: front.delete(["row"]),
-    ):
-        with pytest.raises(reem.WrongKind, match="list"):
-            call()
-    assert raw.lrange("row", 0, -1) == [b"1"]
-
-
 async def test_a_catalogue_tells_documents_from_strings(server, raw):
     async with reem_async.RedisInterface(server, namespace="listed:") as interface:
         store = reem_async.KeyValueStore(interface)
@@ -216,106 +201,6 @@ async def test_a_catalogue_tells_documents_from_strings(server, raw):
 
 
 # --- together with others -------------------------------------------------
-
-CLIENTS, CHANGES = (
-    int(os.environ.get(f"REEM_TEST_{what}", usual)) for what, usual in (("CLIENTS", "4"), ("CHANGES", "60"))
-)
-
-
-def test_no_change_is_lost_and_no_array_left_behind(server, raw):
-    """Clients of both fronts, each with an interface of its own, all below the top of one document."""
-    with contextlib.closing(reem.RedisInterface(server)) as interface:
-        reem.KeyValueStore(interface)["shared"] = {"sum": 0, "of": {}, "list": []}
-
-    def blocking(number):
-        with contextlib.closing(reem.RedisInterface(server, timeout=60)) as interface:
-            shared = reem.KeyValueStore(interface)["shared"]
-            for step in range(CHANGES):
-                shared["sum"] += 1
-                shared["of"][f"c{number}"] = np.full(4, step) if step % 3 == 0 else step
-                shared["list"].append([number, step])
-
-    def on_a_loop(number):
-        async def run():
-            async with reem_async.RedisInterface(server, timeout=60) as interface:
-                shared = reem_async.KeyValueStore(interface)["shared"]
-                for step in range(CHANGES):
-                    await asyncio.gather(
-                        shared["sum"].increment(1),
-                        shared["of"][f"c{number}"].write(np.full(4, step) if step % 3 == 0 else step),
-                        shared["list"].append([number, step]),
-                    )
-
-        asyncio.run(run())
-
-    both = [blocking, on_a_loop]
-    run_all([lambda number=number: both[number % 2](number) for number in range(CLIENTS)])
-    value = orjson.loads(text_of(raw, "shared"))
-    assert value["sum"] == CLIENTS * CHANGES
-    for number in range(CLIENTS):
-        assert sorted(step for who, step in value["list"] if who == number) == list(range(CHANGES))
-    check_no_orphans(raw, "shared")
-
-
-@pytest.mark.parametrize("name", FRONTS)
-def test_a_broken_connection_leaves_a_change_done_once_or_not_at_all(server, raw, name):
-    """Connections are killed all the while; whoever was told that his call was lost has changed it at most once."""
-    with contextlib.closing(FRONTS[name](server.url)) as front:
-        front.write(["torn"], {"n": {str(number): 0 for number in range(CLIENTS)}, "a": {}})
-    done, lost, over = [0] * CLIENTS, [0] * CLIENTS, threading.Event()
-    ready = threading.Barrier(CLIENTS + 1)
-
-    def change(number):
-        with contextlib.closing(FRONTS[name](server.url)) as front:
-            ready.wait(30)
-            for step in range(CHANGES):
-                try:
-                    front.write(["torn", "a", str(number)], np.full(3, step))
-                    front.increment(["torn", "n", str(number)], 1)
-                    done[number] += 1
-                except reem.ConnectionLost:
-                    lost[number] += 1
-                except (reem.NotConnected, reem.PartialWrite):  # nothing, or the array alone, was applied
-                    continue
-
-    def kill():
-        ready.wait(30)
-        while not over.wait(0.01):
-            raw.client_kill_filter(_type="normal", skipme=True)
-
-    killer = threading.Thread(target=kill)
-    killer.start()
-    try:
-        run_all([lambda number=number: change(number) for number in range(CLIENTS)])
-    finally:
-        over.set()
-        killer.join()
-    with contextlib.closing(FRONTS[name](server.url)) as front:
-        for number in range(CLIENTS):
-            counted = front.read(["torn", "n", str(number)])
-            assert done[number] <= counted <= done[number] + lost[number]
-            front.write(["torn", "a", str(number)], np.zeros(2))
-        assert sum(lost) > 0
-    check_no_orphans(raw, "torn")
-
-
-def run_all(works):
-    """Run all at the same time; raises what any raised."""
-    failed = []
-
-    def guarded(work):
-        try:
-            work()
-        except BaseException as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=guarded, args=(work,)) for work in works]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(1200)
-    if failed:
-        raise failed[0]
 
 
 async def test_a_cancelled_change_is_done_once_or_not_at_all(server):
@@ -501,36 +386,6 @@ def test_what_others_have_changed_meanwhile_is_tried_again():
     with pytest.raises(StopIteration) as end:
         steps.send([b"OK", b"QUEUED", None])
     assert end.value.value is None
-
-
-def test_a_large_array_gets_through_beside_a_busy_writer(server, raw):
-    """It is sent ahead, or the other one would be first each time."""
-    with (
-        contextlib.closing(reem.RedisInterface(server, timeout=30)) as one,
-        contextlib.closing(reem.RedisInterface(server)) as two,
-    ):
-        mine, theirs = reem.KeyValueStore(one)["busy"], reem.KeyValueStore(two)["busy"]
-        reem.KeyValueStore(one)["busy"] = {"n": 0}
-        over, count = threading.Event(), 0
-
-        def write():
-            nonlocal count
-            while not over.is_set():
-                theirs["n"] = count
-                count += 1
-
-        busy = threading.Thread(target=write)
-        busy.start()
-        try:
-            for number in range(5):
-                mine["image"] = np.full(1 << 20, number)
-        finally:
-            over.set()
-            busy.join()
-        value = mine.read()
-        assert value["n"] == count - 1
-        assert_same(value["image"], np.full(1 << 20, 4))
-    check_no_orphans(raw, "busy")
 
 
 def test_a_large_text_is_written_though_somebody_was_first(server, raw, monkeypatch):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import weakref
 
 import hypothesis.strategies as st
 import pytest
-from clusterkit import owner, raw_of
+from clusterkit import on_each_node, raw_of
 from conftest import Keys, aeventually
 from hypothesis import given, settings
 
@@ -179,18 +178,6 @@ async def test_a_listener_that_is_gone_is_told_nothing():
 
 
 # --- on a real cluster -------------------------------------------------
-
-
-def on_each_node(cluster, key, count):
-    """So many new names for each node."""
-    found = {node.port: [] for node in cluster.nodes}
-    numbers = itertools.count()
-    while min(map(len, found.values())) < count:
-        name = key(f"k{next(numbers)}")
-        there = found[owner(cluster, name).port]
-        if len(there) < count:
-            there.append(name)
-    return [name for names in found.values() for name in names]
 
 
 @contextlib.asynccontextmanager

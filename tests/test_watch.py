@@ -10,13 +10,12 @@ import logging
 import numpy as np
 import pytest
 from clusterkit import Move, clients_of
-from conftest import FRONTS, PATIENCE, RawCluster, aeventually, assert_same, commands_run
+from conftest import FRONTS, PATIENCE, Loop, RawCluster, aeventually, assert_same, commands_run
 from own_servers import Configured, free_port, program
 
 import reem
 import reem_async
 from reem_async import Every, Last
-from reem_async.concurrency.queues import EMPTY
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
@@ -24,50 +23,18 @@ IMAGE = np.arange(10_000, dtype=np.float64).reshape(100, 100)
 """80 kB: over a connection of its own."""
 
 
-class Watching:
-    """A watch of either front, update by update."""
-
-    def __init__(self, front, path, **options):
-        self.front = front
-        self.watch = front.at(path).watch(Last(1000), **options)
-        self.wait(self.watch.listen)
-
-    def wait(self, call):
-        result = call()
-        return self.front.run(result) if hasattr(self.front, "run") else result
-
-    async def _next(self):
-        return await asyncio.wait_for(anext(self.watch), PATIENCE)
-
-    def next(self):
-        """The next update, waited for."""
-        if hasattr(self.front, "run"):
-            return self.front.run(self._next())
-        queue, found = self.watch._core.queue, []
-
-        async def taken():
-            await aeventually(lambda: (item := queue.take()) is not EMPTY and (found.append(item) or True))
-
-        asyncio.run(taken())
-        return found[0]
-
-    def told(self):
-        """What the next update says: origin, path, value and whether something is gone."""
-        update = self.next()
-        return str(update.origin), update.path, update.value, update.deleted
-
-    def close(self):
-        self.wait(self.watch.close)
-
-
 @pytest.fixture
 def watching(front):
     with contextlib.ExitStack() as stack:
 
         def begin(path, **options):
-            return stack.enter_context(contextlib.closing(Watching(front, path, **options)))
+            return stack.enter_context(contextlib.closing(watched(front, path, **options)))
 
         yield begin
+
+
+def watched(front, path, **options):
+    return Loop(front, front.at(path).watch(Last(1000), **options))
 
 
 def test_what_anybody_stores_is_told_as_what_it_led_to(front, watching, raw, kvs, key):
@@ -254,28 +221,18 @@ def test_who_may_not_track_hears_what_is_published_and_is_warned_once(kind, capl
     """The warning says which right it is."""
     with EmbeddedServer() as server, clients_of([server]) as (raw,):
         raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-client|tracking")
-        front = FRONTS[kind](f"redis://robot:pw@127.0.0.1:{server.port}")
-        with contextlib.closing(front), caplog.at_level(logging.WARNING, "reem.subscribe"):
-            watch, other = Watching(front, ("foo",)), Watching(front, ("bar",))
+        url = f"redis://robot:pw@127.0.0.1:{server.port}"
+        front, space = FRONTS[kind](url), FRONTS[kind](server.url, "PublishSpace")
+        with contextlib.closing(front), contextlib.closing(space), caplog.at_level(logging.WARNING, "reem.subscribe"):
+            watch, other = watched(front, ("foo",)), watched(front, ("bar",))
             front.write(("foo",), {"a": 1})
-            publish(front, "foo", "a", 2)
+            space.write(("foo", "a"), 2)
             update = watch.next()
             assert (update.origin, update.data) == ("published", {"a": 2})
             watch.close()
             other.close()
         (warning,) = [record.getMessage() for record in caplog.records if record.name == "reem.subscribe"]
         assert "client|tracking" in warning
-
-
-def publish(front, *path_and_value):
-    """Write through a PublishSpace of the same interface."""
-    *path, value = path_and_value
-    package = reem_async if hasattr(front, "run") else reem
-    space = package.PublishSpace(front.interface)
-    if package is reem:
-        space[path[0]][path[1]] = value
-    else:
-        front.run(space[path[0]][path[1]].write(value))
 
 
 def test_a_restart_without_data_is_told_as_a_gap_and_that_all_is_gone():
@@ -360,31 +317,13 @@ async def test_what_is_pushed_and_is_no_invalidation_is_counted(ainterface, akvs
 
 
 @pytest.mark.parametrize("kind", list(FRONTS))
-def test_in_a_cluster_the_node_of_the_key_tells(kind, cluster):
-    """Keys on every node, arrays too."""
-    front = FRONTS[kind](cluster.url)
-    with contextlib.closing(front):
-        names = [f"watched{number}" for number in range(8)]
-        watches = [Watching(front, (name,)) for name in names]
-        for name, watch in zip(names, watches, strict=True):
-            front.write((name,), {"n": 1, "image": IMAGE})
-            update = watch.next()
-            assert_same(update.data, {"n": 1, "image": IMAGE})
-            front.write((name, "n"), 2)
-            assert watch.told() == ("stored", f"{name}.n", 2, False)
-            front.delete((name,))
-            assert watch.next().deleted
-            watch.close()
-
-
-@pytest.mark.parametrize("kind", list(FRONTS))
 def test_a_slot_that_moves_is_told_as_a_gap_and_stores_are_told_from_its_new_node(kind, cluster):
     """What is stored while it moves is not lost."""
     front = FRONTS[kind](cluster.url)
     name = "moving-watch"
     with contextlib.closing(front):
         front.write((name,), {"n": 1, "image": IMAGE})
-        watch = Watching(front, (name,))
+        watch = watched(front, (name,))
         assert watch.next().initial
         slot = Move(cluster, name)
         slot.begin()

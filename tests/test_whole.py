@@ -8,10 +8,10 @@ import signal
 
 import pytest
 import redis
-from clusterkit import Move, owner
+from clusterkit import Move, on_each_node, owner
 from conftest import aeventually
 from own_servers import liar
-from test_reorder import hearing, on_each_node
+from test_reorder import hearing
 
 import reem_async
 from reem_async.errors import ClusterNode, NotConnected
