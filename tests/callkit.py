@@ -1,7 +1,5 @@
 """Every kind of call that changes something, for tests that try them all."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from reem_async.errors import PathRefused

@@ -1,7 +1,5 @@
 """Changing a real cluster under a test: moving slots, killing primaries, looking into one node."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json
@@ -21,7 +19,6 @@ def slot_of(key):
 
 
 def raw_of(node):
-    """A plain client of one node."""
     return redis.Redis(port=node.port, decode_responses=True)
 
 
@@ -94,7 +91,6 @@ class Move:
         return self
 
     def take(self, *keys):
-        """Move these keys."""
         with raw_of(self.source) as client:
             for key in keys:
                 client.execute_command("MIGRATE", "127.0.0.1", self.target.port, key, 0, 5000)

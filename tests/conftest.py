@@ -10,8 +10,6 @@ that a test starts has the JSON module. It is not flushed: every test
 names its keys through the `key` fixture, and what carries its prefix is unlinked.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import operator
@@ -86,7 +84,6 @@ def _container():
 
 @pytest.fixture(scope="session")
 def cluster():
-    """A cluster of three primaries."""
     from reem_async.server.cluster import EmbeddedCluster
 
     with EmbeddedCluster(replicas=0) as running:
@@ -95,7 +92,6 @@ def cluster():
 
 @pytest.fixture(scope="session")
 def server_url(request):
-    """Where the server of this test run listens."""
     given = os.environ.get("REEM_TEST_URL")
     if given:
         yield given
@@ -235,7 +231,6 @@ class RawCluster(redis.RedisCluster):
 
 @pytest.fixture(scope="session")
 def raw(server_url):
-    """A plain client, to look behind the scenes."""
     if server_url.startswith("redis+cluster://"):
         first = server_url.replace("redis+cluster://", "redis://").split(",")[0]
         with contextlib.closing(RawCluster.from_url(first, decode_responses=True)) as client:
@@ -246,7 +241,6 @@ def raw(server_url):
 
 
 def url_of_user(url, name, password):
-    """The address of the server for another user."""
     scheme, _, rest = url.partition("://")
     return f"{scheme}://{name}:{password}@{rest.rpartition('@')[2]}"
 
@@ -326,7 +320,6 @@ async def binterface(server_url):
 
 @pytest.fixture
 def file(tmp_path):
-    """Where a recording goes."""
     return tmp_path / "run.mcap"
 
 
@@ -512,7 +505,6 @@ def open_front(request, server_url, key):
 
 @pytest.fixture
 def front(open_front):
-    """Either front with the default options."""
     return open_front()
 
 

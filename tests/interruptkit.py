@@ -7,8 +7,6 @@ no reply reaches another call; nothing crashes. A call that has not ended in 15 
 threads. Without a URL it runs against an embedded server.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import faulthandler

@@ -1,7 +1,5 @@
 """A writer, a reader, a counter and mirrors at work, and what must hold of them whatever happens to the servers."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import threading
@@ -119,7 +117,6 @@ class Load:
         self.torn += not (value["image"] == value["n"]).all()
 
     def _count(self):
-        """Count, on a thread of the blocking front."""
         with contextlib.closing(reem.RedisInterface(self.host)) as interface:
             kvs = reem.KeyValueStore(interface)
             while not self.stopping.is_set():

@@ -1,7 +1,5 @@
 """Programs for test_local_processes.py, which compares what they say: `python tests/localkit.py NAME URL KEY ...`."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import os
@@ -28,7 +26,6 @@ def until(condition):
 
 
 def frame(n, items=30_000):
-    """An image whose items all say whose it is."""
     return {"n": n, "image": np.full(items, float(n))}
 
 
@@ -148,8 +145,6 @@ def fork_publisher(url, key):
     say("parent:", in_slot(pair.publish(1)["image"]), is_whole(pair.mirror.value()))
 
 
-# --- the end of the interpreter ---------------------------------------------------------------------
-
 KEPT = []
 """What is alive until the interpreter clears its modules."""
 
@@ -188,9 +183,6 @@ def exit_in_thread(url, key):
 EXITS = [name for name in dict(globals()) if name.startswith("exit_")]
 
 
-# --- another user -----------------------------------------------------------------------------------
-
-
 def another_user(url, key, user):
     """Follow as somebody else, with a look at where the memory is."""
     with reem.RedisInterface(url) as interface:  # what is imported late is where root alone may look
@@ -211,9 +203,6 @@ def another_user(url, key, user):
             os.close(os.open(f"/proc/{process}/fd/{descriptor}", os.O_RDONLY))
         except PermissionError:
             say("refused")
-
-
-# --- kill -9 ----------------------------------------------------------------------------------------
 
 
 def die():

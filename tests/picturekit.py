@@ -5,8 +5,6 @@ The quick version is in test_browser_pictures.py. All of it, with the defaults o
     .venv/bin/python tests/picturekit.py
 """
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json
@@ -96,7 +94,6 @@ def main():
 
 
 def resident():
-    """Return how many bytes of memory this process has."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 

@@ -1,7 +1,5 @@
 """Generated JSON commands, done by the module of a server and by REEM's own text; and clients for plain servers."""
 
-from __future__ import annotations
-
 import argparse
 import random
 import re
@@ -227,7 +225,6 @@ def _as_text(reply):
 
 
 def main():
-    """Compare many: python -m tests.plainkit --count 100000 --seed 1."""
     from reem_async.server import EmbeddedServer
 
     options = argparse.ArgumentParser()

@@ -1,7 +1,5 @@
 """A primary, a replica and three sentinels on loopback, for tests."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import subprocess
@@ -61,15 +59,12 @@ class Watched:
         return False
 
     def primary(self):
-        """The port that the sentinels name now."""
         return self.sentinels[0].sentinel_get_master_addr_by_name(SERVICE)[1]
 
     def now(self):
-        """A plain client of the primary."""
         return self._raw(master=True)
 
     def standby(self):
-        """A plain client of the replica."""
         return self._raw(master=False)
 
     def _raw(self, master):
@@ -97,7 +92,6 @@ class Watched:
         return False
 
     def pid(self, port):
-        """The process that listens there."""
         return next(server.pid for server in self.servers if server.port == port)
 
 

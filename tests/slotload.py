@@ -62,7 +62,6 @@ class Worker:
             await asyncio.sleep(self.random.random() * 0.006)
 
     async def step(self):
-        """Make one call; return the model after it."""
         raise NotImplementedError
 
     def array(self):
@@ -70,16 +69,12 @@ class Worker:
 
 
 class Counts(Worker):
-    """Adds to an integer."""
-
     async def step(self):
         await self.at.increment(1)
         return self.model + 1
 
 
 class Calculates(Worker):
-    """Adds to a float, and divides it."""
-
     start = 0.1
 
     async def step(self):
@@ -138,8 +133,6 @@ class Comes(Worker):
 
 
 class Edits(Worker):
-    """Reads, changes and writes back."""
-
     published = False
     start = {"n": 0, "image": np.zeros(4), "l": [np.zeros(1)]}  # noqa: RUF012
 
@@ -152,14 +145,10 @@ class Edits(Worker):
 
 
 class StoresLists(Lists):
-    """The same, without telling anybody."""
-
     published = False
 
 
 class Stores(Comes):
-    """The same, without telling anybody."""
-
     published = False
 
 
@@ -178,7 +167,6 @@ class Blocking:
         self._host, self._stopping = host, stopping
 
     def run(self):
-        """Work until it is to stop."""
         with reem.RedisInterface(self._host, timeout=2) as interface:
             at = reem.PublishSpace(interface)[KEY]["thread"]
             while not self._stopping.is_set():

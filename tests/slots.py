@@ -73,19 +73,16 @@ class Party:
         os._exit(0)
 
     def kill(self) -> None:
-        """End it at once, and begin anew."""
         self._process.kill()
         self.end()
         self._begin()
 
     def ask(self, what: Any) -> Any:
-        """Send it something and return its answer."""
         self.pipe.send(what)
         assert self.pipe.poll(PATIENCE), "a party does not answer"
         return self.pipe.recv()
 
     def stop(self, signal_number: int) -> None:
-        """Send it a signal."""
         os.kill(self._process.pid or 0, signal_number)
 
     def end(self) -> int | None:
@@ -120,12 +117,10 @@ def frame(rng: random.Random, source: np.ndarray) -> list[Any]:
 
 
 def is_whole(view: memoryview) -> bool:
-    """Return whether a frame is as it was made."""
     return zlib.crc32(view[8:]).to_bytes(8, "little") == view[:8]
 
 
 def open_files() -> int:
-    """Return how many descriptors this process has."""
     gc.collect()
     return len(os.listdir("/proc/self/fd"))
 

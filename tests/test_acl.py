@@ -1,7 +1,5 @@
 """The sample files in deploy/: users with only the rights REEM needs can do all of it, and nothing else."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import subprocess
@@ -24,7 +22,6 @@ ALWAYS = {"auth", "hello", "quit", "reset"}
 
 @pytest.fixture(scope="module")
 def secrets(tmp_path_factory):
-    """The folder that deploy/prepare.sh fills."""
     folder = tmp_path_factory.mktemp("deploy") / "secrets"
     subprocess.run([ROOT / "deploy/prepare.sh", "-o", folder, "localhost", "127.0.0.1"], check=True, timeout=60)
     if PLAIN:  # as SECURITY.md says
@@ -53,7 +50,6 @@ def admin(server, secrets):
 
 @pytest.fixture(scope="module")
 def urls(server, secrets):
-    """The addresses by which each user logs in."""
     users = ("admin", "robot", "watcher")
     return {user: server.url.replace("//", f"//{user}:{password(secrets, user)}@") for user in users}
 
@@ -67,12 +63,8 @@ def nothing_denied(admin):
     assert not denied, denied
 
 
-# --- those who only read -------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def stored(urls):
-    """Something to read."""
     with reem.RedisInterface(urls["robot"], namespace="robot1:") as interface:
         kvs = reem.KeyValueStore(interface)
         kvs["c"] = {"n": 1, "l": [1, 2], "image": np.arange(3), "b": b"x"}
@@ -126,9 +118,6 @@ def test_a_watcher_changes_nothing(urls, stored, admin, name):
                     call()
     assert {key: admin.dump(key) for key in admin.scan_iter() if not key.endswith(":last")} == before
     admin.execute_command("ACL", "LOG", "RESET")
-
-
-# --- everything else is refused ----------------------------------------------------------------------------
 
 
 def every_command(admin):
@@ -225,9 +214,6 @@ def test_another_namespace(tmp_path, namespace):
             if namespace:
                 with pytest.raises(reem.NotAllowed):
                     reem.KeyValueStore(interface)["foo"].read()
-
-
-# --- the files around it ---------------------------------------------------------------------------------------
 
 
 def test_a_server_takes_the_sample_configuration(secrets):

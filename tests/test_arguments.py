@@ -1,7 +1,5 @@
 """A wrong argument is refused where it is given, and what goes wrong in one listener costs no other."""
 
-from __future__ import annotations
-
 import logging
 
 import numpy as np
@@ -72,8 +70,6 @@ CALLS = {
 
 
 class Blocking:
-    """What the table calls, in the blocking front."""
-
     pkg, recording_module = reem, reem.recording
 
     def __init__(self, interface, key, file):
@@ -83,7 +79,6 @@ class Blocking:
         self.run(self.mirror.listen())
 
     def run(self, result):
-        """Nothing is left to be done."""
         return result
 
     def recorder(self, patterns=("*",), **options):
@@ -92,11 +87,9 @@ class Blocking:
         return self.recording_module.Recorder(self.interface, patterns, **options)
 
     def monitor(self, *arguments, **options):
-        """A monitor; there is none in the blocking front."""
         return reem_async.monitor.Monitor(self.interface._followers, *arguments, **options)
 
     def close(self):
-        """End the mirror."""
         self.run(self.mirror.close())
 
 
@@ -110,11 +103,9 @@ class Async(Blocking):
         super().__init__(interface._followers, key, file)
 
     def run(self, result):
-        """Wait for what was asked."""
         return self._portal._wait(result)
 
     def monitor(self, *arguments, **options):
-        """A monitor."""
         return reem_async.monitor.Monitor(self.interface, *arguments, **options)
 
 
@@ -155,7 +146,6 @@ class Failing(reem.Newest):
 
     @property
     def bound(self):
-        """What the queue asks for with each update."""
         if self.broken:
             raise ZeroDivisionError("broken policy")
         return 1

@@ -3,8 +3,6 @@
 The full promise (20,000 reads, 8 x 2,000 changes of shape) runs with REEM_TEST_EXAMPLES=100000.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import random
@@ -25,7 +23,6 @@ SMALL, FULL = (48, 64, 3), (640, 480, 3)
 
 
 def frame(stamp, shape):
-    """An image that shows its stamp in every element."""
     return {
         "stamp": float(stamp),
         "image": np.full(shape, float(stamp)),
@@ -309,7 +306,6 @@ def _shape(rng, n):
 
 
 def _numbers(value):
-    """All numbers in a value."""
     if isinstance(value, np.ndarray):
         return {int(number) for number in value.ravel()}
     if isinstance(value, dict):
@@ -501,7 +497,6 @@ async def test_an_array_that_changes_after_a_cancelled_write_is_not_on_its_way_a
 
 
 async def test_calls_that_queue_behind_a_cancelled_large_publish_go_on(akvs, apspace, key):
-    """In whichever order they came."""
     large = {"count": 0, "image": np.zeros(1_000_000)}
     await apspace[key()].write(large)
     for number in range(12):

@@ -115,7 +115,6 @@ if hasattr(np.dtypes, "StringDType"):
 
 @pytest.fixture
 def stored(front, key):
-    """A document that must stay as it is."""
     document = {"outer": {"inner": [0, 1, 2]}, "n": 1, "image": np.arange(4)}
     front.write([key()], document)
     yield document
@@ -325,7 +324,6 @@ def test_an_async_interface_in_a_second_loop_says_so(server_url, key):
 
 
 def test_a_wrong_option_is_a_type_error():
-    """A misspelt option is not silently dropped."""
     with pytest.raises(TypeError):
         reem.RedisInterface("localhost", no_such_option=1).initialize()
 

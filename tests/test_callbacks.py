@@ -1,7 +1,5 @@
 """The calls of callback subscribers on an event loop: where, in which order, and for how long they are made."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import errno
@@ -177,7 +175,6 @@ async def test_a_function_that_returns_something_to_await_is_awaited(ainterface,
 
 
 async def test_a_subscriber_that_nobody_holds_works_until_its_interface_is_closed(server_url, apspace, key):
-    """And is gone then."""
     told = []
 
     class Told:
@@ -197,7 +194,6 @@ async def test_a_subscriber_that_nobody_holds_works_until_its_interface_is_close
 
 
 async def test_a_callback_sees_mirrors_of_the_same_key_as_they_are_after_the_update(ainterface, apspace, key):
-    """Whichever was made first."""
     seen = []
     before = SilentSubscriber(key(), ainterface)
     await before.listen()

@@ -3,8 +3,6 @@
 `python -m tests.chaos` runs it at full size.
 """
 
-from __future__ import annotations
-
 import os
 import time
 

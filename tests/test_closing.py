@@ -1,7 +1,5 @@
 """Closing ends all that waits: loops, callbacks and waits of both fronts, whatever the event loop is busy with."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import sys
@@ -16,8 +14,6 @@ from reem_async.errors import InterfaceClosed, Stale
 
 
 class Waiting:
-    """A loop in a thread of its own."""
-
     def __init__(self, updates):
         self.taken = []
         self.thread = threading.Thread(target=self._loop, args=(updates,), daemon=True)
@@ -117,7 +113,6 @@ class Slow(reem.ships.BytesShip):
 
 
 async def test_loops_do_not_wait_for_a_task_that_is_slow_to_end(server_url, key):
-    """They end before it."""
     ship = Slow(0.5)
     interface = reem_async.RedisInterface(server_url, ships=[ship], local="off")
     store = reem_async.KeyValueStore(interface)
@@ -155,7 +150,6 @@ def test_a_task_that_is_slow_to_end_keeps_no_connection_open(server_url, key):
 
 
 def test_a_watch_that_is_closed_after_its_interface_ends(server_url, key):
-    """Also if it has never begun."""
     interface = reem.RedisInterface(server_url)
     watch = reem.KeyValueStore(interface)[key()].watch()
     interface.close()
@@ -220,7 +214,6 @@ async def test_closing_the_interface_ends_a_wait_for_a_mirror(server_url, key):
 
 
 def test_closing_the_interface_ends_a_wait_for_a_mirror_in_a_thread(server_url, key):
-    """As it does in asyncio."""
     interface = reem.RedisInterface(server_url)
     mirror = reem.KeyValueStore(interface)[key()].mirror()
     mirror.listen()

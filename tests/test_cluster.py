@@ -1,7 +1,5 @@
 """A cluster of real servers: where things go, what is refused, and what a slot on its way does to calls."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import pickle
@@ -31,9 +29,6 @@ def front(request, cluster):
     opened.close()
 
 
-# --- the embedded cluster -------------------------------------------------
-
-
 def test_a_cluster_takes_writes_when_it_has_started_and_is_gone_when_it_has_stopped():
     """Primaries first, each replica known; nothing is left over."""
     with EmbeddedCluster(primaries=3, replicas=1, node_timeout=1.0) as cluster:
@@ -52,7 +47,6 @@ def test_a_cluster_takes_writes_when_it_has_started_and_is_gone_when_it_has_stop
 
 
 def test_a_cluster_ends_with_its_owner_however_it_ends():
-    """Killed -9, all nodes go."""
     code = """
 import os, signal
 from reem_async.server.cluster import EmbeddedCluster
@@ -97,16 +91,11 @@ print(*[node.pid for node in cluster.nodes], flush=True)
 
 @pytest.mark.parametrize("wrong", [{"primaries": 2}, {"replicas": 6}, {"node_timeout": 0}])
 def test_a_cluster_that_cannot_be_is_refused(wrong):
-    """Before anything is started."""
     with pytest.raises(BadValue, match=next(iter(wrong))):
         EmbeddedCluster(**wrong)
 
 
-# --- addresses -------------------------------------------------
-
-
 def test_the_password_is_not_shown(cluster):
-    """Neither as hostname nor in errors."""
     interface = reem.RedisInterface("redis+cluster://user:secret@127.0.0.1:1,127.0.0.1:2")
     assert interface.hostname == "127.0.0.1:1,127.0.0.1:2"
     with pytest.raises(NotConnected) as refusal:
@@ -127,7 +116,6 @@ def test_one_server_is_no_cluster(server_url):
 
 
 def test_one_node_leads_to_all_and_an_interface_can_be_pickled(cluster, key):
-    """The others are asked for."""
     with reem.RedisInterface(f"redis+cluster://127.0.0.1:{cluster.nodes[1].port}") as interface:
         for name in on_each_node(cluster, key):
             reem.KeyValueStore(interface)[name] = name
@@ -135,11 +123,7 @@ def test_one_node_leads_to_all_and_an_interface_can_be_pickled(cluster, key):
         assert copied.read() == name
 
 
-# --- everything is where it belongs -------------------------------------------------
-
-
 def test_keys_go_to_the_node_of_their_slot_and_all_of_a_key_to_one(front, cluster, key):
-    """Document, arrays and registry."""
     for name in on_each_node(cluster, key):
         front.write((name,), {"image": np.arange(10), "n": 1})
         with raw_of(owner(cluster, name)) as raw:
@@ -148,7 +132,6 @@ def test_keys_go_to_the_node_of_their_slot_and_all_of_a_key_to_one(front, cluste
 
 
 async def test_all_nodes_are_listed(cluster, key):
-    """Each key once."""
     async with reem_async.RedisInterface(cluster) as interface:
         there = {key(f"n{number}") for number in range(30)}
         for name in there:
@@ -159,15 +142,11 @@ async def test_all_nodes_are_listed(cluster, key):
 
 
 def test_a_foreign_type_is_named_by_the_node_that_has_it(front, cluster, key):
-    """The error needs a second question."""
     for name in on_each_node(cluster, key):
         with raw_of(owner(cluster, name)) as raw:
             raw.set(name, "x")
         with pytest.raises(WrongKind, match="of type string"):
             front.read((name,))
-
-
-# --- a slot on its way -------------------------------------------------
 
 
 @pytest.fixture
@@ -182,7 +161,6 @@ def moving(cluster, front, key):
 
 
 def test_what_has_left_is_found_where_it_went(front, moving):
-    """Read, written, counted, and read again."""
     moving.take(*moving.all_keys())
     assert front.read((moving.name, "n")) == 1
     assert front.read((moving.name, "image")).tolist() == [0, 0, 0, 0]
@@ -251,7 +229,6 @@ def test_nodes_that_do_not_agree_are_named_as_the_reason(front, cluster, key):
 
 
 def test_an_edit_goes_to_where_the_key_is_now(cluster, key):
-    """It watches, which needs one connection."""
     name = key()
     with reem.RedisInterface(cluster) as interface:
         kvs = reem.KeyValueStore(interface)
@@ -321,9 +298,6 @@ async def test_leaving_and_coming_back_to_channels_of_one_node_keeps_the_connect
             await mirror.close()
 
 
-# --- many keys -------------------------------------------------
-
-
 async def test_a_key_that_is_found_late_has_a_gap(cluster, key, monkeypatch):
     """As when it was made, and published to, by somebody who had done so before."""
     monkeypatch.setattr("reem_async.session._FRESH", 0.0)  # so long all nodes are told
@@ -349,6 +323,5 @@ async def test_a_key_that_is_found_late_has_a_gap(cluster, key, monkeypatch):
 
 
 def test_slots_are_those_of_the_servers(cluster, key):
-    """Of names with every kind of character."""
     for name in (key("a b"), key("ü"), key(":x"), key("\n")):
         assert int(cluster.nodes[0].say("CLUSTER", "KEYSLOT", name)) == slot_of(name)

@@ -1,7 +1,5 @@
 """What the servers of a cluster may do while programs work: slots move back and forth, a primary is killed."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import socket
@@ -88,8 +86,6 @@ async def test_calls_in_asyncio_share_what_a_look_for_a_node_that_answers_came_t
 
 @pytest.mark.alone
 def test_blocking_calls_share_what_a_look_for_a_node_that_answers_came_to(silent):
-    """Likewise."""
-
     def read(_):
         with pytest.raises(NotConnected, match="no node of the cluster answers"):
             store["a"].read()

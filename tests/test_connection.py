@@ -1,7 +1,5 @@
 """The connection: its state, calls that stand still, what a stopped or restarted server does."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -315,7 +313,6 @@ def test_a_blocking_call_that_finds_another_connection_has_lost_nothing(server):
 
 
 def test_a_blocking_call_that_fails_leaves_no_state_behind_that_the_next_one_does_not_mend(server):
-    """However many connections wait for calls."""
     with reem.RedisInterface(server, timeout=0.3) as interface:
         transport = interface._direct.session.transport
         for line in [transport._take(), transport._take()]:
@@ -329,7 +326,6 @@ def test_a_blocking_call_that_fails_leaves_no_state_behind_that_the_next_one_doe
 
 @pytest.mark.alone
 async def test_a_stopped_server_is_noticed_by_who_only_follows(server):
-    """Nobody calls anything: the heartbeat finds out."""
     async with reem_async.RedisInterface(server, timeout=0.5) as interface:
         store, space = reem_async.KeyValueStore(interface), reem_async.PublishSpace(interface)
         await space["foo"].write(1)

@@ -1,7 +1,5 @@
 """Connections that break, stand still or are broken off: no call waits longer, and none of them stays."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -29,20 +27,17 @@ LARGE = np.zeros(1_000_000)
 
 @pytest.fixture
 def server():
-    """A server of the test's own, to be stopped."""
     with EmbeddedServer() as own:
         yield own
 
 
 @pytest.fixture
 def clients(server):
-    """How many are connected to it."""
     with redis.Redis(port=server.port) as admin:
         yield lambda: int(admin.info("clients")["connected_clients"]) - 1
 
 
 def sockets():
-    """How many sockets this process has."""
     found = 0
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
@@ -221,7 +216,6 @@ async def test_close_beside_a_server_that_stands_still_keeps_no_socket(server):
 
 
 async def test_a_way_that_is_not_used_any_more_is_closed_once_nothing_is_due_on_it(server, clients):
-    """A primary of before, mostly."""
     interface = reem_async.RedisInterface(server)
     transport = interface.session.transport
     await interface.initialize()

@@ -1,7 +1,5 @@
 """Changes that look first end beside programs that never rest: applied, or with a Conflict that says what to do."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools
@@ -77,7 +75,6 @@ VALUE = {"busy": 0, "n": 8, "l": [1, 2]}
 
 
 def run(front, call, path):
-    """Make a call of either front."""
     result = CALLS[call](front.at(path))
     return front.run(result) if isinstance(front, FRONTS["asyncio"]) else result
 
@@ -188,7 +185,6 @@ async def test_an_update_that_others_are_always_faster_than_is_neither_outage_no
 
 
 async def test_a_cluster_says_so_too(cluster, monkeypatch):
-    """There all that is published is watched."""
     key = "contended"
     first = cluster.url.replace("redis+cluster://", "redis://").split(",")[0]
     with contextlib.closing(RawCluster.from_url(first, decode_responses=True)) as raw:

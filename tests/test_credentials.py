@@ -1,7 +1,5 @@
 """Passwords are never shown, and whoever can be overheard is told so; in both fronts."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import ssl
@@ -21,8 +19,6 @@ from reem_async.transport import options as options_module
 
 both = pytest.mark.parametrize("name", list(FRONTS))
 
-
-# --- credentials ---------------------------------------------------------------------------------------------
 
 PASSWORD = "p%41s@ word:%zz/+#"
 ENCODED = "p%2541s%40%20word%3A%25zz%2F%2B%23"
@@ -109,9 +105,6 @@ def test_a_password_in_the_place_of_a_host_is_refused_unseen():
         assert not shows(everything_shown(caught.value))
 
 
-# --- listeners ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def unwarned(monkeypatch):
     """As if nothing had been warned of yet."""
@@ -155,7 +148,6 @@ def test_tls_without_checking_who_answers_warns(unwarned):
 
 
 def test_the_warning_can_be_silenced(unwarned):
-    """As its text says."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", category=reem.InsecureConnection)
         reem.RedisInterface("robot.example")

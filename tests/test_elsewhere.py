@@ -1,7 +1,5 @@
 """What follows belongs to a process and an event loop: after a fork, or in a second loop, it begins anew or says so."""
 
-from __future__ import annotations
-
 import os
 
 import pytest
@@ -166,7 +164,6 @@ asyncio.run(asyncio.wait_for(second(), 20))
 
 
 def test_an_interface_of_an_event_loop_that_was_closed_can_be_closed_in_the_next(server_url, key):
-    """Though nothing is followed there."""
     done = python(ONLY_CLOSED, server_url, key(), flags=("-W", "ignore"))
     assert done.stdout == "True False\n", done.stderr
 

@@ -1,7 +1,5 @@
 """What people do with the command line says and does the same on a cluster and behind sentinels."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re
@@ -176,8 +174,6 @@ def _begun(space, heard):
 
 
 class Lines:
-    """What a process has printed until now."""
-
     def __init__(self, process):
         self._rows = []
         threading.Thread(target=self._read, args=(process.stdout,), daemon=True).start()

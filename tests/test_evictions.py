@@ -1,7 +1,5 @@
 """Subscribers that the server cuts off since they do not read: what they missed is told, number by number."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 import time

@@ -1,7 +1,5 @@
 """The last command of a program: whatever runs while the interpreter exits may still write and publish."""
 
-from __future__ import annotations
-
 import pytest
 from conftest import python
 

@@ -1,7 +1,5 @@
 """Top-level keys that expire, and arrays that no document refers to any more."""
 
-from __future__ import annotations
-
 import json
 import threading
 
@@ -95,12 +93,8 @@ def test_no_array_outlives_its_document_while_others_change_the_shape(interface,
     eventually(lambda: not left(raw, key))
 
 
-# --- what is left behind ---------------------------------------------------------------------------
-
-
 @pytest.fixture
 def own():
-    """A private server and a plain client of it."""
     with EmbeddedServer() as server, redis.Redis.from_url(server.url) as client:
         yield server.url, client
 

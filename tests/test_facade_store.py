@@ -1,7 +1,5 @@
 """The key-value store of `reem`: Python's own syntax, threads, processes, exit, programs with loops."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import gc
@@ -23,7 +21,6 @@ from reem import Conflict, KeyValueStore, RedisInterface
 
 
 def test_an_accessor_keeps_its_path(kvs, key):
-    """Going deeper from it leaves it alone."""
     kvs[key()] = {"x": {"foo": 3}}
     a = kvs[key()]
     b = a["x"]
@@ -76,7 +73,6 @@ def test_a_store_takes_the_address_itself(server_url, key):
 
 
 def test_leaving_a_with_block_closes_the_interface(server_url, key):
-    """Calls after it say so."""
     with RedisInterface(server_url) as interface:
         kvs = KeyValueStore(interface)
         kvs[key()] = 1
@@ -85,7 +81,6 @@ def test_leaving_a_with_block_closes_the_interface(server_url, key):
 
 
 def test_every_documented_name_is_where_the_manual_has_it():
-    """Module paths included."""
     import reem.connection
     import reem.datatypes
     import reem.errors
@@ -122,7 +117,6 @@ def test_low_level_writer_reader_and_publisher(interface, kvs, key, raw):
 
 
 def test_handles_can_be_pickled(kvs, pspace, interface, key):
-    """Stores, accessors, publish spaces and interfaces reconnect."""
     kvs[key()] = {"a": np.arange(3)}
     store, accessor, publishing, bare = (
         pickle.loads(pickle.dumps(it)) for it in (kvs, kvs[key()]["a"], pspace, interface)
@@ -164,7 +158,6 @@ def test_several_threads_share_one_interface(kvs, key, raw):
 
 
 def test_closing_while_other_threads_call_ends_their_calls_with_interface_closed(server_url, key):
-    """Not with a CancelledError, and none hangs."""
     for _ in range(5):
         interface = RedisInterface(server_url)
         kvs = KeyValueStore(interface)

@@ -1,7 +1,5 @@
 """Subscribing in `reem`: callbacks on threads of their own, and loops that block. `test_following.py` has the rest."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -19,8 +17,6 @@ from reem import (
     RedisInterface,
     SilentSubscriber,
 )
-
-# --- callbacks -------------------------------------------------------------------------------------
 
 
 def test_callbacks_run_on_a_thread_of_their_own_and_may_use_reem(interface, kvs, pspace, key):
@@ -105,11 +101,7 @@ def test_a_callback_may_close_its_own_subscriber(interface, pspace, key):
     assert seen == [1]
 
 
-# --- connections, processes and endings ------------------------------------------------------------
-
-
 def test_leaving_the_with_block_ends_the_callbacks(interface, pspace, key):
-    """And no thread of theirs is left."""
     heard = []
     before = set(threading.enumerate())
     with SilentSubscriber(key("warm"), interface):
@@ -124,7 +116,6 @@ def test_leaving_the_with_block_ends_the_callbacks(interface, pspace, key):
 
 
 def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):
-    """On a connection of its own."""
     kvs[key()] = 1
     with SilentSubscriber(key(), interface) as mirror:
         copy = pickle.loads(pickle.dumps(mirror))

@@ -1,7 +1,5 @@
 """Many robots in one place: a namespace for each, all of them watched at once, and a user for each."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import re
@@ -21,7 +19,6 @@ from reem_async.pubsub.monitor import Monitor
 
 @pytest.fixture(params=["server", "cluster"])
 def host(request):
-    """One server, and a cluster."""
     return request.getfixturevalue("server_url" if request.param == "server" else "cluster")
 
 
@@ -82,14 +79,11 @@ async def test_keys_of_the_same_name_are_counted_apart(host, key):
 
 @pytest.mark.parametrize("wrong", [3, "robots/{r1}:"])
 async def test_what_is_no_glob_of_namespaces_is_refused(server_url, wrong):
-    """Before anything is sent."""
     interface = reem_async.RedisInterface(server_url)
     with pytest.raises(BadType, match="namespaces="):
         Monitor(interface, namespaces=wrong)
     await interface.close()
 
-
-# --- users -------------------------------------------------
 
 USER = re.search(r"```text\nuser r1 (.*?)```", (ROOT / "docs/fleet.md").read_text(), re.DOTALL)
 """The rights of a robot's user in a cluster, from the documentation."""
@@ -141,9 +135,6 @@ def test_a_user_who_may_not_ask_for_the_layout_is_told_what_is_missing(robot_url
         reem.RedisInterface(robot_url, namespace="robots/r1:"),
     ):
         pass
-
-
-# --- compose files -------------------------------------------------
 
 
 @pytest.mark.parametrize(("file", "services"), [("cluster-compose.yaml", 7), ("sentinel-compose.yaml", 5)])

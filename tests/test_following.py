@@ -1,7 +1,5 @@
 """What subscribers of both fronts do: mirrors, callbacks and loops, each promise written once."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -45,9 +43,6 @@ def following(front):
         yield Following(front, stack)
 
 
-# --- the mirror ------------------------------------------------------------------------------------
-
-
 def test_reading_a_mirror_is_local_and_gives_copies(following, kvs, key, raw):
     """Plain calls that send nothing, and copies that may be changed."""
     kvs[key()] = {"number": 5, "l": [1]}
@@ -76,7 +71,6 @@ def test_a_mirror_cannot_be_written(following, kvs, key):
 
 
 def test_no_publish_after_listen_is_missed(following, pspace, key):
-    """By another client, at once."""
     for n in range(30):
         mirror = following.mirror(key(f"channel{n}"))
         pspace[key(f"channel{n}")] = {"n": n}
@@ -99,11 +93,7 @@ def test_large_updates_arrive_whole(following, server_url, key, local):
         assert_same(mirror["image"].read(), image)
 
 
-# --- channels --------------------------------------------------------------------------------------
-
-
 def test_foo_does_not_hear_of_foobar(following, pspace, key):
-    """Nor of anything that merely begins alike."""
     heard = []
     following.calls(key("foo"), lambda data, updated_path: heard.append(updated_path))
     for name in ("foobar", "fo", "foo bar", "foo:ships", "bar"):
@@ -117,7 +107,6 @@ def test_foo_does_not_hear_of_foobar(following, pspace, key):
 
 
 def test_foo_dot_bar_hears_of_itself_below_and_of_a_fresh_foo(following, pspace, key):
-    """And not of foo.other, nor of foo.barbar."""
     calls, expected = [], []
     pspace[key("foo")] = {"bar": {"x": 0}, "other": 0, "barbar": 0}
     following.calls(f"{key('foo')}.bar", lambda data, path: calls.append((data, path.removeprefix(key("foo")))))
@@ -136,9 +125,6 @@ def test_foo_dot_bar_hears_of_itself_below_and_of_a_fresh_foo(following, pspace,
             following.until(lambda: len(calls) >= len(expected))
     assert calls == expected
     following.until(lambda: mirror.value() == {"z": 3})
-
-
-# --- callbacks -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(params=["plain", "coroutine"])
@@ -174,7 +160,6 @@ def test_a_callback_gets_data_path_and_its_keyword_arguments(following, as_callb
 
 
 def test_an_exception_in_a_callback_is_logged_and_ends_nothing(following, as_callback, pspace, key, caplog):
-    """The next update is delivered."""
     seen = []
 
     def fail(data, updated_path):
@@ -189,9 +174,6 @@ def test_an_exception_in_a_callback_is_logged_and_ends_nothing(following, as_cal
         pspace[key()] = 2
         following.until(lambda: seen == [1, 2])
     assert any(record.exc_info and record.exc_info[0] is ZeroDivisionError for record in caplog.records)
-
-
-# --- loops -----------------------------------------------------------------------------------------
 
 
 def test_a_loop_begins_with_what_is_there_and_then_tells_every_update(following, kvs, pspace, key):
@@ -259,9 +241,6 @@ def test_every_one_beyond_its_bound_is_an_error(following, kvs, pspace, key):
         for _ in range(20):
             got += [update.data for update in following.take(updates)]
     assert got == list(range(5))
-
-
-# --- connections -----------------------------------------------------------------------------------
 
 
 def test_all_subscribers_of_an_interface_share_one_connection(following, kvs, pspace, key, raw):

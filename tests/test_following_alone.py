@@ -1,7 +1,5 @@
 """What ails one follower, or one key, and leaves the others of an interface alone: rights, strangers, cancellations."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -79,9 +77,6 @@ async def gathered(stack, stream):
     return told
 
 
-# --- what a ship has written that is lacking here
-
-
 async def test_a_value_of_a_ship_that_is_lacking_ends_nobodys_following(server, other):
     """Its place is remembered by who leaves it at the server; who wants it warns, and goes on with the next."""
     pub = reem_async.PublishSpace(other)
@@ -98,9 +93,6 @@ async def test_a_value_of_a_ship_that_is_lacking_ends_nobodys_following(server, 
             await pub["cam"].write({"n": 3})
             await aeventually(lambda: cam.value() == mirror.value() == {"n": 3})
         assert (interface.state, interface.unreadable) == ("connected", 1)
-
-
-# --- who is cancelled, or refused
 
 
 @pytest.fixture
@@ -167,9 +159,6 @@ async def test_a_channel_that_is_refused_keeps_no_other_from_being_followed(serv
             await following(interface, "b")
 
 
-# --- a server that is busy, or does not tell what is changed
-
-
 BUSY = """
 local function now() local t = redis.call('TIME'); return t[1] * 1000000 + t[2] end
 local begun = now(); while now() < begun + 400000 do end
@@ -213,9 +202,6 @@ async def test_who_may_not_touch_keys_is_warned_that_he_hears_of_no_store(server
         await reem_async.PublishSpace(other)["cam"]["n"].write(1)
         assert (await asyncio.wait_for(anext(watch), PATIENCE)).value == 1
     assert [record.message for record in caplog.records if "needs the right +type" in record.message]
-
-
-# --- one key of many
 
 
 @pytest.mark.parametrize("late", [False, True])

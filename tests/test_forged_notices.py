@@ -1,7 +1,5 @@
 """Anybody who may publish can send anything: one bad message costs at most itself, and what follows is told right."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -100,7 +98,6 @@ NO_KEYS = [b"{}:notices", b"{a{b}}:notices", b"{" + b"k" * 700 + b"}:notices", b
 
 @pytest.mark.parametrize("title", list(UNSOUND))
 def test_what_no_publisher_of_reem_writes_is_refused(title):
-    """Before anything is made of it."""
     notices._sound_path.cache_clear()  # of a path (1,) that another test has published, (1.0,) would be taken for it
     with pytest.raises(BadData):
         notices.decode(UNSOUND[title], SHIPS)
@@ -108,7 +105,6 @@ def test_what_no_publisher_of_reem_writes_is_refused(title):
 
 @pytest.mark.parametrize("title", list(SOUND))
 def test_what_a_publisher_could_have_written_is_read(title):
-    """It cannot be told from the truth."""
     notices.decode(SOUND[title], SHIPS)
 
 
@@ -187,7 +183,6 @@ def test_a_note_that_was_not_the_last_that_was_heard_shows_what_was_made_up():
 
 
 def test_an_update_that_comes_twice_is_known_again():
-    """Also when others came between."""
     heard = GapDetector()
     assert [heard.count(update("p", number)) for number in (1, 2, 2, 1, 3, 2)] == [0, 0, None, None, 0, None]
     assert heard.compare(b"p 3") == 0
@@ -244,7 +239,6 @@ class Crowd:
             self.owner.spublish(channel, payload)
 
     async def tell(self):
-        """Publish as REEM does, to two keys."""
         self.sent += 1
         for name in ("foo", "bar"):
             await self.space[name].write({"n": self.sent})
@@ -352,7 +346,6 @@ async def test_bad_messages_are_counted_and_said_once_for_each_key(server_url, a
 
 
 async def test_a_message_that_cannot_be_read_is_a_gap_of_its_key_alone(server_url, ainterface, key):
-    """Not of all that are watched."""
     if server_url.startswith("redis+cluster"):
         pytest.skip("what is told to all nodes is not told to those who follow a key")
     space, keys = reem_async.PublishSpace(ainterface), [key("foo"), key("bar")]
@@ -370,7 +363,6 @@ async def test_a_message_that_cannot_be_read_is_a_gap_of_its_key_alone(server_ur
 async def test_a_recorder_reads_only_the_key_anew_of_which_a_message_could_not_be_read(
     server_url, ainterface, key, tmp_path, quiet
 ):
-    """Whichever of its patterns brought it."""
     if server_url.startswith("redis+cluster"):
         pytest.skip("what is told to all nodes is not told to those who follow a key")
     keys = [key("foo"), key("bar")]

@@ -1,7 +1,5 @@
 """A fork while another thread uses a feature for the first time: the child can use it too."""
 
-from __future__ import annotations
-
 import os
 import time
 

@@ -115,7 +115,6 @@ def test_handles_of_one_place_are_equal_and_of_others_not(kvs, pspace, akvs_hand
 
 
 def test_printing_a_handle_says_what_it_is(kvs, pspace, akvs_handle, key):
-    """And how to read it."""
     assert str(kvs[key()]["n"]) == f"<Accessor {key()}.n: read its value with .read()>"
     assert f"{akvs_handle}" == f"<Accessor {key()}.n: read its value with await handle.read()>"
     assert repr(pspace[key()]) == f"<PublishAccessor {key()}: read its value with a KeyValueStore>"
@@ -261,7 +260,6 @@ def test_an_update_is_published_value_by_value(kvs, pspace, key):
 
 
 def test_a_store_is_updated_key_by_key_after_all_was_looked_at(kvs, pspace, key):
-    """Nothing is stored if one cannot be."""
     kvs.update({key(): {"n": 1}}, **{key("image"): np.ones(2)})
     assert_same(kvs[key("image")].read(), np.ones(2))
     with pytest.raises(BadType):
@@ -274,7 +272,6 @@ def test_a_store_is_updated_key_by_key_after_all_was_looked_at(kvs, pspace, key)
 
 
 def test_a_publish_space_refuses_what_would_read(pspace, key):
-    """As it refuses `read`."""
     for call in (
         pspace[key()].keys,
         lambda: "x" in pspace[key()],

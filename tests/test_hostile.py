@@ -1,7 +1,5 @@
 """Data from the server is not trusted: hostile bytes cost a BadData, quickly, and pixels never become commands."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import gc
@@ -398,7 +396,6 @@ def used(path):
 
 
 def test_the_search_for_dangerous_calls_finds_them(tmp_path):
-    """Under any name."""
     for number, text in enumerate([
         "import pickle", "from pickle import loads as l", "import numpy as np\nnp.load(x, allow_pickle=y)", "eval(x)",
         "import marshal\nmarshal.loads(x)", "from os import system", "f = exec",

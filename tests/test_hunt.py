@@ -1,7 +1,5 @@
 """Random calls on REEM and on a plain dict, for some seconds; `make hunt` goes on for longer."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

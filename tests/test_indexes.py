@@ -1,7 +1,5 @@
 """Indexes that count from the end of a list: the item that is meant is the one of the instant when it is used."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ctrl-C ends any blocking call and leaves the interface usable; a handler of SIGTERM may close it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -91,9 +89,6 @@ def test_redis_py_never_has_hiredis_format_a_number():
     assert Packer().pack("CLIENT SETINFO", 1.5) == [b"*3\r\n$6\r\nCLIENT\r\n$7\r\nSETINFO\r\n$3\r\n1.5\r\n"]
 
 
-# --- the queue of a loop, which has no lock -----------------------------------------------------------
-
-
 def update(number, **more):
     return Update("a", number, number, sequence=number, **more)
 
@@ -154,9 +149,6 @@ def test_several_threads_take_from_a_queue_while_one_puts(policy):
     assert len({each.sequence for each in taken}) == len(taken)
     assert 20_000 in {each.sequence for each in taken}
     assert sum(each.missed for each in taken) == 20_000 // 7
-
-
-# --- the lock that keeps the updates of a key in order -------------------------------------------------
 
 
 def test_a_thread_broken_off_among_the_locks_keeps_no_other_from_them():

@@ -3,8 +3,6 @@
 In these tests a second without a key is as long as a minute and a half.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 
@@ -34,7 +32,6 @@ def key():
 
 @pytest.fixture
 async def pair(cluster):
-    """Who publishes and stores, and who listens."""
     async with reem_async.RedisInterface(cluster) as one, reem_async.RedisInterface(cluster) as two:
         yield one, two
 

@@ -1,7 +1,5 @@
 """What a large array does for small calls beside it: those who share its event loop, or its interface."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools
@@ -24,7 +22,6 @@ from reem_async.transport.wire import BUFFER
 
 @pytest.fixture
 def server():
-    """A server of the test's own."""
     with EmbeddedServer() as own:
         yield own
 
@@ -71,7 +68,6 @@ async def test_a_large_array_waits_for_small_calls_that_are_under_way(ainterface
 
 
 async def test_it_does_not_wait_for_ever(akvs, key):
-    """Where calls never end."""
     name, others, over, calls = key(), key("others"), asyncio.Event(), itertools.count()
 
     async def call():

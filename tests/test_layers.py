@@ -1,7 +1,5 @@
 """What may import what: the middle is pure, one package talks to redis, and nothing is ever evaluated."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import re
@@ -59,7 +57,6 @@ def wrong(paths, said):
 
 
 def test_plans_and_ships_know_nothing_of_loops_sockets_or_redis():
-    """They are values and functions."""
     forbidden = {"asyncio", "anyio", "redis", "hiredis", "socket", "uvloop"}
     assert wrong(PURE, lambda path: roots(path) & forbidden) == {}
 
@@ -84,7 +81,6 @@ def test_redis_is_imported_in_one_place():
 
 
 def test_the_core_does_not_know_its_facade():
-    """Only the facade imports the core."""
     core = [path for path in MODULES if label(path).startswith("reem_async/")]
     assert wrong(core, lambda path: roots(path) & {"reem"}) == {}
 
@@ -109,15 +105,12 @@ def test_no_forbidden_command_is_even_spelled():
 
 
 def test_what_is_forbidden_would_be_found(tmp_path, monkeypatch):
-    """The searches work."""
     monkeypatch.setattr(sys.modules[__name__], "ROOT", tmp_path)
     bad = tmp_path / "bad.py"
     bad.write_text("import pickle, redis\nrun('KEYS', 'Keys')\n")
     assert spelled(bad) == ["line 2: KEYS"]
     assert roots(bad) == {"pickle", "redis"}
 
-
-# --- the order of the folders, and no import circles -------------------------------------------------
 
 ORDER = [
     {"errors", "_moved", "_installation"},
@@ -179,7 +172,6 @@ def circles(graph):
 
 
 def test_a_circle_would_be_found():
-    """The search works."""
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [("b", "c")]
 
 
@@ -189,7 +181,6 @@ def test_no_modules_import_each_other():
 
 
 def test_no_scripts_of_the_page_import_each_other():
-    """Likewise in JavaScript."""
     graph = {path.name: set(re.findall(r'from "\./([\w.]+)"', path.read_text(encoding="utf-8"))) for path in SCRIPTS}
     assert any(graph.values())
     assert circles(graph) == []
@@ -204,7 +195,6 @@ def folder(module):
 
 
 def test_the_folders_are_in_order():
-    """A folder uses only those before it."""
     place = {name: number for number, names in enumerate(ORDER) for name in names}
     wrong = []
     for module, wanted in imports().items():

@@ -1,7 +1,5 @@
 """What is kept for each key or each loop goes when nobody needs it any more."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 import logging
@@ -27,8 +25,6 @@ def listeners(interface):
 
 
 class SlowShip(reem_async.BytesShip):
-    """Takes its time to make a value."""
-
     async def unpack(self, blob):
         await asyncio.sleep(PATIENCE)
         return bytes(blob)
@@ -101,7 +97,6 @@ async def test_a_mirror_that_is_dropped_is_unsubscribed(ainterface, akvs, key):
 
 
 def test_a_dropped_watch_of_the_blocking_front_is_unsubscribed(server_url, key):
-    """By a heartbeat, although nothing is published."""
     with reem.RedisInterface(server_url) as interface:
         name = key()
         reem.KeyValueStore(interface)[name] = 1
@@ -125,8 +120,6 @@ async def test_a_store_and_its_transport_keep_a_bounded_number_of_keys(server_ur
 
 
 class FailingShip(reem_async.BytesShip):
-    """Cannot make a value of what begins with "bad"."""
-
     def unpack(self, blob):
         if bytes(blob).startswith(b"bad"):
             raise ValueError("bad")
@@ -135,7 +128,6 @@ class FailingShip(reem_async.BytesShip):
 
 @pytest.mark.parametrize("stored", [False, True])
 async def test_a_copy_keeps_no_replies_that_its_values_were_made_of(server_url, key, monkeypatch, stored):
-    """Whether ships could make them or not."""
     monkeypatch.setattr(logging.getLogger("reem.subscribe"), "disabled", True)  # pytest keeps the errors in its records
 
     def kept():
@@ -185,7 +177,6 @@ def test_numbers_of_a_publisher_never_go_back_when_idle_keys_are_forgotten(monke
 
 
 def test_keys_that_are_published_now_and_then_keep_their_numbers():
-    """However many they are."""
     numbers = _Numbers()
     for turn in range(1, 4):
         for channel in range(5000):

@@ -1,7 +1,5 @@
 """Large values from publisher to subscribers of one host through shared memory, and what happens where that fails."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np
@@ -113,9 +111,6 @@ async def test_early_an_update_is_told_once_and_says_so(server_url, key):
         assert [each.data["n"] for each in told] == list(range(20))
         assert not any(each.gap for each in told)
         assert all(each.early for each in told[1:])
-
-
-# --- slots ------------------------------------------------------------------------------------------
 
 
 def put(segment, data):

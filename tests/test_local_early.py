@@ -1,7 +1,5 @@
 """`local="early"`: what subscribers near by are told before the server has it, and how that is put right."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 

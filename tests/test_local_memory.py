@@ -1,7 +1,5 @@
 """Slots of shared memory: what must hold whatever comes between any two steps, and whatever a notice names."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import gc

@@ -1,7 +1,5 @@
 """Large values through shared memory, and what befalls the processes: forks, ends, limits, other users, kill -9."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import subprocess
@@ -36,7 +34,6 @@ def started(*words):
 
 
 def line(process):
-    """What it says next."""
     return line_of(process.stdout.fileno()).strip() or process.communicate()[1]
 
 
@@ -59,9 +56,6 @@ def mirror(following, key):
     return mirror
 
 
-# --- forks ------------------------------------------------------------------------------------------
-
-
 def test_a_child_of_a_reader_unlocks_nothing_and_keeps_what_it_has(server_url, key):
     with started("fork_reader", server_url, key("cam")) as process:
         assert line(process) == "kept by the parent: True"
@@ -75,17 +69,11 @@ def test_a_child_of_a_publisher_has_memory_of_its_own(server_url, key):
         assert line(process) == "parent: True True"
 
 
-# --- the end of the interpreter ---------------------------------------------------------------------
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("name", EXITS)
 def test_an_interpreter_that_ends_while_frames_are_looked_at_says_nothing(name, server_url, key):
     with started(name, server_url, key("cam")) as process:
         assert line(process) == "True"
-
-
-# --- another user -----------------------------------------------------------------------------------
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be somebody else")
@@ -101,9 +89,6 @@ def test_another_user_of_this_host_gets_the_frame_from_the_server(server_url, ke
         order(process, " ".join(map(str, orjson.loads(message)[-1][0][1:6])))
         assert line(process) == "None"
         assert line(process) == "refused"
-
-
-# --- kill -9 ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mode", ["auto", pytest.param("early", marks=pytest.mark.long)])

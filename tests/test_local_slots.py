@@ -1,7 +1,5 @@
 """Slots of shared memory in the hands of processes that are killed; `make slots` goes on for longer."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What users see of the local path: `reem doctor`, `reem top`, the page. Looking on costs publishers nothing."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -44,9 +42,6 @@ def local_finding(url, *words, namespace=""):
     assert run.returncode == 0, run.stdout + run.stderr
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "local"]
     return row
-
-
-# --- reem doctor ------------------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -95,9 +90,6 @@ def test_doctor_notices_that_a_user_may_not_use_the_channels(channels, status):
     assert ("deploy/users.acl" in row["remedy"]) == (status == WARN)
 
 
-# --- reem top, and the page -------------------------------------------------------------------------
-
-
 def test_top_says_of_late_and_not_for_ever():
     window = Window(100)
     for moment, local, expected in [(100, False, "-"), (101, True, "yes"), (105, False, "yes"), (112, False, "-")]:
@@ -127,9 +119,6 @@ def test_the_page_says_which_key_is_shared(server_url, key, beside, pspace):
         eventually(lambda: {key("cam"), key("arm")} <= page.rows().keys())
         eventually(lambda: page.rows()[key("cam")]["shared"])
         assert not page.rows()[key("arm")]["shared"]
-
-
-# --- who only looks on ------------------------------------------------------------------------------
 
 
 @only_where_there_is

@@ -1,7 +1,5 @@
 """Large values through shared memory: whatever they are, wherever they go, however they are heard, whatever serves."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np
@@ -32,8 +30,6 @@ def heard(url, name, **options):
         subscriber.listen()
         yield updates
 
-
-# --- what it is -------------------------------------------------------------------------------------
 
 ARRAYS = {
     "image": np.arange(200_000, dtype=np.uint8).reshape(200, 500, 2),
@@ -67,8 +63,6 @@ def test_values_of_every_kind_come_bit_for_bit_and_read_only(server_url, open_fr
 
 
 class Cloud:
-    """A user's own type."""
-
     def __init__(self, points):
         self.points = points
 
@@ -106,8 +100,6 @@ class PickyShip(CloudShip):
 
 
 class SlowShip(CloudShip):
-    """One that is asynchronous."""
-
     async def unpack(self, blob):
         return CloudShip.unpack(self, blob)
 
@@ -121,9 +113,6 @@ def test_what_a_ship_of_the_users_own_carries_arrives(ship, server_url, open_fro
     assert updates[0]["cloud"] == value["cloud"]
     assert_same(updates[0]["image"], BIG)
     assert updates[0]["empty"] == b""
-
-
-# --- where it goes ----------------------------------------------------------------------------------
 
 
 def image(number):
@@ -174,9 +163,6 @@ def test_who_follows_a_part_gets_the_part(server_url, open_front, key):
             assert in_slot(part.value())
 
 
-# --- how it is heard --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mode", ["auto", "early"])
 async def test_every_way_of_hearing(mode, server_url, key):
     async with (
@@ -207,9 +193,6 @@ async def test_every_way_of_hearing(mode, server_url, key):
                 assert_same(called[-1], value)
                 assert_same(subscriber.value(), value)
             del callback
-
-
-# --- what serves ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """What the manual of the first REEM documents works, and so do scripts of 0.1.2."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from conftest import assert_no_orphans, assert_same, eventually

@@ -1,7 +1,5 @@
 """Many calls at once, and an event loop that is busy with other things: a time limit counts what the server needs."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 import time
@@ -83,7 +81,6 @@ async def test_a_busy_event_loop_connects_and_follows(server_url, key):
 
 
 async def test_a_silent_server_is_given_up_by_a_busy_event_loop_too():
-    """After a hundred turns at most."""
     server = socket.create_server(("127.0.0.1", 0))  # the kernel takes connections for it
     port = server.getsockname()[1]
 

@@ -1,7 +1,5 @@
 """A mirror of the store: read from memory, with its age, and an error in place of an old value."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -24,8 +22,6 @@ IMAGE = np.zeros((480, 640, 3), np.uint8)
 
 
 class Mirrored:
-    """A mirror of either front."""
-
     def __init__(self, front, path, **options):
         self.front = front
         self.mirror = front.at(path).mirror(**options)
@@ -134,7 +130,6 @@ def test_objects_of_a_users_own_ship_are_copied_too(server_url, key):
 
 
 def test_a_predicate_of_the_blocking_front_may_call_reem(kvs, key):
-    """It is called on the caller's thread."""
     kvs[key()] = 1
     with kvs[key()].mirror() as mirror:
         assert mirror.wait_until(lambda value: kvs[key()].read() == value, 10) == 1
@@ -212,7 +207,6 @@ def test_a_stopped_server_makes_the_copy_too_old_and_a_dead_one_is_an_error(kind
 
 
 def test_a_mirror_that_does_not_follow_yet_says_so(front, key):
-    """It is a `with` that begins."""
     mirror = front.at((key(),)).mirror()
     with pytest.raises(Stale, match="listen"):
         mirror.value()
@@ -258,7 +252,6 @@ async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_t
 
 
 async def test_many_wait_and_one_is_cancelled(akvs, key):
-    """Which disturbs no other."""
     async with akvs[key()].mirror() as mirror:
         waiting = [asyncio.ensure_future(mirror.wait_until(lambda value: value == 1)) for _ in range(5)]
         await asyncio.sleep(0)
@@ -269,7 +262,6 @@ async def test_many_wait_and_one_is_cancelled(akvs, key):
 
 
 def test_threads_read_one_mirror(kvs, key):
-    """While another writes."""
     kvs[key()] = {"a": 0, "b": 0}
     with kvs[key()].mirror() as mirror:
         torn, ended = [], threading.Event()

@@ -1,7 +1,5 @@
 """The age of a mirror is never smaller than the true one: delays, slow loops, expiry, SWAPDB, missing rights."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import random

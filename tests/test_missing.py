@@ -1,7 +1,5 @@
 """What is not there: what reads as None, what raises, how to ask; and the names by which old programs catch it."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np
@@ -13,8 +11,6 @@ import reem
 import reem_async
 from reem_async.errors import BadType, MissingKey, NotFinite, Overflow, PathRefused, TooDeep, WrongType
 from reem_async.store.catalog import outline
-
-# --- a top-level key that is not there ----------------------------------------------------------------
 
 
 def test_a_program_that_must_know_asks(front, key, raw):
@@ -67,12 +63,8 @@ def test_accessors_get_with_a_default(kvs, key):
 
 
 async def test_tools_still_say_that_nothing_is_there(ainterface, key):
-    """They do not read through `Accessor.read`."""
     with pytest.raises(MissingKey):
         await outline(ainterface, key())
-
-
-# --- an array as the first thing below a top-level key ------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.arange(3.0), np.zeros(20_000), b"bytes"], ids=["small", "large", "bytes"])

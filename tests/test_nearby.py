@@ -1,7 +1,5 @@
 """The Unix socket of a server on this machine: taken by whoever says localhost, and by `reem record`."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil
@@ -31,7 +29,6 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture
 def server():
-    """A server of the test's own."""
     with EmbeddedServer() as own:
         yield own
 
@@ -217,7 +214,6 @@ ELSEWHERE = [Options(host, 1.0, {}) for host in ("192.0.2.1", "rediss://localhos
 
 @pytest.mark.parametrize("options", [*ELSEWHERE, NodeOptions(Options("localhost", 1.0, {}), ("localhost", 7000))])
 def test_elsewhere_nothing_is_looked_for(options):
-    """Nor for one of several servers."""
     look_nearby(options)
     assert options.nearby is None
 

@@ -1,7 +1,5 @@
 """A peer that is no server, or a broken one: its replies cost an error of REEM's own, never one of Python's."""
 
-from __future__ import annotations
-
 import contextlib
 
 import numpy as np
@@ -159,7 +157,6 @@ def test_a_flood_of_pushes_ends_a_call(name):
 
 @pytest.mark.parametrize("module", [reem, reem_async])
 def test_a_limit_that_is_none_is_refused(module):
-    """Before anything is connected."""
     for wrong in (0, -1, 1000, 1.5, "many", None, True):
         with pytest.raises(reem.BadValue, match="largest_value"):
             module.RedisInterface("redis://127.0.0.1:1", largest_value=wrong)

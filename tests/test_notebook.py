@@ -1,7 +1,5 @@
 """IPython and Jupyter: completion by the real completer, what a notebook shows, and outlines."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
@@ -14,7 +12,6 @@ from reem_async.tools.notebook import picture_of
 
 @pytest.fixture(scope="module")
 def shell():
-    """IPython in this process, with the extension."""
     interactive = pytest.importorskip("IPython.core.interactiveshell", reason="IPython is not installed")
     from traitlets.config import Config
 
@@ -23,7 +20,6 @@ def shell():
 
 
 def completed(shell, text):
-    """What Tab makes of a line."""
     from IPython.core.completer import provisionalcompleter
 
     with provisionalcompleter():
@@ -121,6 +117,5 @@ def test_an_outline_is_a_line_for_each_value(kvs, pspace, key):
 
 
 async def test_the_awaited_outline(akvs, key):
-    """The same in asyncio."""
     await akvs[key()].write({"a": np.zeros(3)})
     assert str(await akvs[key()].outline()) == f"{key()}: dict of 1\n    a: float64[3], 24 bytes"

@@ -1,8 +1,6 @@
 """Paths that no robot has, and whoever types a link may ask for: each is addressed exactly or refused, and nothing
 that REEM sends for them ends the server."""
 
-from __future__ import annotations
-
 import itertools
 import json
 

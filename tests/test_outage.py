@@ -1,7 +1,5 @@
 """What a publisher does in an outage: raise, drop, or keep the newest of each place; on servers that really go away."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -48,7 +46,6 @@ class Server:
 
 @pytest.fixture
 def server(tmp_path):
-    """One of the test's own."""
     with contextlib.ExitStack() as stack:
         yield Server(tmp_path, stack)
 

@@ -1,7 +1,5 @@
 """What a read tells of the updates that were only announced: every schedule of a small model, no server, no clock."""
 
-from __future__ import annotations
-
 import itertools
 import random
 

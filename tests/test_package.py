@@ -1,7 +1,5 @@
 """The package: what is installed beside it, what its metadata says, and the private names of redis-py that it uses."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import re
@@ -55,7 +53,6 @@ def test_the_doctor_fails_beside_the_original(tmp_path, its_redis_py):
 
 
 def test_version_and_extras_are_those_of_the_distribution():
-    """Whatever a message tells users to install."""
     about = metadata.metadata("reem-async")
     assert about["Version"] == reem_async.__version__
     texts = [

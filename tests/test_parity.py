@@ -1,7 +1,5 @@
 """The two fronts agree: the same names, the same parameters, the same promises in their docstrings."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 
@@ -100,7 +98,6 @@ def test_every_method_has_its_twin(name):
 
 @pytest.mark.parametrize("name", CLASSES)
 def test_twins_take_the_same_parameters(name):
-    """Names, kinds and defaults, the constructor's too."""
     blocking, core = made(reem, name), made(reem_async, name)
     if name not in ("accessor", "watch", "mirror"):
         assert parameters(blocking.__init__) == parameters(core.__init__)
@@ -127,7 +124,6 @@ def test_twins_promise_the_same(name):
 
 
 def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():
-    """Local calls stay plain in both."""
     waiting = {
         "RedisInterface": {"initialize", "close"},
         "KeyValueStore": {"get", "set"},

@@ -1,7 +1,5 @@
 """Servers without the JSON module: documents are text there, and everything else is as it is with it."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -58,7 +56,6 @@ def front(open_front):
 
 @pytest.fixture(scope="module")
 def with_json():
-    """A server with the module."""
     with EmbeddedServer() as running:
         if not running.json:
             pytest.skip("there is no server with JSON")
@@ -72,14 +69,12 @@ def calls(raw):
 
 
 def called(raw, work):
-    """Which commands `work` leads to."""
     before = calls(raw)
     work()
     return {name: count - before.get(name, 0) for name, count in calls(raw).items() if count > before.get(name, 0)}
 
 
 def text_of(raw, key):
-    """A document as another program sees it."""
     return raw.execute_command("GET", key)
 
 

@@ -1,7 +1,5 @@
 """Publishing: a change and its notice in one transaction, numbered in the order of the calls."""
 
-from __future__ import annotations
-
 import copy
 import operator
 

@@ -1,7 +1,5 @@
 """The parts that talk to nobody: paths, placeholders, floats, packing, parsing, trees."""
 
-from __future__ import annotations
-
 import math
 import struct
 
@@ -46,7 +44,6 @@ def nested(levels, beside, ahead):
 
 
 def depth(value):
-    """How deep containers are nested."""
     if not isinstance(value, dict | list):
         return 0
     return 1 + max(map(depth, value.values() if isinstance(value, dict) else value), default=0)
@@ -106,7 +103,6 @@ def test_the_text_that_a_path_is_shown_by_leads_back_to_it(top, path):
 
 
 def test_paths_read_as_people_write_them():
-    """Plain keys with dots, others in quotes."""
     assert show(("foo", "bar", 0, "a.b", "x")) == 'foo.bar[0]["a.b"].x'
     assert parse("foo.bar[2].x") == ("foo", "bar", 2, "x")
     assert parse(".a.b") == ("a", "b")
@@ -135,7 +131,6 @@ def test_a_placeholder_says_what_was_put_into_it(label, name, size, summary):
 
 @given(st.one_of(TEXT, TEXT.map(lambda it: placeholders.MARK + it)))
 def test_a_text_that_looks_like_a_placeholder_stays_a_text(text):
-    """It is wrapped, and unwrapped."""
     holder = [placeholders.inline_text(text)]
     assert placeholders.find(holder, "k") == []
     assert holder == [text]
@@ -145,7 +140,6 @@ def test_a_text_that_looks_like_a_placeholder_stays_a_text(text):
     "text", ["$ship ", "$ship x", "$ship x y", "$ship x y -1", "$ship float zz", "$ship a b " + "9" * 30]
 )
 def test_a_broken_placeholder_is_bad_data(text):
-    """Not a guess."""
     with pytest.raises(BadData):
         placeholders.find([text], "k")
 
@@ -164,7 +158,6 @@ def test_exact_text_is_parsed_to_the_very_float(value):
 
 
 def test_few_floats_have_no_text():
-    """About two in a thousand."""
     generator = np.random.default_rng(5)
     without = sum(exact_text(float(value)) is None for value in generator.uniform(-1, 1, 20_000))
     assert without < 100
@@ -247,7 +240,6 @@ def received(reader, stream, sizes):
 
 @given(st.lists(REPLIES, min_size=1, max_size=4), st.lists(st.integers(1, 70_000), min_size=1, max_size=5))
 def test_both_parsers_read_the_same_however_the_bytes_arrive(replies, sizes):
-    """Replies nested at will, cut anywhere."""
     stream = b"".join(map(encoded, replies))
     if len(stream) > 2000:
         sizes = [max(size, 300) for size in sizes]
@@ -256,7 +248,6 @@ def test_both_parsers_read_the_same_however_the_bytes_arrive(replies, sizes):
 
 
 def test_the_large_parser_knows_errors_pushes_and_nonsense():
-    """As hiredis does."""
     for reader in (SmallReader(), LargeReader()):
         stream = b"+OK\r\n-WRONGTYPE no\r\n>3\r\n$7\r\nmessage\r\n$1\r\nc\r\n$1\r\nx\r\n$-1\r\n*-1\r\n"
         ok, error, push, nothing, null = received(reader, stream, [7])
@@ -269,7 +260,6 @@ def test_the_large_parser_knows_errors_pushes_and_nonsense():
 
 
 def test_an_array_is_an_npy_file(tmp_path):
-    """What numpy.load opens, and numpy.save has written."""
     array = np.zeros(3, [("a", "<i4"), ("b", ">f8", (2,)), ("zeit/µs", "<M8[us]")])
     file = tmp_path / "array.npy"
     file.write_bytes(b"".join(NumpyShip().pack(array)))

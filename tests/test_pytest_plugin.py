@@ -1,7 +1,5 @@
 """The fixture `reem_server`, in test runs of their own."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import subprocess

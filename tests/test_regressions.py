@@ -1,7 +1,5 @@
 """Defects that a review found, one test for each: the store, connections, and ships."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import enum
@@ -151,7 +149,6 @@ def test_a_str_subclass_is_stored_as_what_it_holds(front, key):
 
 
 def test_the_empty_path_is_refused_as_a_bad_key(front):
-    """It names no top-level key."""
     for path in ("", "."):
         with pytest.raises(BadKey, match="empty"):
             front.get(path)

@@ -1,7 +1,5 @@
 """Defects that a review found, one test for each: publishing and following."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging
@@ -25,12 +23,10 @@ async def waiting(awaitable):
 
 
 def taken(updates):
-    """All updates that wait in a loop."""
     return [updates.queue.take() for _ in range(len(updates.queue._items))]
 
 
 def connections(raw):
-    """The ids of all connections."""
     return {row["id"] for row in raw.client_list()}
 
 
@@ -41,9 +37,6 @@ async def cut(raw, others):
     for connection in mine:
         raw.client_kill_filter(_id=connection)
     await asyncio.sleep(0.01)
-
-
-# --- what is followed -----------------------------------------------------------------------------
 
 
 async def test_an_update_that_the_server_refuses_is_never_left_in_a_mirror(ainterface, akvs, apspace, key):
@@ -102,7 +95,6 @@ async def test_after_a_fork_parent_and_child_are_two_publishers(server_url, akvs
 async def test_a_cancelled_large_publish_and_a_later_small_one_keep_their_order(
     ainterface, apspace, akvs, binterface, key
 ):
-    """Though they take different connections."""
     large, other = np.zeros(2_000_000), np.zeros(20_000)
     await apspace[key()].write(other)
     async with Mirror(key(), binterface) as mirror:
@@ -113,9 +105,6 @@ async def test_a_cancelled_large_publish_and_a_later_small_one_keep_their_order(
             await akvs[key("behind")].write(other)  # goes behind all that is still on its way
             assert_same(await akvs[key()].read(), number)
             await aeventually(lambda number=number: repr(mirror.value()) == repr(number))
-
-
-# --- closing --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["watch", "mirror", "callback"])
@@ -146,8 +135,6 @@ async def test_closing_while_listen_waits_ends_it_and_leaves_the_interface_usabl
 
 @pytest.mark.parametrize("module", [reem, reem_async])
 async def test_closing_a_subscriber_after_its_interface_is_quiet(server_url, key, module):
-    """The interface has closed it already."""
-
     async def done(result):
         return await result if asyncio.iscoroutine(result) else result
 
@@ -166,7 +153,6 @@ async def test_closing_a_subscriber_after_its_interface_is_quiet(server_url, key
 
 
 async def test_two_calls_of_listen_at_once_both_return_when_the_value_is_there(ainterface, akvs, key):
-    """The second does not return early."""
     await akvs[key()].write({"n": 1})
     mirror = Mirror(key(), ainterface)
     first = asyncio.create_task(mirror.listen())
@@ -175,9 +161,6 @@ async def test_two_calls_of_listen_at_once_both_return_when_the_value_is_there(a
     assert mirror.value() == {"n": 1}
     await waiting(first)
     await mirror.close()
-
-
-# --- outages --------------------------------------------------------------------------------------
 
 
 async def test_who_begins_to_follow_in_an_outage_misses_nothing_and_no_connection_is_left_over(
@@ -230,9 +213,6 @@ async def test_nothing_goes_on_reconnecting_for_a_subscriber_that_was_closed_in_
             pass
 
 
-# --- large updates --------------------------------------------------------------------------------
-
-
 async def test_an_update_of_over_32_megabytes_is_mirrored_and_small_ones_arrive_meanwhile(
     ainterface, server_url, key, raw
 ):
@@ -272,9 +252,6 @@ async def test_a_callback_subscriber_fetches_a_large_update_once(ainterface, bin
         await asyncio.sleep(0.05)
         assert raw.info("stats")["total_net_output_bytes"] - before < 6_000_000
         assert len(calls) == 1
-
-
-# --- policies, callbacks and loops ----------------------------------------------------------------
 
 
 async def test_every_update_cannot_be_had_of_large_ones_that_are_skipped(akvs, server_url, key):

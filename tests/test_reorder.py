@@ -1,7 +1,5 @@
 """What is heard of a key of a cluster in two ways: in one order, nothing lost, nothing told twice."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import weakref
@@ -30,7 +28,6 @@ def key():
 
 @pytest.fixture
 async def pair(cluster):
-    """Who publishes, and who listens."""
     async with reem_async.RedisInterface(cluster) as one, reem_async.RedisInterface(cluster) as two:
         yield reem_async.PublishSpace(one), two
 
@@ -40,8 +37,6 @@ def notice(sequence, publisher="p"):
 
 
 class Heard:
-    """A listener that writes down what it is told."""
-
     def __init__(self):
         self.told = []
 
@@ -154,7 +149,6 @@ async def test_who_follows_from_the_beginning_waits_for_nobody():
 
 
 async def test_a_crowd_of_publishers_is_forgotten_and_taken_as_it_comes(monkeypatch):
-    """Nobody can make it remember without end."""
     monkeypatch.setattr(reorder, "_MOST_PUBLISHERS", 3)
     listener = Heard()
     made = handed(listener)
@@ -166,7 +160,6 @@ async def test_a_crowd_of_publishers_is_forgotten_and_taken_as_it_comes(monkeypa
 
 
 async def test_a_listener_that_is_gone_is_told_nothing():
-    """It was dropped without closing."""
     listener = Heard()
     made = handed(listener)
     del listener
@@ -175,9 +168,6 @@ async def test_a_listener_that_is_gone_is_told_nothing():
     made.told_here(notice(9, "q"))
     made._give_up(made._senders["q"])
     assert not made.waits
-
-
-# --- on a real cluster -------------------------------------------------
 
 
 @contextlib.asynccontextmanager
@@ -247,7 +237,6 @@ async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pai
 async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_followed_over_it(
     cluster, pair, key, spelled_out
 ):
-    """And nobody listens less afterwards."""
     space, other = pair
     names = on_each_node(cluster, key, 5)
     for name in names:
@@ -266,7 +255,6 @@ async def test_a_connection_that_breaks_is_one_gap_however_many_keys_were_follow
 
 
 async def test_a_connection_that_is_made_while_the_interface_closes_is_closed_too(server_url, key):
-    """Nobody else would close it."""
     async with reem_async.RedisInterface(server_url) as interface:
         manager = manager_of(interface.session)
         following = asyncio.create_task(reem_async.SilentSubscriber(key(), interface).listen())

@@ -1,7 +1,5 @@
 """Users who lack one right: each call is refused and does nothing, or is done, or says what of it was done."""
 
-from __future__ import annotations
-
 import collections
 import contextlib
 import random
@@ -60,7 +58,6 @@ class Rights:
         return reem_async.RedisInterface(self.host, namespace="robot1:", username="robot", password="pw")
 
     def note(self, name):
-        """Return which update of a key was the last."""
         for client in self.clients:
             with contextlib.suppress(redis.exceptions.RedisError):
                 return client.get("{robot1:" + name + "}:last")
@@ -112,7 +109,6 @@ class Trial:
                 self.told = error
 
     async def check(self):
-        """Compare what is there with what the call said."""
         about = (self.space, self.kind, self.lacking, self.told)
         if isinstance(self.told, PartialWrite):
             written = self.after is not PathRefused and "not written" not in str(self.told)
@@ -165,14 +161,12 @@ async def tried(rights, space, kinds, *, late):
 
 
 def kinds_for(space):
-    """Return the kinds of calls that there are."""
     return [kind for kind in CALLS if space == "KeyValueStore" or kind != "an edit"]
 
 
 @pytest.mark.parametrize("late", [False, True], ids=["from the beginning", "taken away later"])
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 async def test_a_call_without_a_right_is_not_applied_or_says_what_was(single, space, late):
-    """On one server."""
     counts = await tried(single, space, kinds_for(space)[:: sized(3, 1)], late=late)
     print(space, late, counts)
     assert counts["NotAllowed"] > sized(15, 50)
@@ -180,7 +174,6 @@ async def test_a_call_without_a_right_is_not_applied_or_says_what_was(single, sp
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 async def test_a_call_without_a_right_in_a_cluster_is_not_applied_or_says_what_was(several, space):
-    """The error names command and key."""
     counts = await tried(several, space, random.Random(1).sample(kinds_for(space), sized(3, 6)), late=False)
     print(space, counts)
     assert counts["NotAllowed"] > sized(10, 30)

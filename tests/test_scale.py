@@ -1,7 +1,5 @@
 """How far it goes: the model's arithmetic, the simulation, the kept page, and a measurement of a real server."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import dataclasses
@@ -38,8 +36,6 @@ from benchmarks.scale.slots import (
     weigh,
 )
 
-# --- the kept page -------------------------------------------------
-
 
 @pytest.fixture(scope="module")
 def kept():
@@ -55,8 +51,6 @@ def test_the_page_is_of_a_whole_run(kept):
     assert kept["mode"] == "full"
     assert kept["seconds"] < 240
 
-
-# --- the model, by hand -------------------------------------------------
 
 POINT = Value(((0, Cost(20, 800, 60)), (10, Cost(40, 800, 3560)), (50, Cost(140, 800, 17_560))), memory=1000)
 FRAME = Value(((0, Cost(250, 900_000, 100, 900_000)), (2, Cost(550, 900_400, 1_800_100, 900_000))), memory=900_000)
@@ -87,9 +81,6 @@ def test_the_most_followers_of_one_key_by_hand():
     # 1000 x (140 us + (n - 50) x 2.5 us) + n x 10 us = 0.5
     assert most_followers(Topic("t", "point", 1000, 0), FIGURES, node) == int((0.5 - 0.140 + 0.125) / 0.00251)
     assert most_followers(Topic("t", "point", 1e6, 0), FIGURES, node) == 0  # not even without followers
-
-
-# --- the simulation -------------------------------------------------
 
 
 def test_slots_are_the_servers(server_url):
@@ -131,8 +122,6 @@ def test_a_key_that_all_follow_grows_with_the_fleet(kept):
     assert small.hot > 1
     assert spread.shared_core(3000, given) > 50 * spread.shared_core(30, given)
 
-
-# --- a real server -------------------------------------------------
 
 EFFORT = dataclasses.replace(QUICK, rounds=2, points=60, frames=3, seconds=0.5, keys=50, buffers=0.0)
 

@@ -1,7 +1,5 @@
 """TLS with certificates on one side or both, and what is refused; in both fronts."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import datetime
@@ -46,7 +44,6 @@ class Certificates:
         self.expired = self.issue("expired", "localhost", HOST, not_after=yesterday)
 
     def issue(self, title, *names, **limits):
-        """Certificate and key, two files."""
         issued = self._authority.issue_cert(*names, **limits)
         paths = str(self._folder / f"{title}.crt"), str(self._folder / f"{title}.key")
         issued.cert_chain_pems[0].write_to_path(paths[0])
@@ -165,7 +162,6 @@ def behind_tls(certificates):
 
 @pytest.fixture(scope="module")
 def guarded(behind_tls):
-    """A server that asks for certificates; yields its port."""
     with behind_tls(ask=True) as port:
         yield port
 
@@ -296,7 +292,6 @@ def test_a_sentinel_whose_authority_is_not_known_is_refused_in_the_same_words(sh
 
 @both
 def test_a_client_without_the_right_certificate_is_refused(guarded, certificates, other_authority, name):
-    """None, and one of another authority."""
     certfile, keyfile = other_authority.robot
     strange = {"ssl_certfile": certfile, "ssl_keyfile": keyfile}
     for options in ({}, strange):
@@ -317,7 +312,6 @@ def test_a_server_that_speaks_tls_only_is_told(shielded, name):
 
 
 def test_tls_is_1_2_or_newer(certificates):
-    """Older versions cannot even be asked for."""
     for version in (ssl.TLSVersion.TLSv1_1, ssl.TLSVersion.TLSv1, ssl.TLSVersion.MINIMUM_SUPPORTED, 769):
         with pytest.raises(reem.BadValue, match=r"TLS before 1\.2"):
             reem.RedisInterface("rediss://localhost", ssl_min_version=version)

@@ -1,7 +1,5 @@
 """A primary that sentinels watch: found, lost, found again where they say."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import os
@@ -56,14 +54,12 @@ def test_sentinels_that_never_answer_keep_nobody_out(watched, name):
 
 @pytest.mark.parametrize("package", [reem, reem_async])
 def test_an_option_that_nobody_knows_is_refused(package):
-    """Those of the sentinels are known."""
     package.RedisInterface("redis+sentinel://127.0.0.1/mymaster", sentinel_password="x")
     with pytest.raises(BadType, match="sentinel_pasword"):
         package.RedisInterface("redis+sentinel://127.0.0.1/mymaster", sentinel_pasword="x")
 
 
 def test_a_service_that_no_sentinel_knows_is_named(watched):
-    """With the sentinels that were asked."""
     interface = reem.RedisInterface(watched.url.replace("mymaster", "yours"))
     with pytest.raises(NotConnected, match="yours"):
         interface.initialize()
@@ -113,7 +109,6 @@ def test_a_primary_that_takes_no_writes_for_want_of_replicas_is_no_replica(front
 
 @pytest.mark.long
 def test_a_switch_leaves_no_connection_to_the_primary_of_before(front, watched):
-    """Nothing is due on them."""
     watched.settle()
     front.write(("switched",), 1)
     transport = getattr(front.interface, "_direct", front.interface).session.transport

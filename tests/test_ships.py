@@ -1,7 +1,5 @@
 """Types of the user's own: ships written for the first REEM, and ships whose methods are coroutines."""
 
-from __future__ import annotations
-
 import ast
 import asyncio
 import gc
@@ -121,7 +119,6 @@ def test_the_list_of_ships_replaces_the_default_one(open_front, key, raw, ship):
 
 
 def test_a_value_that_no_ship_takes_is_refused_with_its_path(open_front, key, raw, ship):
-    """Also with no ship at all."""
     for ships in ([], [ship]):
         front = open_front(ships=ships)
         with nothing_sent(raw), pytest.raises(BadType) as caught:
@@ -131,7 +128,6 @@ def test_a_value_that_no_ship_takes_is_refused_with_its_path(open_front, key, ra
 
 
 def test_the_first_ship_that_fits_takes_the_value(open_front, key, raw):
-    """The order of the list decides."""
     greedy = PoseShip()
     greedy.get_label = lambda: "greedy"
     front = open_front(ships=[greedy, PoseShip()])
@@ -189,7 +185,6 @@ def test_an_array_subclass_is_refused_unless_a_ship_claims_it(open_front, key, r
 
 
 def test_classes_that_add_nothing_to_their_items_are_stored_as_arrays(front, key, tmp_path):
-    """memmap, matrix and recarray."""
     mapped = np.memmap(tmp_path / "image", np.uint8, "w+", shape=(50, 100))
     for value in mapped, mapped[3:5], np.eye(2).view(np.matrix), np.rec.array([(1, 2.0)], names="a,b"):
         front.write([key()], value)
@@ -217,7 +212,6 @@ def test_an_unknown_label_is_said_with_the_remedy(open_front, key):
 
 
 def test_a_program_without_the_ship_still_cleans_up_after_it(open_front, key, raw):
-    """Replacing or deleting needs no ship."""
     open_front(ships=[PoseShip()]).write([key()], {"at": Pose(1, 2), "b": {"at": Pose(1, 2)}})
     without = open_front()
     without.delete([key(), "at"])
@@ -227,8 +221,6 @@ def test_a_program_without_the_ship_still_cleans_up_after_it(open_front, key, ra
 
 
 def test_a_ship_that_fails_to_write_sends_nothing(open_front, key, raw):
-    """Its exception passes through."""
-
     class Failing(PoseShip):
         def write(self, key, value, client):
             client.set(key, "half")
@@ -254,7 +246,6 @@ def test_a_ship_may_return_falsy_values(open_front, key):
 
 
 async def test_an_async_subscriber_sees_ships_too(server_url, key):
-    """With the coroutine methods."""
     async with reem_async.RedisInterface(server_url, ships=[AsyncPoseShip()]) as interface:
         space = reem_async.PublishSpace(interface)
         await space[key()].write({"at": Pose(0.0, 0.0)})
@@ -395,7 +386,6 @@ def test_a_ship_may_claim_a_type_that_json_has(open_front, key, raw, ship, kind)
 
 
 def test_a_claimed_value_is_published_and_appended(interface, server_url, key):
-    """As any other that goes by ship."""
     with reem.RedisInterface(server_url, ships=[TextShip(CLAIMS["str"])]) as own:
         kvs, space = reem.KeyValueStore(own), reem.PublishSpace(own)
         kvs[key()] = {"l": [1], "n": 1}

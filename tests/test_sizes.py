@@ -1,7 +1,5 @@
 """What is too large for the server is refused before it is sent: the server would only close the connection."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

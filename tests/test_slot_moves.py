@@ -3,8 +3,6 @@
 REEM_SLOT_MOVES=100 makes as many moves under load, REEM_SLOT_SEED=n other ones.
 """
 
-from __future__ import annotations
-
 import asyncio
 import collections
 import contextlib
@@ -38,8 +36,6 @@ async def test_a_slot_that_moves_under_load_leaves_every_call_whole(cluster):
     print(f"{MOVES} moves: {done} calls done, {refused} refused")
     assert done > 20 * MOVES
 
-
-# --- every kind of call, in every phase of a move --------------------------------------------------------
 
 PHASES = {
     "nothing has left": lambda _: False,
@@ -89,7 +85,6 @@ class Case:
             assert (self.told == "PathRefused") == (self.after is PathRefused), (self.kind, self.told)
 
     async def check(self):
-        """Compare what is there with what the call said."""
         with contextlib.suppress(MissingKey):
             assert_same(await self.reader.read(), self.due, f"{self.space}: {self.kind} ({self.told})")
             return

@@ -1,7 +1,5 @@
 """Large arrays get through beside programs that never rest: they are sent before the transaction that is watched."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
@@ -178,9 +176,6 @@ def test_a_user_who_may_not_put_it_in_its_place_is_told(cluster, right):
     finally:
         for node in admins:
             node.say("ACL", "DELUSER", "narrow")
-
-
-# --- the pure part ---------------------------------------------------------------------------------
 
 
 def test_only_large_values_go_first():

@@ -1,7 +1,5 @@
 """What is called back with changes of the connection's state: in order, and without a lock that others need."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

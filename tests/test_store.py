@@ -1,7 +1,5 @@
 """The key-value store of `reem_async`, as documented, and what both fronts share of it."""
 
-from __future__ import annotations
-
 import asyncio
 import pickle
 
@@ -13,11 +11,8 @@ import reem
 import reem_async
 from reem_async.errors import Conflict, NotConnected, WriteOnly
 
-# --- asyncio only ----------------------------------------------------------------------------------
-
 
 async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):
-    """An assignment cannot wait for the server."""
     with pytest.raises(TypeError, match=r"await .*write\("):
         akvs[key()] = 1
     with pytest.raises(TypeError, match=r"await .*write\("):
@@ -117,9 +112,6 @@ async def test_the_interface_need_not_be_initialized(server_url, key):
     await kvs[key()].write(1)
     assert await kvs[key()].read() == 1
     await kvs.interface.close()
-
-
-# --- both fronts -----------------------------------------------------------------------------------
 
 
 def test_types_are_python_types(front, key):

@@ -1,7 +1,5 @@
 """Subscribing in `reem_async`: what depends on tasks and event loops. `test_following.py` has what both fronts do."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 
@@ -20,9 +18,6 @@ from reem_async.pubsub.manager import manager_of
 async def following(updates):
     """The next update, or a failure in place of waiting for ever."""
     return await asyncio.wait_for(anext(updates), PATIENCE)
-
-
-# --- the mirror ------------------------------------------------------------------------------------
 
 
 async def test_a_mirror_that_starts_while_others_publish_ends_up_right(ainterface, key, binterface, akvs):
@@ -179,7 +174,6 @@ async def test_what_was_there_before_is_no_loss(ainterface, binterface, key):
 
 
 async def test_a_store_write_is_not_published(ainterface, akvs, apspace, key):
-    """Subscribers hear of what a PublishSpace writes."""
     heard = []
     async with CallbackSubscriber(key(), ainterface, lambda data, updated_path: heard.append(updated_path), {}):
         await akvs[key()].write({"a": 1})
@@ -187,9 +181,6 @@ async def test_a_store_write_is_not_published(ainterface, akvs, apspace, key):
         await aeventually(lambda: f"{key()}.b" in heard)
         await asyncio.sleep(0.1)
         assert [path for path in heard if path != f"{key()}.b"] == []
-
-
-# --- callbacks -------------------------------------------------------------------------------------
 
 
 async def test_a_callback_may_use_reem(ainterface, akvs, apspace, key):
@@ -207,11 +198,7 @@ async def test_a_callback_may_use_reem(ainterface, akvs, apspace, key):
     assert await akvs[key("count")].read() == 3
 
 
-# --- loops -----------------------------------------------------------------------------------------
-
-
 async def test_without_a_value_a_loop_begins_with_the_first_publish(akvs, apspace, key, raw):
-    """There is no initial update then."""
     before = subscribed(raw)
     updates = akvs[key()].watch()
     waiting = asyncio.ensure_future(following(updates))
@@ -273,9 +260,6 @@ async def test_a_value_that_was_published_before_is_followed_without_a_gap(ainte
         raw.set("{" + key() + "}:last", f"{publisher} {int(number) + 3}", ex=60)  # two were lost on their way
         update = await asyncio.wait_for(anext(watch), 5)
         assert (update.sequence, update.gap, update.missed) == (None, True, 2)
-
-
-# --- connections and endings -----------------------------------------------------------------------
 
 
 async def test_a_closed_subscriber_follows_no_more(ainterface, akvs, apspace, key):

@@ -1,7 +1,5 @@
 """Errors that say it all: the caller's line, hardly any of REEM's, and no chain of what went on inside."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import traceback

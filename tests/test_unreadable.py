@@ -1,7 +1,5 @@
 """One value that cannot be read costs nothing beside it: kinds of damage, kinds of followers, both kinds of servers."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import logging
@@ -133,7 +131,6 @@ def beside(tree):
 
 @pytest.fixture(params=["json", "plain"], scope="module")
 def server(request):
-    """A server whose users this test may change."""
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "plain":
             patch.setenv("REEM_SERVER_PLAIN", "1")
@@ -283,7 +280,6 @@ USES = {
 
 @pytest.mark.parametrize("use", USES)
 def test_an_unreadable_value_raises_when_it_is_used(use):
-    """With the place and the reason."""
     with pytest.raises(BadData, match=r"b\.image: gone"):
         USES[use](Unreadable("b.image", "b.image: gone"))
 
@@ -295,7 +291,6 @@ async def test_an_unreadable_value_is_refused_where_a_copy_of_what_was_followed_
 
 @pytest.mark.parametrize("same", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
 def test_an_unreadable_value_can_be_kept(same):
-    """Copied, pickled, compared, printed."""
     it = Unreadable("b.image", "gone")
     assert operator.eq(same(it), it)
     assert it != Unreadable("b.image", "forbidden")

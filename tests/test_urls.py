@@ -1,7 +1,5 @@
 """URLs of servers: each part counts, and what no part is for is refused. The seed is printed."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import random

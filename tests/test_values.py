@@ -1,7 +1,5 @@
 """What is read is what was written: every value REEM promises to hold, through both fronts."""
 
-from __future__ import annotations
-
 import time
 from collections import OrderedDict, defaultdict
 
@@ -22,8 +20,6 @@ def tried(examples):
     checks = [getattr(HealthCheck, name) for name in fine]
     return settings(max_examples=max(20, examples), deadline=None, suppress_health_check=checks)
 
-
-# --- property tests -------------------------------------------------
 
 scalars = (
     st.none()
@@ -92,8 +88,6 @@ def test_a_great_many_random_floats_come_back_bit_equal(front, key):
         assert_same(front.read([key("floats")]), numbers)
 
 
-# --- named values -------------------------------------------------
-
 FLOATS = [
     *(0.9374604873776271, -0.9374604873776271, 0.0, -0.0, 5e-324, -5e-324, 2.2250738585072014e-308),
     *(2.225073858507201e-308, 1.7976931348623157e308, -1.7976931348623157e308, 1e16, 1e22, 1e23),
@@ -134,7 +128,6 @@ def test_floats_keep_every_bit_beside_arrays_and_through_append(front, key):
 
 
 def test_subclasses_of_dict_str_and_int_are_accepted(front, key):
-    """They come back as the plain type."""
     word = type("Word", (str,), {})("w")
     number = type("Number", (int,), {})(7)
     front.write([key()], OrderedDict(a=defaultdict(int, b=number), c=word))

@@ -1,7 +1,5 @@
 """`watch()` sees every change of what is stored: published updates one by one, all else as what it led to."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import json
@@ -180,15 +178,11 @@ def test_what_a_neighbour_with_a_longer_name_stores_is_not_told(watching, kvs, k
 
 
 def test_a_watch_of_published_updates_alone_does_not_hear_stores(watching, kvs, pspace, key):
-    """Asked for with `stored=False`."""
     watch = watching((key(),), stored=False)
     kvs[key()] = {"a": 1}
     pspace[key()]["a"] = 2
     update = watch.next()
     assert (update.origin, update.path, update.data) == ("published", f"{key()}.a", {"a": 2})
-
-
-# --- what old programs use ---------------------------------------------------------------------------
 
 
 def test_subscribers_hear_what_is_published_and_all_if_asked(interface, kvs, pspace, key):
@@ -213,12 +207,8 @@ def test_subscribers_hear_what_is_published_and_all_if_asked(interface, kvs, psp
         assert every["a"].read() == 2
 
 
-# --- who may not, and servers that go ------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", list(FRONTS))
 def test_who_may_not_track_hears_what_is_published_and_is_warned_once(kind, caplog):
-    """The warning says which right it is."""
     with EmbeddedServer() as server, clients_of([server]) as (raw,):
         raw.execute_command("ACL", "SETUSER", "robot", "on", ">pw", "~*", "&*", "+@all", "-client|tracking")
         url = f"redis://robot:pw@127.0.0.1:{server.port}"
@@ -262,7 +252,6 @@ def test_a_restart_without_data_is_told_as_a_gap_and_that_all_is_gone():
 
 
 def test_a_flushed_server_is_told_by_everybody_who_watches():
-    """The server then names no keys."""
     with EmbeddedServer() as server, clients_of([server]) as (raw,), reem.RedisInterface(server) as interface:
         kvs = reem.KeyValueStore(interface)
         kvs["foo"], kvs["bar"] = {"a": 1}, [np.arange(3)]
@@ -276,7 +265,6 @@ def test_a_flushed_server_is_told_by_everybody_who_watches():
 
 
 async def test_a_broken_connection_is_told_as_a_gap_and_following_goes_on(ainterface, akvs, raw, key):
-    """What was stored meanwhile is in it."""
     await akvs[key()].write({"a": 1})
     async with akvs[key()].watch(Every(100)) as watch:
         assert (await anext(watch)).initial
@@ -302,7 +290,6 @@ async def test_nobody_is_tracked_who_only_follows_what_is_published(binterface, 
 
 
 async def test_what_is_pushed_and_is_no_invalidation_is_counted(ainterface, akvs, key):
-    """Nonsense from a server ends nothing."""
     watch = akvs[key()].watch()
     await watch.listen()
     manager = manager_of(ainterface.session)
@@ -311,9 +298,6 @@ async def test_what_is_pushed_and_is_no_invalidation_is_counted(ainterface, akvs
     assert ainterface.unreadable == 2
     await akvs[key()].write(1)
     assert (await asyncio.wait_for(anext(watch), PATIENCE)).value == 1
-
-
-# --- clusters -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", list(FRONTS))
@@ -341,6 +325,5 @@ def test_a_slot_that_moves_is_told_as_a_gap_and_stores_are_told_from_its_new_nod
 
 
 def test_an_update_says_in_json_what_it_is(watching, kvs, key):
-    """The origin is a string."""
     kvs[key()] = 1
     assert json.dumps([watching((key(),)).next().origin]) == '["found"]'

@@ -1,7 +1,5 @@
 """A watcher that does not keep up: what it owes stays small, at the server and in both processes."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal
@@ -61,7 +59,6 @@ def test_a_stopped_watcher_of_many_keys_owes_one_message_for_each(server_url, kv
 
 
 def test_a_loop_that_takes_nothing_keeps_no_more_than_its_policy_says(interface, key):
-    """And counts what it skipped."""
     kvs = reem.KeyValueStore(interface)
     kvs[key()] = {"n": 0}
     with kvs[key()].watch(Last(10)) as watch, kvs[key()].mirror() as mirror:

@@ -1,7 +1,5 @@
 """Watchers of all kinds beside random changes by four processes; `make watching` goes on for longer."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """`kvs.watch("robot1.*")`: every change of all keys that patterns name, those that come to be and those that go."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 
@@ -34,7 +32,6 @@ def watching(front):
 
 
 def test_all_keys_of_a_pattern_are_told_first_and_then_what_changes(watching, kvs, pspace, key):
-    """Published and stored; nothing of other keys."""
     kvs[key("a1")], kvs[key("a2")], kvs[key("b")] = {"n": 1}, [1, 2], 3
     watch = watching(key("a*"))
     first = {update.path: update for update in (watch.next(), watch.next())}
@@ -122,7 +119,6 @@ def test_any_top_level_key_is_watched_and_disturbs_nobody_beside_it(watching, kv
 
 
 def test_large_arrays_may_stay_at_the_server(watching, kvs, key):
-    """Their changes are told nevertheless."""
     kvs[key("cam")] = {"image": IMAGE, "n": 1}
     watch = watching(key("*"), largest=1000)
     before = watch.next().data["image"]
@@ -134,7 +130,6 @@ def test_large_arrays_may_stay_at_the_server(watching, kvs, key):
 
 
 def test_patterns_that_overlap_tell_each_change_once(watching, kvs, pspace, key):
-    """Whichever names it."""
     watch = watching(key("*"), key("a*"), f"{key('a')}.x")
     pspace[key("a")] = {"x": 1}
     assert watch.told() == ("published", key("a"), {"x": 1}, False)
@@ -145,7 +140,6 @@ def test_patterns_that_overlap_tell_each_change_once(watching, kvs, pspace, key)
 
 
 def test_what_is_no_pattern_is_refused_and_so_is_a_publish_space(front, pspace):
-    """Before anything is sent."""
     with pytest.raises(BadKey):
         front.kvs.watch("a..b")
     with pytest.raises(WriteOnly):
@@ -263,7 +257,6 @@ async def test_of_keys_of_which_some_cannot_be_followed_yet_the_others_are(
 async def test_each_place_in_a_new_key_is_told_what_is_published_until_it_is_followed(
     ainterface, akvs, apspace, key, monkeypatch
 ):
-    """Not only the first one."""
     manager, name = manager_of(ainterface.session), key("job")
     follow_here, followed = manager.follow_here, []
 

@@ -1,7 +1,5 @@
 """What looks at all keys, or waits for all nodes, reaches every node of a cluster, or says that it did not."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

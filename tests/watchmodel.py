@@ -53,9 +53,6 @@ def value(rng: random.Random, place: tuple) -> object:
     return rng.choice([rng.randrange(4), 1.5, "text", None, True, [1], {"x": 1}])
 
 
-# --- who writes --------------------------------------------------------------------------------------
-
-
 def change(space: object, rng: random.Random) -> None:
     """Change something through a store or a publish space of the blocking front."""
     place, kind = rng.choice(PLACES), rng.random()
@@ -82,7 +79,6 @@ async def achange(space: object, rng: random.Random) -> None:
 
 
 def command(client: redis.Redis, rng: random.Random) -> None:
-    """Change something as a program without REEM would."""
     key = rng.choice(KEYS)
     kind = rng.randrange(8)
     if kind < 3:
@@ -135,9 +131,6 @@ def write(url: str, kind: str, seed: int) -> None:
             with contextlib.suppress(ReemError, redis.exceptions.RedisError):  # no parent there, a cut connection
                 one()
         print("done", flush=True)
-
-
-# --- who watches --------------------------------------------------------------------------------------
 
 
 class Last:
@@ -206,7 +199,6 @@ class Watchers:
         self.threads[-1].start()
 
     async def wrong(self) -> list[str]:
-        """Return what differs from the server."""
         kvs, found = reem_async.KeyValueStore(self.interface), {}
         for place in {*WATCHED, *KEYS}:
             try:
@@ -240,9 +232,6 @@ class Watchers:
 def _place(update: object, places: list[str]) -> str:
     """Return the place that an update is about: the only one, or the key of one of many."""
     return places[0] if len(places) == 1 else str(parse(update.path)[0])
-
-
-# --- the whole ----------------------------------------------------------------------------------------
 
 
 def cut(clients: list[redis.Redis], rng: random.Random, stopping: threading.Event) -> None:

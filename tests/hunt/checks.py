@@ -168,7 +168,6 @@ class Follower:
             assert not lost, f"loop over {what}: lost some before {lost[:3]!r:.1000}, with nothing broken off"
 
     def close(self) -> None:
-        """Stop following."""
         self.mirror.close()
         self.caller.close()
         self.other.run(self.watch.close())
