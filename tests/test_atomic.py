@@ -109,41 +109,6 @@ def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
         assert min(written) >= 3, "a run counts only if there was load"
 
 
-def test_arrays_that_change_shape_dtype_and_place_are_never_read_apart(server_url, key):
-    """A reader that remembers where the arrays were is never shown a mixture."""
-    with contextlib.ExitStack() as stack:
-        writing, reading = (
-            reem.KeyValueStore(stack.enter_context(contextlib.closing(reem.RedisInterface(server_url))))
-            for _ in range(2)
-        )
-
-        def value(n):
-            shapes = [(3,), (2, 3), (0,), (1, 1, 4)]
-            array = np.full(shapes[n % 4], n % 100, ["u1", "<f8", ">i4"][n % 3])
-            places = [
-                {"a": array},
-                {"b": {"a": array}},
-                {"l": [array, array]},
-                {"a": n % 100},
-                {"a": [n], "b": array},
-            ]
-            return {"n": n, "in": places[n % 5]}
-
-        writing[key()] = value(0)
-
-        def write():
-            for n in range(10**9):
-                if crew.over.is_set():
-                    return
-                writing[key()] = value(n)
-
-        with Crew() as crew:
-            crew.start(write)
-            for _ in range(READS):
-                got = reading[key()].read()
-                assert_same(got, value(got["n"]))
-
-
 @pytest.mark.parametrize("shape", [SMALL, FULL], ids=["small", "full size"])
 async def test_image_and_stamp_are_never_seen_apart_by_a_subscriber(ainterface, key, server_url, shape):
     """Neither by a loop, nor by a mirror, nor by a callback, with two publishers at work."""
@@ -257,36 +222,6 @@ def test_arrays_of_a_write_that_cannot_be_are_not_even_sent(interface, key, raw,
                 place[name].setdefault("x", {"y": np.arange(900)})
     after = commands_run(raw)
     assert {name: after.get(name) for name in ("set", "sadd")} == {name: before.get(name) for name in ("set", "sadd")}
-
-
-def test_a_writer_does_not_trust_what_it_remembers(front, open_front, key, raw):
-    """Another client changes the shape between two writes of one client."""
-    other = open_front()
-    shapes = [
-        1,
-        np.arange(3),
-        {"a": np.arange(2)},
-        {"a": {"b": np.arange(4)}},
-        [np.arange(1), 2],
-        "text",
-        {},
-        b"x",
-    ]
-    front.write([key()], {"s": None})
-    for mine in shapes:
-        for theirs in shapes:
-            front.write([key(), "s"], mine)
-            other.write([key(), "s"], theirs)
-            assert_same(front.read([key(), "s"]), theirs)
-            assert_no_orphans(raw, key())
-            front.write([key(), "s"], mine)
-            assert_same(other.read([key()]), {"s": mine})
-            assert_no_orphans(raw, key())
-            with contextlib.suppress(PathRefused):
-                front.write([key(), "s", "a"], np.arange(6))
-            other.delete([key(), "s"])
-            assert_same(front.read([key()]), {})
-            assert keys_of(raw, key()) == set()
 
 
 def _shape(rng, n):

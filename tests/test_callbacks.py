@@ -221,33 +221,6 @@ async def test_a_time_limit_for_listen_is_not_one_for_the_calls(ainterface, apsp
     await subscriber.close()
 
 
-def test_a_subscriber_can_be_used_again_in_another_event_loop(server_url, key):
-    """Also if a call was cut off by the end of the first."""
-    begun, ended = [], []
-
-    async def callback(data, updated_path):
-        begun.append(data)
-        await asyncio.sleep(0 if data else 60)
-        ended.append(data)
-
-    interface = RedisInterface(server_url)
-    subscriber, space = CallbackSubscriber(key(), interface, callback), PublishSpace(interface)
-
-    async def use(number):
-        await subscriber.listen()
-        await space[key()].write(number)
-        await aeventually(lambda: begun[-1:] == [number])
-
-    async def use_and_close():
-        await use(1)
-        await subscriber.close()
-        await interface.close()
-
-    asyncio.run(use(0))
-    asyncio.run(use_and_close())
-    assert (begun, ended) == ([0, 1], [1])
-
-
 @pytest.mark.parametrize("policy", [Last(100), Every(100)], ids=["last", "every"])
 @pytest.mark.parametrize("descriptors", ["left", "used up"])
 def test_any_number_of_threads_may_wait_at_a_queue(policy, descriptors, monkeypatch):

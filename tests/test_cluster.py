@@ -183,38 +183,6 @@ def test_a_transaction_over_keys_here_and_there_waits_until_they_are_together(fr
     assert (value["n"], value["image"].tolist()) == (1, [0, 0, 0, 0])
 
 
-LARGE = np.full((100, 1000), 7.0)
-
-
-@pytest.mark.parametrize("gone", ["nothing", "array", "document", "all"])
-def test_a_large_array_is_published_to_a_moving_slot_or_refused(cluster, key, gone):
-    """Whatever of the key has left: all of it is where it was or went, or nothing is applied."""
-    name = key()
-    together = gone in ("nothing", "all")
-    with reem.RedisInterface(cluster, timeout=0.3) as interface:
-        kvs, space = reem.KeyValueStore(interface), reem.PublishSpace(interface)
-        space[name] = {"n": 1, "image": LARGE - 1}
-        move = Move(cluster, name).begin()
-        array = f"{{{name}}}.image"
-        move.take(*{"nothing": [], "array": [array], "document": [name], "all": move.all_keys()}[gone])
-        before = move.left()
-        for write in (
-            lambda: space[name].write({"n": 2, "image": LARGE}),
-            lambda: space[name]["image"].write(LARGE + 1),
-        ):
-            if together:
-                write()
-            else:
-                with pytest.raises(NotConnected, match="nothing was applied"):
-                    write()
-            assert move.left() == before
-        move.finish()
-        value = kvs[name].read()
-        n, image = (2, LARGE + 1) if together else (1, LARGE - 1)
-        assert value["n"] == n
-        assert np.array_equal(value["image"], image)
-
-
 def test_nodes_that_do_not_agree_are_named_as_the_reason(front, cluster, key):
     """Each sends to the other, until time is over."""
     agreed(cluster)
@@ -286,11 +254,11 @@ async def test_leaving_and_coming_back_to_channels_of_one_node_keeps_the_connect
     name = key()
     async with reem_async.RedisInterface(cluster) as interface:
         space = reem_async.PublishSpace(interface)
-        for number in range(60):
+        for number in range(24):
             await space[name].write(number)
             mirror = reem_async.SilentSubscriber(name, interface)
             await mirror.listen()
-            if number % 20 == 10:
+            if number % 12 == 6:
                 Move(cluster, name).begin().finish()
             assert mirror.value() == number
             await space[name].write(-number)

@@ -124,7 +124,7 @@ def test_the_last_confirmation_of_an_upload_counts_from_when_its_bytes_may_have_
 
 async def test_a_slow_upload_is_not_cut_off(server):
     """More than twice the limit, but bytes move."""
-    total, rate = 24 << 20, 10 << 20
+    total, rate = 12 << 20, 10 << 20
     relays = []
 
     async def relay(reader, writer):
@@ -152,17 +152,17 @@ async def test_a_slow_upload_is_not_cut_off(server):
     url = f"redis://127.0.0.1:{port}"
 
     def blocking():
-        with reem.RedisInterface(url, timeout=0.9) as interface:
+        with reem.RedisInterface(url, timeout=0.5) as interface:
             begin = time.monotonic()
             reem.KeyValueStore(interface)["big"] = value
             return time.monotonic() - begin
 
     async with slow:
-        async with reem_async.RedisInterface(url, timeout=0.9) as interface:
+        async with reem_async.RedisInterface(url, timeout=0.5) as interface:
             begin = time.monotonic()
             await reem_async.KeyValueStore(interface)["big"].write(value)
-            assert time.monotonic() - begin > 1.8
-        assert await asyncio.to_thread(blocking) > 1.8
+            assert time.monotonic() - begin > 1.0
+        assert await asyncio.to_thread(blocking) > 1.0
         await asyncio.gather(*relays)
 
 

@@ -74,11 +74,6 @@ CALLS = {
 VALUE = {"busy": 0, "n": 8, "l": [1, 2]}
 
 
-def run(front, call, path):
-    result = CALLS[call](front.at(path))
-    return front.run(result) if isinstance(front, FRONTS["asyncio"]) else result
-
-
 @pytest.mark.parametrize("name", FRONTS)
 @pytest.mark.parametrize("call", CALLS)
 def test_what_others_are_always_faster_than_ends_with_a_conflict(server, raw, monkeypatch, name, call):
@@ -87,12 +82,12 @@ def test_what_others_are_always_faster_than_ends_with_a_conflict(server, raw, mo
         with overtaken(monkeypatch, touching(raw, server, "robot")) as writes:
             began = time.monotonic()
             with pytest.raises(reem.Conflict, match=r"^robot: others kept writing .* nothing was applied: .*timeout="):
-                run(front, call, ["robot"])
+                front.wait(CALLS[call](front.at(["robot"])))
             assert LIMIT < time.monotonic() - began < LIMIT + 2
         assert len(writes) > 1
         found = front.read(["robot"])
         assert {**found, "busy": 0} == VALUE
-        run(front, call, ["robot"])
+        front.wait(CALLS[call](front.at(["robot"])))
 
 
 @pytest.mark.parametrize("name", FRONTS)
@@ -101,7 +96,7 @@ def test_what_others_were_faster_than_some_times_is_applied(server, raw, monkeyp
     with contextlib.closing(FRONTS[name](server.url, timeout=30)) as front:
         front.write(["robot"], VALUE)
         with overtaken(monkeypatch, touching(raw, server, "robot"), 5) as writes:
-            run(front, call, ["robot"])
+            front.wait(CALLS[call](front.at(["robot"])))
         assert len(writes) == 5
 
 

@@ -7,14 +7,11 @@ import dataclasses
 import gc
 import os
 import pickle
-import select
 
 import pytest
 
 import reem
 from reem_async.concurrency.wakeup import wakeups
-from reem_async.local.host import reason_against
-from reem_async.local.segment import Segment
 
 
 @dataclasses.dataclass
@@ -61,42 +58,3 @@ def test_a_copy_of_what_follows_or_waits_closes_no_descriptor(interface, key, wa
         space[key()] = 2
         assert next(watch).data == 2
         mirror.wait_until(lambda value: value == 2, 10)
-
-
-@pytest.mark.parametrize("kind", ["wakeups", "segment"])
-def test_a_number_that_is_another_file_by_then_is_neither_written_nor_closed(tmp_path, kind):
-    """As in a program that becomes a daemon, closes all descriptors and opens files of its own."""
-    if kind == "segment" and reason_against():
-        pytest.skip(reason_against())
-    owner = wakeups() if kind == "wakeups" else Segment(1000)
-    number = owner._write.number if kind == "wakeups" else owner.descriptor
-    with open(tmp_path / "file", "w+b") as file:
-        os.dup2(file.fileno(), number)
-        if kind == "wakeups":
-            owner.put(None)
-        del owner
-        gc.collect()
-        os.write(number, b"mine")
-        os.close(number)
-        file.seek(0)
-        assert file.read() == b"mine"
-
-
-@pytest.mark.parametrize("kind", ["wakeups", "epoll"])
-def test_numbers_that_are_those_of_another_watch_or_an_epoll_by_then_are_not_closed(kind):
-    """A daemon's next watch, or event loop, often gets the number."""
-    owner = wakeups()
-    ends = [owner._read.number, owner._write.number]
-    for number in ends:
-        os.close(number)
-    others = [wakeups()] if kind == "wakeups" else [select.epoll(), select.epoll()]
-    owner.put(None)
-    del owner
-    gc.collect()
-    if kind == "wakeups":
-        assert [others[0]._read.number, others[0]._write.number] == ends
-        others[0].put(None)
-        others[0].get()
-    else:
-        assert [other.fileno() for other in others] == ends
-        assert [other.poll(0) for other in others] == [[], []]

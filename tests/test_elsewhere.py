@@ -142,32 +142,6 @@ def test_what_began_in_an_event_loop_that_was_closed_begins_anew_in_the_next_or_
     ], done.stderr
 
 
-ONLY_CLOSED = """
-import asyncio, sys, reem_async
-from reem_async.transport import wire
-url, key = sys.argv[1:]
-interface = reem_async.RedisInterface(url)
-store = reem_async.KeyValueStore(interface)
-watch = store[key].watch()
-loop = asyncio.new_event_loop()
-loop.run_until_complete(watch.listen())
-loop.close()
-
-async def second():
-    await store[key].write(1)
-    wires = [each for each in wire._open if each._loop is asyncio.get_running_loop()]
-    await interface.close()
-    print(bool(wires), any(each.alive for each in wires))
-
-asyncio.run(asyncio.wait_for(second(), 20))
-"""
-
-
-def test_an_interface_of_an_event_loop_that_was_closed_can_be_closed_in_the_next(server_url, key):
-    done = python(ONLY_CLOSED, server_url, key(), flags=("-W", "ignore"))
-    assert done.stdout == "True False\n", done.stderr
-
-
 PATTERNS = """
 import asyncio, os, signal, sys, reem_async
 from reem_async.pubsub.monitor import Monitor

@@ -80,28 +80,6 @@ def test_leaving_a_with_block_closes_the_interface(server_url, key):
         kvs[key()].read()
 
 
-def test_every_documented_name_is_where_the_manual_has_it():
-    import reem.connection
-    import reem.datatypes
-    import reem.errors
-    import reem.ships
-    import reem_async.connection
-    import reem_async.datatypes
-    import reem_async.ships
-
-    stores = ["KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber"]
-    for package in (reem, reem_async):
-        for module, names in {
-            "connection": ["RedisInterface"],
-            "datatypes": [*stores, "Writer", "Reader", "Publisher"],
-            "ships": ["SpecialDatatypeShip", "NumpyShip"],
-            "errors": ["ReemError", "BadInput", "MissingKey", "Conflict"],
-        }.items():
-            for name in names:
-                assert getattr(getattr(package, module), name) is getattr(package, name)
-    assert reem.ReemError is reem_async.ReemError
-
-
 def test_low_level_writer_reader_and_publisher(interface, kvs, key, raw):
     """They take the manual's path strings and attributes."""
     writer = reem.Writer(key(), interface)

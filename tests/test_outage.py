@@ -417,33 +417,6 @@ def test_what_is_kept_leads_to_what_the_calls_lead_to(seed):
     assert sum(path == ("l", 0) for path, _ in kept.kept) == 1
 
 
-def test_an_outage_ends_in_the_event_loop_after_one_that_was_closed(server):
-    """The task that asked for the server went with the first loop."""
-    interface = reem_async.RedisInterface(server.url)
-    space, store = reem_async.PublishSpace(interface, outage="newest"), reem_async.KeyValueStore(interface)
-
-    async def lose():
-        await space["a"].write(0)
-        server.stop()
-        await space["a"].write(1)
-        await space["a"].write(2)
-
-    async def go_on():
-        await space["a"].write(3)
-        await aeventually(lambda: space.waiting == 0)
-        await space["a"].write(4)
-        assert await store["a"].read() == 4
-        await interface.close()
-
-    first = asyncio.new_event_loop()
-    first.run_until_complete(lose())
-    for task in asyncio.all_tasks(first):  # it would complain of them, as it may
-        task._log_destroy_pending = False
-    first.close()
-    server.start()
-    asyncio.run(go_on())
-
-
 def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):
     front = publisher("drop")
     space, handle = pickle.loads(pickle.dumps((front.kvs, front.kvs["a"]["b"])))

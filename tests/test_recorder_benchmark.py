@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from rich.console import Console
 
-from benchmarks.measure_recorder import LEAST, WRITERS
-from benchmarks.recorder import Window, judge, lines, rewrite, run
+from benchmarks.recorder import Window, judge
 
 
 def _window(tail: float, steal: float = 0.0) -> Window:
@@ -40,24 +38,3 @@ def test_a_run_without_a_quiet_pair_says_so():
     found = judge([(_window(1e-3, 0.05), _window(1e-3))])
 
     assert found["quiet"] == {"pairs": 0}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("whom", ["recorder", *LEAST])
-def test_a_short_run_measures_both_writers_and_is_written_into_the_page(tmp_path, whom):
-    kept = run(whom, pairs=1, minutes=0.01, seconds=1.0, console=Console(quiet=True))
-
-    head, *rows = lines(kept)
-    assert {row[0] for row in rows} == set(WRITERS)
-    for what in WRITERS:
-        found = kept["writers"][what]["all"]
-        assert 0 < found["alone"] < 1
-        assert 0 < found["recorded"] < 1
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- recorder -->\nold\n<!-- end of recorder -->\nafter\n")
-    rewrite(kept, page)
-    text = page.read_text()
-    assert text.startswith("before\n")
-    assert text.endswith("after\n")
-    assert "old" not in text
-    assert all(" | ".join(row) in text for row in [head, *rows])

@@ -8,37 +8,18 @@ import secrets
 import socket
 import threading
 import time
-import traceback
 import zlib
 
 import numpy as np
 import pytest
 from conftest import assert_no_orphans, assert_same, nothing_sent, url_of_user
+from test_ships import Pose, PoseShip
 
 import reem
 import reem_async
 from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, WrongLoop
 
 A = np.arange(3.0)
-
-
-class SetShip(reem.SpecialDatatypeShip):
-    """Stores a set as a Redis list: written twice without a look it would be doubled."""
-
-    def check_fit(self, value):
-        return isinstance(value, set)
-
-    def write(self, key, value, client):
-        client.rpush(key, *sorted(value))
-
-    def read(self, key, client):
-        client.lrange(key, 0, -1)
-
-    def interpret_read(self, responses):
-        return [int(item) for item in responses[0]]
-
-    def get_label(self):
-        return "set"
 
 
 # --- rights, numbers, keys ------------------------------------------------------------------------
@@ -214,43 +195,6 @@ async def test_an_edit_works_after_its_connection_was_killed_while_it_lay_idle(s
             assert await kvs[key()]["n"].read() == n
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "redis://user:s3cret@host:notaport/0",
-        "redis://user:s3cret/@host:6379",
-        "redis://user:6379s3cret#@host",
-        "redis://user:s3cret@host:6379/0?db=x",
-        "redis://user:s3cret@[host:6379/0",
-        "http://user:s3cret@host",
-        "redis+tls://user:s3cret@host",
-        "redis://user:s3cret@127.0.0.1:1",
-        "redis://user:s3cret@127.0.0.1:1/0?nonsense=1",
-    ],
-)
-@pytest.mark.parametrize("module", [reem, reem_async])
-async def test_an_error_over_a_url_never_shows_the_password(module, url):
-    """Neither the message nor the traceback that is printed."""
-
-    async def connect():
-        interface = module.RedisInterface(url)
-        try:
-            done = interface.initialize()
-            if done is not None:
-                await done
-        finally:
-            done = interface.close()
-            if done is not None:
-                await done
-
-    with pytest.raises(reem.ReemError) as caught:
-        await connect()
-    lines = traceback.format_exception(caught.value)
-    shown = "".join(line for line in lines if not line.lstrip().startswith("File"))
-    assert "s3cret" not in shown
-    assert "s3cret" not in repr(caught.value)
-
-
 def test_the_older_protocol_is_refused():
     """Notices and replies share a connection, which only protocol 3 can do."""
     for module in (reem, reem_async):
@@ -335,13 +279,13 @@ def test_a_subclass_of_a_blob_ship_may_override_how_it_writes_and_reads(open_fro
         front.read([key()])
 
 
-@pytest.mark.parametrize("ship", [None, Zipped(), SetShip()])
+@pytest.mark.parametrize("ship", [None, Zipped(), PoseShip()])
 def test_a_foreign_type_under_a_ships_key_is_bad_data_with_the_path(open_front, key, raw, ship):
     """It is not a wrong kind of the document, which is fine."""
     front = open_front(ships=[ship] if ship else None)
-    front.write([key()], {"d": {"v": {1, 2} if isinstance(ship, SetShip) else A}})
+    front.write([key()], {"d": {"v": Pose(1, 2) if isinstance(ship, PoseShip) else A}})
     raw.unlink("{" + key() + "}.d.v")
-    raw.hset("{" + key() + "}.d.v", "x", 1)
+    raw.rpush("{" + key() + "}.d.v", "x")
     with pytest.raises(BadData, match=rf"{key()}\.d\.v"):
         front.read([key()])
     front.write([key(), "d", "v"], 5)

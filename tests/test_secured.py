@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import datetime
-import functools
 import socket
 import ssl
 import threading
@@ -14,11 +13,10 @@ import pytest
 import redis
 import trustme
 from conftest import FRONTS, PATIENCE, PLAIN, assert_same, eventually
-from own_servers import connect, free_port, own_server
+from own_servers import connect, own_server
 
 import reem
 import reem_async
-from reem_async.errors import ServerFailed
 from reem_async.server.process import HOST
 
 both = pytest.mark.parametrize("name", list(FRONTS))
@@ -124,35 +122,12 @@ class Relay:
         self._loop.close()
 
 
-def tls_lines(certificate, ca, ask):
-    return (
-        f"tls-port {free_port()}",
-        f"tls-cert-file {certificate[0]}",
-        f"tls-key-file {certificate[1]}",
-        f"tls-ca-cert-file {ca}",
-        f"tls-auth-clients {'yes' if ask else 'no'}",
-    )
-
-
-@functools.cache
-def speaks_tls(certificate, ca):
-    """Whether the server program was built with TLS (the one in the extra `server` was not)."""
-    with contextlib.suppress(ServerFailed), own_server(*tls_lines(certificate, ca, False)):
-        return True
-    return False
-
-
 @pytest.fixture(scope="module")
 def behind_tls(certificates):
-    """Starts a real server that speaks TLS itself if it can, else behind a relay; yields its port."""
+    """Starts a real server behind a relay that speaks TLS; yields its port."""
 
     @contextlib.contextmanager
     def start(certificate=certificates.server, ask=False):
-        if speaks_tls(certificates.server, certificates.ca):
-            lines = tls_lines(certificate, certificates.ca, ask)
-            with own_server(*lines):
-                yield int(lines[0].split()[1])
-            return
         context = context_for(certificate, certificates.ca if ask else None)
         with own_server() as process, contextlib.closing(Relay(process.socket_path, context)) as relay:
             yield relay.port

@@ -104,6 +104,7 @@ def test_a_ship_carries_its_type_at_any_place(open_front, key, raw, ship, numpy_
     front.append([key(), "l"], Pose(9.0, 9.0))
     assert front.read([key(), "at"]) == Pose(7.0, 8.0)
     assert front.read([key(), "l", -1]) == Pose(9.0, 9.0)
+    assert front.type([key(), "at"]) is Pose
     assert_no_orphans(raw, key())
     front.write([key()], {"at": 1})
     assert keys_of(raw, key()) == set()

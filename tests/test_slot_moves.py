@@ -1,40 +1,31 @@
-"""Slots that move under every kind of call: each is applied as a whole or not at all, and no move is broken.
-
-REEM_SLOT_MOVES=100 makes as many moves under load, REEM_SLOT_SEED=n other ones.
-"""
+"""Slots that move under every kind of call: each is applied as a whole or not at all, and no move is broken."""
 
 import asyncio
 import collections
 import contextlib
 import itertools
-import os
+import random
+import threading
+import time
 
 import numpy as np
 import pytest
 from callkit import CALLS
 from clusterkit import Move, assert_tidy, clients_of, raw_of, slot_of
-from conftest import assert_same
-from slotload import load
+from conftest import aeventually, assert_same, sized
 
+import reem
 import reem_async
 from reem_async.errors import MissingKey, NotConnected, PartialWrite, PathRefused
 from reem_async.server.cluster import EmbeddedCluster
 
-MOVES = int(os.environ.get("REEM_SLOT_MOVES", "5"))
-SEED = int(os.environ.get("REEM_SLOT_SEED", "1"))
+MOVES = sized(5, 30)
 
 
 @pytest.fixture(scope="module")
 def cluster():
     with EmbeddedCluster(primaries=3, replicas=0) as running:
         yield running
-
-
-async def test_a_slot_that_moves_under_load_leaves_every_call_whole(cluster):
-    """What the calls said is what is there, mirrors are equal, and nothing is left that nobody refers to."""
-    done, refused = await load(cluster, MOVES, SEED)
-    print(f"{MOVES} moves: {done} calls done, {refused} refused")
-    assert done > 20 * MOVES
 
 
 PHASES = {
@@ -91,6 +82,19 @@ class Case:
         assert self.due is None, (self.space, self.kind, self.told)
 
 
+@contextlib.asynccontextmanager
+async def cases_in_one_slot(cluster, key, timeout):
+    """A case for each kind of call, of a store and of a publish space, all of them on keys of one slot."""
+    kinds = [(space, kind) for kind in CALLS for space in ("KeyValueStore", "PublishSpace")]
+    kinds.remove(("PublishSpace", "an edit"))
+    async with contextlib.AsyncExitStack() as stack:
+        over = {
+            kind: await stack.enter_async_context(reem_async.RedisInterface(cluster, timeout=timeout)) for kind in CALLS
+        }
+        names = names_of_one_slot(key(), len(kinds))
+        yield [Case(name, over[kind], space, kind) for name, (space, kind) in zip(names, kinds, strict=True)]
+
+
 FIRST = [
     "nothing has left",
     "the document has left",
@@ -105,14 +109,8 @@ FIRST = [
 )
 async def test_a_call_to_a_slot_on_its_way_is_whole_or_refused(cluster, key, phase):
     """Nothing is on both nodes, the rest can be moved, and then there is what the call said, and nothing else."""
-    kinds = [(space, kind) for kind in CALLS for space in ("KeyValueStore", "PublishSpace")]
-    kinds.remove(("PublishSpace", "an edit"))
-    names = names_of_one_slot(key(), len(kinds))
-    async with contextlib.AsyncExitStack() as stack:
-        over = {
-            kind: await stack.enter_async_context(reem_async.RedisInterface(cluster, timeout=0.3)) for kind in CALLS
-        }
-        cases = [Case(name, over[kind], space, kind) for name, (space, kind) in zip(names, kinds, strict=True)]
+    async with cases_in_one_slot(cluster, key, 0.3) as cases:
+        names = [case.name for case in cases]
         await asyncio.gather(*(case.prepare() for case in cases))
         move = Move(cluster, names[0]).begin()
         for moved in filter(PHASES[phase], move.all_keys()):
@@ -131,20 +129,74 @@ async def test_a_call_to_a_slot_on_its_way_is_whole_or_refused(cluster, key, pha
         assert told["PublishSpace", "done"] or phase not in GO, told
 
 
-@pytest.mark.parametrize("json", [True, False], ids=["json", "plain"])
-async def test_a_registry_that_has_not_gone_yet_is_not_taken_for_missing(json):
+def moved(cluster, key, chance):
+    """Move the slot: key by key in any order, or in batches as redis-cli does it, the nodes told in either order."""
+    move = Move(cluster, key).begin()
+    batch, pause = chance.choice([1, 3, 10]), chance.choice([0, 0.002, 0.01])
+    while keys := move.all_keys():
+        chance.shuffle(keys)
+        with raw_of(move.source) as client:
+            client.execute_command("MIGRATE", "127.0.0.1", move.target.port, "", 0, 5000, "KEYS", *keys[:batch])
+        time.sleep(chance.random() * pause)
+    move.finish(source_first=chance.random() < 0.5)
+
+
+async def test_a_slot_that_moves_under_load_leaves_every_call_whole(cluster, key):
+    """What the calls said is what is there, mirrors are equal, and nothing is left that nobody refers to."""
+    chance, stopping, told = random.Random(1), threading.Event(), collections.Counter()
+
+    async def work(case):
+        while not stopping.is_set():
+            with contextlib.suppress(NotConnected):
+                await case.prepare()
+                await case.make()
+                await case.check()
+                told[case.told] += 1
+
+    def count(name):
+        """Count, in the blocking front; what is refused was not applied."""
+        with reem.RedisInterface(cluster, timeout=5) as interface:
+            kvs, space, number = reem.KeyValueStore(interface), reem.PublishSpace(interface), 0
+            space[name] = {"n": 0, "l": [np.zeros(2)]}
+            while not stopping.is_set():
+                with contextlib.suppress(NotConnected):
+                    space[name]["l"][0] = np.full(2, number)
+                    space[name]["n"] += 1
+                    number += 1
+            assert kvs[name]["n"].read() == number > MOVES
+
+    async with cases_in_one_slot(cluster, key, 5) as cases, reem_async.RedisInterface(cluster) as interface:
+        names = [*(case.name for case in cases), names_of_one_slot(key(), len(cases) + 1)[-1]]
+        mirror = reem_async.SilentSubscriber(names[-1], interface)
+        await mirror.listen()
+        tasks = [asyncio.create_task(work(case)) for case in cases]
+        tasks.append(asyncio.create_task(asyncio.to_thread(count, names[-1])))
+        try:
+            for _ in range(MOVES):
+                await asyncio.to_thread(moved, cluster, names[0], chance)
+        finally:
+            stopping.set()
+            await asyncio.gather(*tasks)
+        truth = await reem_async.KeyValueStore(interface)[names[-1]].read()
+        await aeventually(lambda: mirror.value()["n"] == truth["n"])
+        assert_same(mirror.value(), truth)
+        with clients_of(cluster.nodes) as clients:
+            assert_tidy(clients, *names)
+    assert told["done"] > 20 * MOVES, told
+
+
+async def test_a_registry_that_has_not_gone_yet_is_not_taken_for_missing(cluster):
     """The document has gone ahead of its array, which the interface that replaces it does not know of."""
-    with EmbeddedCluster(primaries=3, replicas=0, json=json) as own:
-        async with reem_async.RedisInterface(own) as one, reem_async.RedisInterface(own, timeout=0.3) as two:
-            await reem_async.KeyValueStore(one)["cam"].write({"n": 1, "image": np.arange(5)})
-            cam = reem_async.KeyValueStore(two)["cam"]
-            await reem_async.KeyValueStore(two)["warm"].write(1)
-            move = Move(own, "cam").begin()
-            move.take("cam")
-            with pytest.raises(PartialWrite, match="arrays that nothing refers to could not be removed"):
-                await cam.write({"n": 2})
-            move.finish()
-            assert await cam.read() == {"n": 2}
-            await cam.write({"n": 3})
-            with raw_of(move.target) as client:
-                assert not client.exists("{cam}.image")
+    async with reem_async.RedisInterface(cluster) as one, reem_async.RedisInterface(cluster, timeout=0.3) as two:
+        await reem_async.KeyValueStore(one)["cam"].write({"n": 1, "image": np.arange(5)})
+        cam = reem_async.KeyValueStore(two)["cam"]
+        await reem_async.KeyValueStore(two)["warm"].write(1)
+        move = Move(cluster, "cam").begin()
+        move.take("cam")
+        with pytest.raises(PartialWrite, match="arrays that nothing refers to could not be removed"):
+            await cam.write({"n": 2})
+        move.finish()
+        assert await cam.read() == {"n": 2}
+        await cam.write({"n": 3})
+        with raw_of(move.target) as client:
+            assert not client.exists("{cam}.image")

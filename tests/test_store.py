@@ -114,40 +114,6 @@ async def test_the_interface_need_not_be_initialized(server_url, key):
     await kvs.interface.close()
 
 
-def test_types_are_python_types(front, key):
-    """Of the value as it would be read."""
-    values = {
-        "d": ({"a": 1}, dict),
-        "l": ([1], list),
-        "i": (5, int),
-        "big": (2**64 - 1, int),
-        "f": (5.0, float),
-        "long": (0.9374604873776271, float),
-        "b": (True, bool),
-        "s": ("x", str),
-        "ship": ("$ship x", str),
-        "n": (None, type(None)),
-        "a": (np.arange(3), np.ndarray),
-        "bytes": (b"x", bytes),
-    }
-    front.write([key()], {name: value for name, (value, _) in values.items()})
-    assert front.type([key()]) is dict
-    for name, (value, expected) in values.items():
-        assert front.type([key(), name]) is expected
-        front.write([key(name)], value)
-        assert front.type([key(name)]) is expected
-
-
-def test_the_schema_switch_of_the_first_reem_is_taken_and_does_nothing(front, key):
-    front.kvs.track_schema_changes(False)
-    front.kvs.track_schema_changes(track=False, keys=[key()])
-    front.write([key()], {"n": 1})
-    front.write([key()], {"n": np.zeros(3)})
-    assert_same(front.read([key()]), {"n": np.zeros(3)})
-    with pytest.raises(TypeError):
-        front.kvs.track_schema_changes()
-
-
 def test_a_publish_space_cannot_be_read(open_front, key):
     """It is a store that only writes; the error says so."""
     front = open_front("PublishSpace")
