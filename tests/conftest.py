@@ -110,6 +110,24 @@ def server_url(request):
         yield url
 
 
+@pytest.fixture
+def server():
+    """A server of the test's own, to be stopped and killed."""
+    from reem_async.server.embedded import EmbeddedServer
+
+    with EmbeddedServer() as own:
+        yield own
+
+
+@pytest.fixture(scope="module")
+def watched(tmp_path_factory):
+    """A primary and a replica that sentinels watch."""
+    from sentinelkit import Watched
+
+    with contextlib.ExitStack() as stack:
+        yield Watched(tmp_path_factory.mktemp("sentinels"), stack)
+
+
 ONE_SERVER = {
     "test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks": "in a cluster it takes a second",
     "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",

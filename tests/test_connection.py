@@ -25,13 +25,6 @@ from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
 
-@pytest.fixture
-def server():
-    """A server of the test's own, to be stopped and killed."""
-    with EmbeddedServer() as own:
-        yield own
-
-
 @contextlib.contextmanager
 def stopped(server):
     """The server stands still inside the block."""

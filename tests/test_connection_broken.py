@@ -18,17 +18,10 @@ from test_connection import stopped
 import reem
 import reem_async
 from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected, PartialWrite
-from reem_async.server import EmbeddedServer
 from reem_async.transport.blocking import BlockingTransport
 from reem_async.transport.options import Options
 
 LARGE = np.zeros(1_000_000)
-
-
-@pytest.fixture
-def server():
-    with EmbeddedServer() as own:
-        yield own
 
 
 @pytest.fixture

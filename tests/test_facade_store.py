@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import gc
 import logging
-import pickle
 import signal
 import threading
 import time
@@ -63,48 +62,12 @@ def test_the_host_may_be_positional_a_keyword_or_a_url(server_url, key):
         interface.close()
 
 
-def test_a_store_takes_the_address_itself(server_url, key):
-    """As since REEM 0.1."""
-    kvs = KeyValueStore(server_url)
-    kvs[key()] = 1
-    assert kvs[key()].read() == 1
-    assert isinstance(kvs.interface, RedisInterface)
-    kvs.interface.close()
-
-
 def test_leaving_a_with_block_closes_the_interface(server_url, key):
     with RedisInterface(server_url) as interface:
         kvs = KeyValueStore(interface)
         kvs[key()] = 1
     with pytest.raises(reem.InterfaceClosed):
         kvs[key()].read()
-
-
-def test_low_level_writer_reader_and_publisher(interface, kvs, key, raw):
-    """They take the manual's path strings and attributes."""
-    writer = reem.Writer(key(), interface)
-    writer.send_to_redis(".", {"a": {}})
-    writer.send_to_redis(".a.b", {"image": np.arange(3)})
-    reader = reem.Reader(top_key_name=key(), interface=interface)
-    assert_same(reader.read_from_redis(".a.b.image"), np.arange(3))
-    assert_same(reader.read_from_redis("."), {"a": {"b": {"image": np.arange(3)}}})
-    reem.Publisher(key(), interface).send_to_redis(".a.b", 1)
-    assert kvs[key()].read() == {"a": {"b": 1}}
-    assert (writer.top_key_name, writer.interface) == (key(), interface)
-    assert_no_orphans(raw, key())
-
-
-def test_handles_can_be_pickled(kvs, pspace, interface, key):
-    kvs[key()] = {"a": np.arange(3)}
-    store, accessor, publishing, bare = (
-        pickle.loads(pickle.dumps(it)) for it in (kvs, kvs[key()]["a"], pspace, interface)
-    )
-    assert_same(store[key()].read(), {"a": np.arange(3)})
-    assert_same(accessor.read(), np.arange(3))
-    publishing[key()]["a"] = 5
-    assert KeyValueStore(bare)[key()]["a"].read() == 5
-    for opened in (store.interface, publishing.interface, bare):
-        opened.close()
 
 
 # --- threads and visibility ------------------------------------------------------------------------

@@ -15,7 +15,6 @@ from reem_async.errors import NotAllowed, ServerNotReady
 from reem_async.plan.keys import keys_of
 from reem_async.pubsub.manager import manager_of
 from reem_async.pubsub.monitor import Monitor
-from reem_async.server import EmbeddedServer
 
 PATIENCE = 10
 
@@ -25,12 +24,6 @@ class Mine(reem_async.BytesShip):
 
     def get_label(self):
         return "mine"
-
-
-@pytest.fixture
-def server():
-    with EmbeddedServer() as server:
-        yield server
 
 
 @pytest.fixture

@@ -120,15 +120,6 @@ def test_printing_a_handle_says_what_it_is(kvs, pspace, akvs_handle, key):
     assert repr(pspace[key()]) == f"<PublishAccessor {key()}: read its value with a KeyValueStore>"
 
 
-def test_storing_a_handle_says_to_read_it(kvs, key):
-    """At the top and inside of what is stored."""
-    kvs[key()] = {"n": 1}
-    for value in (kvs[key()]["n"], {"x": kvs[key()]["n"]}, [kvs[key()]["n"]]):
-        with pytest.raises(BadType, match=r"\.read\(\)"):
-            kvs[key()]["m"] = value
-    assert kvs[key()].read() == {"n": 1}
-
-
 def test_what_a_dict_user_types(kvs, key, raw):
     """`in`, `for` and `keys` look without fetching a value."""
     kvs[key()] = {"a": 1, "image": np.zeros((480, 640, 3), np.uint8), "d": {"\u4e00": {}}}
@@ -306,29 +297,6 @@ async def test_what_cannot_wait_says_what_to_await(akvs, key):
         assert remedy in str(caught.value)
 
 
-def test_writing_an_item_of_an_array_says_to_write_it_as_a_whole(kvs, key):
-    """Its server knows the array as a text, and said that a list was too short."""
-    kvs[key()] = {"image": np.zeros((2, 2)), "l": [1]}
-    for place in (kvs[key()]["image"], kvs[key()]["l"]):
-        with pytest.raises(PathRefused, match=r"\[7\]: .*"):
-            place[7] = 3
-    with pytest.raises(PathRefused, match="write an array as a whole"):
-        kvs[key()]["image"][0] = 3
-
-
-@pytest.mark.parametrize("space", ["kvs", "pspace"])
-def test_an_item_where_no_list_is_is_refused_with_what_is_there(request, kvs, key, space):
-    """Servers with the module say of all of them that the index is out of range."""
-    kvs[key()] = {"d": {"x": 1}, "s": "text", "n": 5, "l": [1]}
-    place = request.getfixturevalue(space)[key()]
-    for name, kind in (("d", "object"), ("s", "string"), ("n", "integer")):
-        with pytest.raises(PathRefused, match=rf"\.{name} is of type {kind} and has no element 0"):
-            place[name][0] = 1
-    with pytest.raises(PathRefused, match=r"the list index is out of range; a list only grows by appending$"):
-        place["l"][1] = 1
-    assert kvs[key()].read() == {"d": {"x": 1}, "s": "text", "n": 5, "l": [1]}
-
-
 def test_a_key_with_a_dot_is_shown_quoted(kvs, key):
     """So that it cannot be taken for a path, and what is shown can be typed."""
     for path in [("m.a",), ("m.a", "x"), ("a[0]",), ('a"b', 3), ("plain", "x"), (".x",), ("a b", "c.d")]:
@@ -343,16 +311,6 @@ def test_a_key_with_a_dot_is_shown_quoted(kvs, key):
         kvs[dotted]["x"].read()
 
 
-def test_an_item_of_an_array_says_that_arrays_are_read_whole(kvs, key):
-    """Of a list that is too short it says no such thing."""
-    kvs[key()] = {"image": np.zeros((2, 2)), "l": [1]}
-    with pytest.raises(MissingKey, match=r"image is an array, and arrays are read whole: read it, then take \[0\]"):
-        kvs[key()]["image"][0].read()
-    for place in (kvs[key()]["l"][5], kvs[key()]["image"][0][1], kvs[key()]["none"][0]):
-        with pytest.raises(MissingKey, match="nothing is stored at"):
-            place.read()
-
-
 def test_ipython_is_offered_the_keys(kvs, pspace, key):
     """After `kvs["` and `kvs["foo"]["`; nothing where there are none."""
     kvs[key()] = {"a": 1, "b": 2}
@@ -360,3 +318,33 @@ def test_ipython_is_offered_the_keys(kvs, pspace, key):
     assert kvs[key()]._ipython_key_completions_() == ["a", "b"]
     assert kvs[key()]["a"]._ipython_key_completions_() == []
     assert pspace[key()]._ipython_key_completions_() == []
+
+
+WHOLE = "image is an array, and arrays are read whole: read it, then take \\[0\\]"
+REFUSALS = [
+    (lambda at: at.write({"x": at["n"]}), BadType, r"\.read\(\)"),
+    (lambda at: at["m"].write(at["n"]), BadType, r"\.read\(\)"),
+    (lambda at: at["image"][0].write(3), PathRefused, "write an array as a whole"),
+    (lambda at: at["image"][7].write(3), PathRefused, r"\[7\]: "),
+    (lambda at: at["l"][1].write(1), PathRefused, "the list index is out of range; a list only grows by appending$"),
+    (lambda at: at["d"][0].write(1), PathRefused, r"\.d is of type object and has no element 0"),
+    (lambda at: at["s"][0].write(1), PathRefused, r"\.s is of type string and has no element 0"),
+    (lambda at: at["n"][0].write(1), PathRefused, r"\.n is of type integer and has no element 0"),
+]
+MISSING = [
+    (lambda at: at["image"][0].read(), MissingKey, WHOLE),
+    (lambda at: at["image"][0][1].read(), MissingKey, "nothing is stored at"),
+    (lambda at: at["l"][5].read(), MissingKey, "nothing is stored at"),
+    (lambda at: at["none"][0].read(), MissingKey, "nothing is stored at"),
+]
+
+
+@pytest.mark.parametrize(("space", "call", "error", "match"), [
+    *(("pspace", *row) for row in REFUSALS), *(("kvs", *row) for row in REFUSALS + MISSING),
+])  # fmt: skip
+def test_what_cannot_be_done_at_a_place_says_what_is_there_or_what_to_do(request, kvs, key, space, call, error, match):
+    value = {"d": {"x": 1}, "s": "text", "n": 5, "l": [1], "image": np.zeros((2, 2))}
+    kvs[key()] = value
+    with pytest.raises(error, match=match):
+        call(request.getfixturevalue(space)[key()])
+    assert_same(kvs[key()].read(), value)

@@ -15,15 +15,8 @@ from conftest import assert_same, eventually
 
 import reem
 import reem_async
-from reem_async.server import EmbeddedServer
 from reem_async.transport import blocking
 from reem_async.transport.wire import BUFFER
-
-
-@pytest.fixture
-def server():
-    with EmbeddedServer() as own:
-        yield own
 
 
 @pytest.fixture

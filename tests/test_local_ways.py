@@ -5,7 +5,6 @@ import contextlib
 import numpy as np
 import pytest
 from conftest import FRONTS, aeventually, assert_same, eventually
-from sentinelkit import Watched
 from slotkit import in_slot
 
 import reem
@@ -193,12 +192,6 @@ async def test_every_way_of_hearing(mode, server_url, key):
                 assert_same(called[-1], value)
                 assert_same(subscriber.value(), value)
             del callback
-
-
-@pytest.fixture(scope="module")
-def watched(tmp_path_factory):
-    with contextlib.ExitStack() as stack:
-        yield Watched(tmp_path_factory.mktemp("sentinels"), stack)
 
 
 @pytest.fixture(scope="module")

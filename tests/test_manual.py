@@ -157,5 +157,7 @@ def test_the_documented_classes_have_the_documented_attributes(opened, key):
     SilentSubscriber(key(), interface)
     reem.datatypes.Writer(key(), interface).send_to_redis(set_path=".", set_value={"a": np.arange(2)})
     assert_same(reem.datatypes.Reader(key(), interface).read_from_redis(read_path=".a"), np.arange(2))
+    reem.datatypes.Publisher(key(), interface).send_to_redis(".a", 1)
+    assert KeyValueStore(interface)[key()].read() == {"a": 1}
     KeyValueStore(interface).track_schema_changes(set_value=False, keys=[key()])
     PublishSpace(interface).track_schema_changes(False)

@@ -27,12 +27,6 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture
-def server():
-    with EmbeddedServer() as own:
-        yield own
-
-
 @pytest.fixture(params=list(FRONTS))
 def connect(request):
     """Opens either front at a host and port; all are closed at the end."""

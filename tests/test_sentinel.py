@@ -9,17 +9,10 @@ import socket
 import pytest
 from conftest import FRONTS, aeventually, eventually
 from loadkit import Load
-from sentinelkit import Watched
 
 import reem
 import reem_async
 from reem_async.errors import BadType, ConnectionLost, NotConnected, ServerReadOnly
-
-
-@pytest.fixture(scope="module")
-def watched(tmp_path_factory):
-    with contextlib.ExitStack() as stack:
-        yield Watched(tmp_path_factory.mktemp("sentinels"), stack)
 
 
 @pytest.fixture(params=list(FRONTS))

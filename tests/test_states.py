@@ -54,27 +54,6 @@ def test_a_callback_on_the_main_thread_may_publish_too(server_url, key):
         interface.close()
 
 
-def test_a_callback_that_is_interrupted_silences_no_later_one():
-    """Though somebody keeps what was raised, as a prompt does."""
-    states, heard, kept = States(), [], []
-
-    def told(change):
-        if change.state == "connected" and not kept:
-            raise KeyboardInterrupt
-        heard.append(change.state)
-
-    states.call(told)
-    try:
-        states.opened("there", "1")
-    except KeyboardInterrupt as error:
-        kept.append(error)
-    states.lost(OSError("cut"))
-    states.opened("there", "1")
-    states.closed()
-    assert kept
-    assert heard == ["lost", "connected", "closed"]
-
-
 def test_changes_are_told_in_order_while_a_callback_waits_for_another_thread():
     """Who notes the next change does not wait for it."""
     states, told, go_on = States(), [], threading.Event()

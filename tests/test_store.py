@@ -93,25 +93,27 @@ async def test_an_async_program_reads_what_a_blocking_one_wrote_and_the_reverse(
     assert_same(kvs[key("back")].read(), value)
 
 
-async def test_async_handles_can_be_pickled(akvs, apspace, key):
-    """They reconnect in the loop that uses them."""
-    await akvs[key()].write({"a": np.arange(3)})
-    store, accessor = pickle.loads(pickle.dumps((akvs, akvs[key()]["a"])))
-    assert_same(await accessor.read(), np.arange(3))
-    assert_same(await store[key()].read(), {"a": np.arange(3)})
-    await store.interface.close()
-    publishing = pickle.loads(pickle.dumps(apspace))
-    await publishing[key()]["a"].write(1)
-    await publishing.interface.close()
-    assert await akvs[key()].read() == {"a": 1}
-
-
 async def test_the_interface_need_not_be_initialized(server_url, key):
     """The first call connects; `KeyValueStore` also takes the address itself."""
     kvs = reem_async.KeyValueStore(server_url)
     await kvs[key()].write(1)
     assert await kvs[key()].read() == 1
     await kvs.interface.close()
+
+
+def test_handles_can_be_pickled(open_front, key):
+    """Stores, accessors, publish spaces and interfaces reconnect."""
+    front, space = open_front(), open_front("PublishSpace")
+    front.write([key()], {"a": np.arange(3)})
+    store, accessor = pickle.loads(pickle.dumps((front.kvs, front.at([key(), "a"]))))
+    assert_same(front.wait(store[key()].read()), {"a": np.arange(3)})
+    assert_same(front.wait(accessor.read()), np.arange(3))
+    publishing, bare = (pickle.loads(pickle.dumps(it)) for it in (space.kvs, space.interface))
+    space.wait(publishing[key()]["a"].write(5))
+    assert front.read([key(), "a"]) == 5
+    front.wait(store.interface.close())
+    space.wait(publishing.interface.close())
+    space.wait(bare.close())
 
 
 def test_a_publish_space_cannot_be_read(open_front, key):
