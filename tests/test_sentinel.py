@@ -8,7 +8,7 @@ import socket
 
 import pytest
 from conftest import FRONTS, aeventually, eventually
-from loadkit import Load
+from loadkit import load
 
 import reem
 import reem_async
@@ -166,8 +166,7 @@ async def test_what_is_stored_after_a_switch_is_told_by_the_new_primary(watched)
 
 async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
     """Killed -9: calls fail until the sentinels have agreed; followers converge, and say that there is a gap."""
-    load = Load(watched.url, "robot", failover=True)
-    async with reem_async.RedisInterface(watched.url) as interface, load.running():
+    async with reem_async.RedisInterface(watched.url) as interface, load(watched.url, "robot") as gaps:
         changes = []
         interface.on_state(changes.append)
         store = reem_async.KeyValueStore(interface)
@@ -182,4 +181,4 @@ async def test_a_failover_is_seen_as_a_change_of_state_and_all_go_on(watched):
                     pass
         assert [change.state for change in changes] == ["lost", "reconnecting", "connected"]
         assert changes[-1].restarted
-    assert load.gaps >= 1
+    assert gaps
