@@ -154,7 +154,6 @@ WITH_MODULE = {
     "test_outline_tells_what_is_there_without_fetching_arrays": "counts GET",
     "test_a_write_that_loses_the_server_before_its_last_step_says_so": "without it there is no such step",
     "test_the_servers_own_text_would_not_do": "shows how the module reads numbers",
-    "test_what_a_user_may_not_do_is_named": "takes away rights to the module's commands",
     "test_a_client_that_may_not_read_the_document_removes_no_array_of_it": "may ask for the type of a document alone",
     "test_without_the_right_to_use_json_one_hears_of_it_on_connecting": "the same",
     "test_each_short_key_of_odd_characters_is_addressed_exactly_or_refused": "tries how the module reads paths",
@@ -339,6 +338,14 @@ async def binterface(server_url):
 @pytest.fixture
 def file(tmp_path):
     return tmp_path / "run.mcap"
+
+
+@pytest.fixture
+def cli(server_url, key):
+    """The command line, in a namespace of the test's own."""
+    from clikit import CommandLine
+
+    return CommandLine(server_url, f"{key.prefix}:")
 
 
 @pytest.fixture

@@ -20,11 +20,8 @@ from picturekit import resident
 from PIL import Image
 
 import reem
-from reem_async.plan.trees import walk
 from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import listen
-from reem_async.tools.browser.arrays import file_of
-from reem_async.tools.browser.trees import Leaf
 
 
 @pytest.fixture(scope="module")
@@ -358,47 +355,10 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
     assert items == [str(item) for item in kvs[key()]["items"].read()]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda number: {"img": np.full((20, 20), number, np.uint8)},
-        lambda number: np.full(5, number),
-        lambda number: {"n": number, "blob": "x" * 300_000},
-        lambda number: {"raw": bytes([number])},
-    ],
-)
-def test_the_past_of_what_is_only_stored_is_not_the_present(page, ask, kvs, key, make):
-    """Arrays of the same shape leave the document's text as it is; that of long ones is not kept at first."""
-    name, (_, source) = key(), page
-    known = {}
-    kvs[name] = make(0)
-    eventually(lambda: name in source.history.names)
-    time.sleep(1.5)  # what it holds has been looked at
-    for number in range(1, 5):
-        before = len(source.history.times((name,)))
-        kvs[name] = make(number)
-        eventually(lambda before=before: len(source.history.times((name,))) > before)
-        eventually(lambda: is_known(source, name))
-        known[time.time()] = number
-    found = {at: content(ask, name, at) for at in known}
-    assert found == {at: content_of(make(number)) for at, number in known.items()}
-
-
-def is_known(source, name):
-    """Whether the buffer has all of a key: arrays are read a moment after the rest."""
-    kept = source.history.kept((name,), time.time())
-    return not kept.late and not any(isinstance(it, Leaf) for _, it in walk(kept.value, ()))
-
-
 def content(ask, name, at):
     """What is shown of the past, None if it is not kept."""
     answer = ask.http.get(f"/view/{name}", params={"format": "json", "at": at})
     return answer.json() if answer.status_code == 200 else None
-
-
-def content_of(value):
-    return orjson.loads(file_of(value, ("x",), "json", None)[0])
 
 
 def test_what_comes_back_as_it_was_is_there_again(ask, kvs, key):

@@ -99,6 +99,10 @@ async def test_each_way_of_storing_is_seen_when_the_server_tells_of_it(server_ur
             await akvs[key("array")].write(np.full(5, float(number)))
             await seen(source, np.full((30, 30), float(number)), key(), "image")
             await seen(source, np.full(5, float(number)), key("array"))
+        for number, blob in ((1, b"a"), (2, b"b")):  # the document's text stays as it is, or is not kept at first
+            await akvs[key()].update({"raw": blob, "long": str(number) * 300_000})
+            await seen(source, blob, key(), "raw")
+            await seen(source, str(number) * 300_000, key(), "long")
         raw.delete(key("gone"))
         await seen(source, MISSING, key("gone"))
         await akvs[key("gone")].write(2)

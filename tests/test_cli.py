@@ -24,11 +24,6 @@ from reem_async.tools.cli.commands import COMMANDS
 
 
 @pytest.fixture
-def cli(server_url, key):
-    return CommandLine(server_url, f"{key.prefix}:")
-
-
-@pytest.fixture
 def kvs(cli):
     """A store in the same namespace, with something in it."""
     with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:

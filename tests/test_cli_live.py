@@ -12,7 +12,6 @@ import time
 
 import numpy as np
 import pytest
-from clikit import CommandLine
 from conftest import RawCluster, eventually, subscribed, subscriptions
 
 import reem as blocking
@@ -24,11 +23,6 @@ from reem_async.pubsub.monitor import Event
 from reem_async.tools.cli import following
 from reem_async.tools.cli.following import Ending, follow
 from reem_async.tools.cli.top import BANDWIDTH, DELAY, RATE, Window, spread
-
-
-@pytest.fixture
-def cli(server_url, key):
-    return CommandLine(server_url, f"{key.prefix}:")
 
 
 @pytest.fixture

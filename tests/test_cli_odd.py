@@ -16,7 +16,7 @@ import numpy as np
 import orjson
 import pytest
 import typer
-from clikit import REEM, CommandLine, invoked
+from clikit import REEM, invoked
 from conftest import assert_same
 from snapshotkit import servers  # noqa: F401 - a fixture
 
@@ -38,24 +38,19 @@ from reem_async.tools.snapshots.rdb import describe_rdb
 
 
 @pytest.fixture
-def reem(server_url, key):
-    return CommandLine(server_url, key("foo:"))
-
-
-@pytest.fixture
-def kvs(server_url, key):
-    with blocking.RedisInterface(server_url, namespace=key("foo:")) as interface:
+def kvs(cli):
+    with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
         yield blocking.KeyValueStore(interface)
 
 
 @pytest.mark.parametrize(
     ("press", "code", "left"), [("^C", 130, ["a"]), ("n\n", 1, ["a"]), ("\x04", 1, ["a"]), ("y\n", 0, [])]
 )
-def test_before_a_whole_key_goes_it_is_asked(reem, kvs, press, code, left):
+def test_before_a_whole_key_goes_it_is_asked(cli, kvs, press, code, left):
     kvs["a"] = 1
     mine, its = pty.openpty()
     pipes = {"stdin": its, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(reem.words("del", "a"), env=reem.environment(), **pipes) as process:
+    with subprocess.Popen(cli.words("del", "a"), env=cli.environment(), **pipes) as process:
         said = b""
         while b"[y/N]" not in said:
             said += process.stderr.read(1)
@@ -96,7 +91,7 @@ def test_a_format_of_an_export_that_there_is_not(tmp_path, options, said):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(reem, kvs, tmp_path, monkeypatch):
+def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(cli, kvs, tmp_path, monkeypatch):
     kvs["a"] = np.arange(3)
     file, write = tmp_path / "a.npy", FILES[".npy"]
 
@@ -105,7 +100,7 @@ def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(reem, kvs, tmp
         return write(*arguments)
 
     monkeypatch.setitem(FILES, ".npy", meanwhile)
-    assert "there already; choose another name, or replace it with" in reem.error(2, "get", "a", "-o", file)
+    assert "there already; choose another name, or replace it with" in cli.error(2, "get", "a", "-o", file)
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"precious"]
 
 
@@ -153,14 +148,14 @@ def test_a_restore_that_fails_says_how_far_it_came(servers, tmp_path):  # noqa: 
 
 
 @pytest.mark.long
-def test_saving_by_period_ends_with_its_reader(reem, kvs, tmp_path):
+def test_saving_by_period_ends_with_its_reader(cli, kvs, tmp_path):
     kvs["a"] = 1
     words = shlex.join(
-        [REEM, "snapshot", "save", "--namespace", reem.namespace, "--every", "1s", "-d", str(tmp_path), "--keep", "3"]
+        [REEM, "snapshot", "save", "--namespace", cli.namespace, "--every", "1s", "-d", str(tmp_path), "--keep", "3"]
     )
     run = subprocess.run(
         ["sh", "-c", f"{words} | head -1"],
-        env=reem.environment(),
+        env=cli.environment(),
         capture_output=True,
         text=True,
         timeout=20,
@@ -314,17 +309,17 @@ def test_json_keeps_every_value_beside_any_other(seed):
     assert json.loads(json_text([np.datetime64("NaT"), np.float32(0.1), np.zeros((2, 0))])) == ["NaT", 0.1, [[], []]]
 
 
-def test_a_terminal_that_does_not_know_all_characters(reem, kvs):
+def test_a_terminal_that_does_not_know_all_characters(cli, kvs):
     kvs["a"] = {"text": "日本"}
-    run = reem.process("tree", PYTHONIOENCODING="ascii")
+    run = cli.process("tree", PYTHONIOENCODING="ascii")
     assert (run.returncode, "\\u65e5" in run.stdout) == (0, True)
 
 
-def test_without_an_output(reem, kvs):
+def test_without_an_output(cli, kvs):
     kvs["a"] = 1
-    words = shlex.join(reem.words("ls"))
+    words = shlex.join(cli.words("ls"))
     run = subprocess.run(
-        ["sh", "-c", f"{words} >&-"], env=reem.environment(), capture_output=True, text=True, timeout=20, check=False
+        ["sh", "-c", f"{words} >&-"], env=cli.environment(), capture_output=True, text=True, timeout=20, check=False
     )
     assert (run.returncode, run.stderr) == (0, "")
 
@@ -359,11 +354,11 @@ def test_paths_are_shown_as_they_can_be_typed(path):
     assert parse(shown) == path
 
 
-def test_a_pipe_is_no_snapshot(reem, tmp_path):
+def test_a_pipe_is_no_snapshot(cli, tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    environment = reem.environment()
+    environment = cli.environment()
     run = subprocess.run(
-        [reem.words("up")[0], "up", "--from", str(tmp_path / "pipe")],
+        [cli.words("up")[0], "up", "--from", str(tmp_path / "pipe")],
         env=environment,
         capture_output=True,
         text=True,

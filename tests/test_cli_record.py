@@ -38,9 +38,8 @@ def reem(server_url, tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def recorded(key, server_url, pspace, tmp_path):
+def recorded(key, server_url, pspace, file, tmp_path):
     pspace[key("a")] = {"n": 0, "image": IMAGE}
-    file = tmp_path / "run.mcap"
     with started(server_url, tmp_path, "record", key("*"), "-o", file, "--json") as process:
         said = [begins(process, as_json=True)]
         eventually(lambda: is_recording(file))  # so that the updates are in a chunk of their own
@@ -55,10 +54,9 @@ def recorded(key, server_url, pspace, tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="only Linux has a scheduling class for what can wait")
 @pytest.mark.parametrize("background", [True, False])
-def test_in_the_background_it_takes_only_what_nobody_else_wants(background, key, server_url, pspace, tmp_path):
+def test_in_the_background_it_takes_only_what_nobody_else_wants(background, key, server_url, pspace, file, tmp_path):
     """What reads and what writes; without --background it only does not take the processor from others."""
     pspace[key("a")] = 1
-    file = tmp_path / "run.mcap"
     option = ["--background"] if background else []
     with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
         begins(process)
@@ -148,8 +146,9 @@ def test_step(key, recorded, server_url, kvs, tmp_path):
 
 
 @pytest.mark.parametrize("option", [[], ["--json"]], ids=["text", "json"])
-def test_once_it_says_that_it_has_begun_nothing_is_missed_and_ctrl_c_ends_it(option, key, server_url, pspace, tmp_path):
-    file = tmp_path / "run.mcap"
+def test_once_it_says_that_it_has_begun_nothing_is_missed_and_ctrl_c_ends_it(
+    option, key, server_url, pspace, file, tmp_path
+):
     with started(server_url, tmp_path, "record", key("*"), "-o", file, *option) as process:
         line = begins(process, as_json=bool(option))
         pspace[key("a")] = 1

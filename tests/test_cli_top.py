@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 import pytest
-from clikit import REEM, CommandLine
+from clikit import REEM
 from rich.console import Console
 
 import reem as blocking
@@ -18,11 +18,6 @@ from reem_async.pubsub.monitor import Event
 from reem_async.tools.cli.output import json_text
 from reem_async.tools.cli.top import ALL, Board, Window, table
 from reem_async.tools.cli.values import preview
-
-
-@pytest.fixture
-def cli(server_url, key):
-    return CommandLine(server_url, f"{key.prefix}:")
 
 
 @pytest.fixture

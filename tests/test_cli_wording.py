@@ -6,8 +6,7 @@ import ast
 import re
 
 import numpy as np
-import pytest
-from clikit import CommandLine, invoked
+from clikit import invoked
 from conftest import ROOT
 
 import reem as blocking
@@ -64,11 +63,6 @@ def test_no_message_advises_what_cannot_be_typed():
         and not any(known in text for known in OF_PROGRAMS.get(file, ()))
     ]
     assert wrong == []
-
-
-@pytest.fixture
-def cli(server_url, key):
-    return CommandLine(server_url, f"{key.prefix}:")
 
 
 def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):

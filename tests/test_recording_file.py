@@ -232,14 +232,19 @@ def test_cut_anywhere_it_opens(names, file_and_values, tmp_path):
             open_log(cut)
 
 
+def starts(data):
+    """Where the records of a file begin."""
+    places, position = [], 8
+    while position + 9 <= len(data):
+        places.append(position)
+        position += 9 + int.from_bytes(data[position + 1 : position + 9], "little")
+    return places
+
+
 def test_cut_in_its_index_a_chunk_is_read_whole(names, file_and_values, tmp_path):
     """What is there of the index does not tell that the rest of it is missing."""
     data = file_and_values[0].read_bytes()
-    records, place = [], 8
-    while place + 9 < len(data):
-        records.append((data[place], place))
-        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
-    indexes = [here for (before, _), (kind, here) in itertools.pairwise(records) if before == kind == 0x07]
+    indexes = [here for before, here in itertools.pairwise(starts(data)) if data[before] == data[here] == 0x07]
     assert len(indexes) > 3
     cut = tmp_path / "cut.mcap"
     for index in (indexes[0], indexes[len(indexes) // 2], indexes[-1]):
@@ -279,10 +284,7 @@ def test_a_flipped_bit_in_the_head_of_any_record_is_counted_if_it_costs_somethin
 ):
     """Also one that makes another kind of record of it, which may hide what follows."""
     data, damaged = file_and_values[0].read_bytes(), tmp_path / "damaged.mcap"
-    heads, place, rng = [], 8, random.Random(3)
-    while place < len(data) - 8:
-        heads.append(place)
-        place += 9 + int.from_bytes(data[place + 1 : place + 9], "little")
+    heads, rng = starts(data), random.Random(3)
 
     def state():
         with open_log(damaged) as log:
@@ -354,9 +356,8 @@ def test_history_goes_on_from_a_keyframe_behind_what_is_damaged(names, file_and_
         assert texts[-1] == log[names("a")]["t"].at(log.end) == whole[1][-1]
 
 
-async def test_a_file_that_is_read_may_be_replaced(key, apspace, binterface, tmp_path):
+async def test_a_file_that_is_read_may_be_replaced(key, apspace, binterface, file, tmp_path):
     """Its reader goes on with the old one; cut short under him, it would kill his process."""
-    file = tmp_path / "run.mcap"
     async with Recorder(binterface, [key()], file):
         await apspace[key()].write({"image": IMAGE, "text": "x" * 100_000})
     with open_log(file) as log:
@@ -431,8 +432,7 @@ def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace,
         assert any(value["n"] == log[key("a")].at(log.end)["n"] for _, value in sent if type(value) is dict)
 
 
-async def test_while_it_grows_it_can_be_read(key, apspace, binterface, tmp_path):
-    file = tmp_path / "run.mcap"
+async def test_while_it_grows_it_can_be_read(key, apspace, binterface, file):
     async with Recorder(binterface, [key("*")], file):
         await apspace[key("a")].write({"image": FRAME})
 
@@ -471,9 +471,8 @@ asyncio.run(main(*sys.argv[1:]))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="limits of POSIX")
-def test_a_full_disk_ends_the_recording_and_leaves_a_file_that_can_be_read(key, server_url, tmp_path):
+def test_a_full_disk_ends_the_recording_and_leaves_a_file_that_can_be_read(key, server_url, file):
     """A limit of the process stands in for the disk: writing fails in the middle of a chunk."""
-    file = tmp_path / "run.mcap"
     run = python(FULL, server_url, key("a"), file, flags=("-W", "error"))
     assert run.stderr == ""
     assert "could not be written any further" in run.stdout

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from conftest import aeventually, assert_same
 from test_recording_overload import Writing
+from test_unreadable import Pose
 
 import reem_async
+from examples.custom_ship import Scan, ScanShip
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import default_ships
 from reem_async.tools.recording import Recorder, Replayer, open_log, sink
@@ -15,48 +17,14 @@ from reem_async.tools.recording.export import export
 from reem_async.tools.recording.format import Kind, Role
 
 
-class Sweep:
-    """What only its own ship can make bytes of."""
-
-
-class SweepShip(reem_async.SpecialDatatypeShip):
-    """One whose value is no bytes: it is not recorded."""
-
-    def check_fit(self, value):
-        return isinstance(value, Sweep)
-
-    def write(self, key, value, client):
-        client.hset(key, mapping={"n": 1})
-
-    def read(self, key, client):
-        client.hgetall(key)
-
-    def interpret_read(self, responses):
-        return Sweep()
-
-    def get_label(self):
-        return "sweep"
-
-
-class TagShip(reem_async.BlobShip):
-    """One whose value is bytes: it is recorded, and only who has the ship can read it."""
-
-    def check_fit(self, value):
-        return isinstance(value, complex)
-
-    def pack(self, value):
-        return (repr(value).encode(),)
-
-    def unpack(self, blob):
-        return complex(bytes(blob).decode())
-
-    def get_label(self):
-        return "tag"
+def sweep():
+    """A value whose ship makes no bytes of it: it is not recorded. Those of `Pose` are bytes."""
+    return Scan("front", np.zeros((2, 3)))
 
 
 @pytest.fixture
 async def special(server_url):
-    async with reem_async.RedisInterface(server_url, ships=[SweepShip(), TagShip(), *default_ships()]) as it:
+    async with reem_async.RedisInterface(server_url, ships=[ScanShip(), Pose(), *default_ships()]) as it:
         yield it
 
 
@@ -65,13 +33,13 @@ def test_an_update_that_cannot_be_recorded_is_in_the_file_as_lost(file):
     writing = Writing(file)
     writing.put(Role.STATE, {"x": 5, "y": 1}, kind=Kind.READ)
     writing.put(Role.UPDATE, 6, "x")
-    writing.put(Role.UPDATE, Sweep(), "x")
+    writing.put(Role.UPDATE, sweep(), "x")
     writing.put(Role.UPDATE, 2, "y")
     assert [place for place, _, _ in writing.told()] == ["a", "a.x", "a.y"]
     assert (writing.thread.counts.lost, writing.thread.counts.messages) == (1, 4)
     with open_log(file) as log:
         assert (log["a.x"].at(log.start + 0.001), log["a.y"].at(log.end)) == (6, 2)
-        with pytest.raises(ValueError, match=r"a\.x: Sweep, not recorded"):
+        with pytest.raises(ValueError, match=r"a\.x: Scan, not recorded"):
             log["a.x"].at(log.end)
         assert log["a.x"].history()[1].tolist() == [5, 6]
         assert log.unreadable == 1
@@ -103,14 +71,14 @@ def test_a_path_for_which_there_is_no_channel_any_more_is_not_taken_for_its_old_
 async def test_what_cannot_be_read_is_left_out_alone_when_it_is_played(key, special, akvs, ainterface, file):
     """The whole key was, and not counted: of a robot with one value of a custom type nothing was played."""
     space = reem_async.PublishSpace(special)
-    await space[key("a")].write({"n": 0, "scan": Sweep(), "tag": 1j, "list": [1, Sweep(), 2]})
-    await space[key("b")].write(Sweep())
+    await space[key("a")].write({"n": 0, "scan": sweep(), "pose": 1j, "list": [1, sweep(), 2]})
+    await space[key("b")].write(sweep())
     async with Recorder(special, [key("*")], file) as recorder:
         await space[key("a")]["n"].write(1)
-        await space[key("a")]["tag"].write(2j)
-        await space[key("a")]["scan"].write(Sweep())
+        await space[key("a")]["pose"].write(2j)
+        await space[key("a")]["scan"].write(sweep())
         await aeventually(lambda: recorder.status.messages >= 6)
-        await space[key("a")].write({"n": 2, "scan": Sweep(), "image": np.arange(500)})
+        await space[key("a")].write({"n": 2, "scan": sweep(), "image": np.arange(500)})
         await aeventually(lambda: recorder.status.messages >= 8)
     await akvs[key("a")].delete()
     await akvs[key("b")].delete()
@@ -121,8 +89,8 @@ async def test_what_cannot_be_read_is_left_out_alone_when_it_is_played(key, spec
         assert (start, log.unreadable) == ({"n": 0, "list": [1, None, 2]}, 3)
         assert (log.readable_at(key("b"), begun), log.unreadable) == (MISSING, 4)
         assert (log.readable_at(key("c"), begun), log.unreadable) == (MISSING, 4)
-    with open_log(file, ships=[TagShip(), *default_ships()]) as log:
-        assert log.readable_at(key("a"), begun)["tag"] == 1j
+    with open_log(file, ships=[Pose(), *default_ships()]) as log:
+        assert log.readable_at(key("a"), begun)["pose"] == 1j
     with open_log(file) as log:
         replayer = Replayer(ainterface, log, rate=100, start=begun)
         while (update := await replayer.step()) is not None and update.path != (key("a"),):
@@ -140,13 +108,13 @@ async def test_a_value_of_an_unknown_ship_does_not_hide_what_is_beside_it(key, s
     space = reem_async.PublishSpace(special)
     await space[key()].write({"n": 0})
     async with Recorder(special, [key()], file) as recorder:
-        await space[key()]["tag"].write(2j)
+        await space[key()]["pose"].write(2j)
         await aeventually(lambda: recorder.status.messages >= 2)
     with open_log(file) as log:
         assert log.readable_at(key(), log.end) == {"n": 0}
-        assert log.tree_at(log.end)[key()]["tag"].label == "tag"
-        with pytest.raises(ValueError, match="'tag'"):
-            log[f"{key()}.tag"].at(log.end)
+        assert log.tree_at(log.end)[key()]["pose"].label == "pose"
+        with pytest.raises(ValueError, match="'pose'"):
+            log[f"{key()}.pose"].at(log.end)
         assert log[f"{key()}.n"].at(log.end) == 0
 
 
@@ -175,7 +143,7 @@ def test_an_export_of_arrays_has_each_value_at_its_time_beside_what_was_lost(fil
     for number in (-1.0, -2.0):
         writing.put(Role.UPDATE, number, "li", 0)
         writing.put(Role.KEYFRAME, None)
-    writing.put(Role.UPDATE, Sweep(), "li")
+    writing.put(Role.UPDATE, sweep(), "li")
     for number in (-3.0, -4.0):
         writing.put(Role.UPDATE, [number, *long[1:]], "li")
     writing.told()

@@ -26,12 +26,6 @@ from reem_async.tools.recording.layout import encode, to_json
 from reem_async.tools.recording.sink import Sink
 
 
-@pytest.fixture
-async def other(server_url):
-    async with reem_async.RedisInterface(server_url) as opened:
-        yield opened
-
-
 @pytest.fixture(scope="module")
 def made(server_url, tmp_path_factory):
     """Half a second: a counter, a picture for each tenth, a key that comes and goes."""
@@ -64,7 +58,7 @@ def log(made):
         yield opened
 
 
-async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs, other):
+async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs, binterface):
     target = key("again")
     seen = []
 
@@ -75,7 +69,7 @@ async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs
 
     async with akvs[target].watch(Every(1000)) as watch:
         following = asyncio.create_task(follow(watch))
-        status = await Replayer(other, log, patterns=[names("arm")], remap={names("arm"): target}).play()
+        status = await Replayer(binterface, log, patterns=[names("arm")], remap={names("arm"): target}).play()
         await aeventually(lambda: seen and seen[-1][2]["n"] == 25)
         following.cancel()
     assert (status.refused, status.rounds, status.published) == (0, 1, 1 + 25 + 2)
@@ -89,9 +83,9 @@ async def test_a_subscriber_sees_it_again_at_the_same_pace(names, key, log, akvs
 
 @pytest.mark.alone
 @pytest.mark.parametrize("rate", [10.0, 1e6])
-async def test_faster(names, key, log, akvs, other, rate):
+async def test_faster(names, key, log, akvs, binterface, rate):
     begun = time.monotonic()
-    status = await Replayer(other, log, rate=rate, remap={names("arm"): key("b"), names("late"): key("c")}).play()
+    status = await Replayer(binterface, log, rate=rate, remap={names("arm"): key("b"), names("late"): key("c")}).play()
     assert time.monotonic() - begun < log.duration + status.most_lag
     assert status.lag <= status.most_lag
     assert status.position == log.end
@@ -99,16 +93,18 @@ async def test_faster(names, key, log, akvs, other, rate):
     assert await akvs.get(key("c"), "gone") == "gone"
 
 
-async def test_from_the_middle_the_state_comes_first(names, key, log, akvs, other):
+async def test_from_the_middle_the_state_comes_first(names, key, log, akvs, binterface):
     middle = log[names("arm.n")].history()[0][10]  # n was 10 then, and the other key there
-    replayer = Replayer(other, log, start=middle, end=middle, remap={names("arm"): key("b"), names("late"): key("c")})
+    replayer = Replayer(
+        binterface, log, start=middle, end=middle, remap={names("arm"): key("b"), names("late"): key("c")}
+    )
     await replayer.play()
     assert_same({"b": await akvs[key("b")].read()}, {"b": log[names("arm")].at(middle)})
     assert_same(await akvs[key("c")].read(), log[names("late")].at(middle))
 
 
-async def test_step_by_step(names, key, log, akvs, other):
-    replayer = Replayer(other, log, patterns=[names("arm.n")], remap={names("arm"): key("b")})
+async def test_step_by_step(names, key, log, akvs, binterface):
+    replayer = Replayer(binterface, log, patterns=[names("arm.n")], remap={names("arm"): key("b")})
     for number in range(1, 26):
         update = await replayer.step()
         assert (update.path, update.value) == ((names("arm"), "n"), number)
@@ -117,9 +113,9 @@ async def test_step_by_step(names, key, log, akvs, other):
     assert replayer.status.rounds == 1
 
 
-async def test_loops_begin_with_what_was_there(names, key, log, akvs, other):
+async def test_loops_begin_with_what_was_there(names, key, log, akvs, binterface):
     """What came during the recording is deleted at the next beginning."""
-    replayer = Replayer(other, log, rate=50, loop=True, remap={names("arm"): key("b"), names("late"): key("c")})
+    replayer = Replayer(binterface, log, rate=50, loop=True, remap={names("arm"): key("b"), names("late"): key("c")})
     playing = asyncio.create_task(replayer.play())
     await aeventually(lambda: replayer.status.rounds >= 2)
     playing.cancel()
@@ -129,16 +125,15 @@ async def test_loops_begin_with_what_was_there(names, key, log, akvs, other):
     assert (await akvs[key("b")].read()).keys() == {"n", "image"}
 
 
-async def test_what_the_server_refuses_is_counted(key, apspace, akvs, other, server_url, tmp_path):
-    async with reem_async.RedisInterface(server_url) as own:
-        await akvs[key("a")].write({"x": {"y": 1}})
-        async with Recorder(own, [key("a.x.*")], tmp_path / "a.mcap"):
-            await apspace[key("a")]["x"]["y"].write(2)
-    with open_log(tmp_path / "a.mcap") as log:
+async def test_what_the_server_refuses_is_counted(key, apspace, akvs, binterface, file):
+    await akvs[key("a")].write({"x": {"y": 1}})
+    async with Recorder(binterface, [key("a.x.*")], file):
+        await apspace[key("a")]["x"]["y"].write(2)
+    with open_log(file) as log:
         after = log[key("a.x.y")].history()[0][0] + 1e-4
-        status = await Replayer(other, log, start=after, remap={key("a"): key("b")}).play()
+        status = await Replayer(binterface, log, start=after, remap={key("a"): key("b")}).play()
         assert (status.refused, await akvs[key("b")].read()) == (0, {"x": {"y": 2}})
-        replayer = Replayer(other, log, remap={key("a"): key("c")})
+        replayer = Replayer(binterface, log, remap={key("a"): key("c")})
         await replayer.step()  # the start, and the one update
         await akvs[key("c")].write(5)
         replayer._updates = iter(log.updates(after))
@@ -146,7 +141,7 @@ async def test_what_the_server_refuses_is_counted(key, apspace, akvs, other, ser
         assert replayer.status.refused == 1
 
 
-async def test_bad_arguments(log, other):
+async def test_bad_arguments(log, binterface):
     for arguments in (
         {"rate": 0},
         {"rate": float("inf")},
@@ -158,7 +153,7 @@ async def test_bad_arguments(log, other):
         {"start": "now"},
     ):
         with pytest.raises(BadInput):
-            Replayer(other, log, **arguments)
+            Replayer(binterface, log, **arguments)
 
 
 @pytest.mark.parametrize(
@@ -171,28 +166,26 @@ async def test_bad_arguments(log, other):
         ({"remap": {"ARM": "b", "LATE": "b"}}, r"both .*arm and .*late would be played as b;"),
     ],
 )
-async def test_names_that_mean_nothing_or_two_things(names, log, other, arguments, message):
+async def test_names_that_mean_nothing_or_two_things(names, log, binterface, arguments, message):
     text = repr(arguments).replace("ARM", names("arm")).replace("LATE", names("late"))
     with pytest.raises(BadValue, match=message):
-        Replayer(other, log, **ast.literal_eval(text))
+        Replayer(binterface, log, **ast.literal_eval(text))
 
 
-async def test_keys_may_swap_names(names, log, akvs, other):
+async def test_keys_may_swap_names(names, log, akvs, binterface):
     swapped = {names("arm"): names("late"), names("late"): names("arm")}
-    await Replayer(other, log, rate=1e6, remap=swapped).play()
+    await Replayer(binterface, log, rate=1e6, remap=swapped).play()
     assert_same(await akvs[names("late")].read(), log[names("arm")].at(log.end))
     assert await akvs.get(names("arm"), "gone") == "gone"  # as the other one is at the end
     await akvs[names("late")].delete()
 
 
-async def test_samples_replay_with_their_parents(key, akvs, other, server_url, tmp_path):
+async def test_samples_replay_with_their_parents(key, akvs, binterface, file):
     await akvs[key("a")].write({"x": {"y": 1, "z": 2}})
-    async with reem_async.RedisInterface(server_url) as own:
-        recorder = Recorder(own, [], tmp_path / "a.mcap", sample={key("a.x.y"): 0.01})
-        async with recorder:
-            await aeventually(lambda: recorder.status.messages > 5)
-    with open_log(tmp_path / "a.mcap") as log:
-        await Replayer(other, log, remap={key("a"): key("b")}).play()
+    async with Recorder(binterface, [], file, sample={key("a.x.y"): 0.01}) as recorder:
+        await aeventually(lambda: recorder.status.messages > 5)
+    with open_log(file) as log:
+        await Replayer(binterface, log, remap={key("a"): key("b")}).play()
     assert await akvs[key("b")].read() == {"x": {"y": 1}}
 
 
@@ -224,9 +217,9 @@ def test_export_npz(names, log, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-async def test_deletions_and_what_is_empty_have_rows(key, apspace, server_url, tmp_path, kind):
-    file, name = tmp_path / "run.mcap", key("k")
-    async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [name], file):
+async def test_deletions_and_what_is_empty_have_rows(key, apspace, binterface, file, tmp_path, kind):
+    name = key("k")
+    async with Recorder(binterface, [name], file):
         for value in ({"a": 1, "b": 2, "deleted": 0}, {}, {"a": 3, "b": []}, []):
             await apspace[name].write(value)
         await apspace[name].write({"a": 4})
@@ -261,11 +254,11 @@ LONG = 2**62 + 1
 
 
 @pytest.fixture
-async def mixed(key, apspace, server_url, tmp_path):
-    async with reem_async.RedisInterface(server_url) as own, Recorder(own, [key()], tmp_path / "mixed.mcap"):
+async def mixed(key, apspace, binterface, file):
+    async with Recorder(binterface, [key()], file):
         for long, short, flags, item in ((LONG, 1, True, [LONG, 0.5]), (0.5, 0.5, 1, [1, 0.5]), (1, 2, 0, [2, 1])):
             await apspace[key()].write({"long": long, "short": short, "flags": flags, "item": item, "text": "abc\0"})
-    with open_log(tmp_path / "mixed.mcap") as log:
+    with open_log(file) as log:
         yield log
 
 
@@ -297,8 +290,7 @@ def test_export_parquet(names, log, tmp_path):
     assert str(table.schema.field("time").type) == "timestamp[us, tz=UTC]"
 
 
-async def test_a_key_called_time_does_not_take_the_place_of_the_instants(key, server_url, other, tmp_path):
-    file = tmp_path / "run.mcap"
+async def test_a_key_called_time_does_not_take_the_place_of_the_instants(key, server_url, file, tmp_path):
     async with reem_async.RedisInterface(server_url, namespace=key("foo:")) as interface:
         space = reem_async.PublishSpace(interface)
         async with Recorder(interface, ["*"], file):
@@ -348,8 +340,7 @@ def test_a_file_that_somebody_makes_while_it_is_exported_stays(log, tmp_path, mo
 
 
 @pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
-def test_what_cannot_be_read_is_counted_once_though_it_is_read_several_times(kind, tmp_path):
-    file = tmp_path / "run.mcap"
+def test_what_cannot_be_read_is_counted_once_though_it_is_read_several_times(kind, file, tmp_path):
     sink = Sink(file, "none", {}, overwrite=False)
     for number in range(1, 4):
         sink.json(("a", "n"), Role.UPDATE, Kind.PUBLISHED, to_json(number), (number, number, number))
@@ -363,12 +354,11 @@ def test_what_cannot_be_read_is_counted_once_though_it_is_read_several_times(kin
     assert (result.rows, result.unreadable) == (3, 3)
 
 
-async def test_steps_of_a_recording_without_updates_end(key, akvs, other, server_url, tmp_path):
-    file = tmp_path / "run.mcap"
+async def test_steps_of_a_recording_without_updates_end(key, akvs, binterface, file):
     await akvs[key()].write(5)
-    async with reem_async.RedisInterface(server_url) as interface, Recorder(interface, [key()], file):
+    async with Recorder(binterface, [key()], file):
         pass
     with open_log(file) as log:
-        replayer = Replayer(other, log, start=log.end, loop=True)
+        replayer = Replayer(binterface, log, start=log.end, loop=True)
         assert await replayer.step() is None
         assert (replayer.status.published, replayer.status.rounds) == (1, 1)

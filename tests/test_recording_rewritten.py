@@ -18,6 +18,7 @@ import numpy as np
 import orjson
 import pytest
 from conftest import eventually, sized
+from test_recording_file import starts
 
 import reem
 import reem.recording
@@ -139,19 +140,6 @@ def rewritten(original, rng, chosen, *, metadata):
         writer.add_metadata(each.name, each.metadata)
     writer.finish()
     return stream.getvalue()
-
-
-def starts(data):
-    places, position = [], 8
-    while position + 9 <= len(data):
-        places.append(position)
-        position += 9 + int.from_bytes(data[position + 1 : position + 9], "little")
-    return places
-
-
-@pytest.fixture
-def file(tmp_path):
-    return tmp_path / "variant.mcap"
 
 
 def test_whatever_is_optional_it_is_read_equal(original, file):

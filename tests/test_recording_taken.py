@@ -163,8 +163,7 @@ def test_a_part_file_is_removed_only_if_nobody_has_it(tmp_path):
     assert list(tmp_path.iterdir()) == [tmp_path / "a"]
 
 
-def test_of_two_recorders_that_make_the_same_file_one_is_refused(tmp_path, monkeypatch):
-    file = tmp_path / "run.mcap"
+def test_of_two_recorders_that_make_the_same_file_one_is_refused(file, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(type(file), "is_file", lambda self: False)  # as both of them saw it
         first = Output(file, overwrite=True)
@@ -185,9 +184,8 @@ def test_two_recorders_may_write_to_a_device():
         each.close()
 
 
-def test_ctrl_c_before_it_has_begun_is_no_recording(tmp_path):
+def test_ctrl_c_before_it_has_begun_is_no_recording(file, tmp_path):
     """A server that does not answer keeps the recorder from beginning."""
-    file = tmp_path / "run.mcap"
     with socket.create_server(("127.0.0.1", 0)) as silent:
         url = f"redis://127.0.0.1:{silent.getsockname()[1]}"
         with started(url, tmp_path, "record", "-o", file, "--url", url) as process:
