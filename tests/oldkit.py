@@ -130,15 +130,10 @@ def everything(raw):
 
 
 class Cut:
-    """A way to a server that hands on a number of commands, one by one, and is dead from then on.
-
-    Attributes:
-        handed_on: How many it has handed on.
-    """
+    """A way to a server that hands on a number of commands, one by one, and is dead from then on."""
 
     def __init__(self, port, after):
         self._target, self._left = port, after
-        self.handed_on = 0
         self._links = []
         self._lock = threading.Lock()
         self._listening = socket.create_server(("127.0.0.1", 0))
@@ -174,7 +169,6 @@ class Cut:
                         self._end()
                         return
                     self._left -= 1
-                    self.handed_on += 1
                     server.sendall(command)
 
     def _down(self, client, server):

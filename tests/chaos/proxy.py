@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import collections
 import contextlib
 import socket
 import struct
@@ -12,46 +11,6 @@ import time
 from collections.abc import Callable
 
 CHUNK = 1 << 16
-
-
-class Scanner:
-    """Counts the commands in what one client sends, by the lengths they declare, just as a server would."""
-
-    def __init__(self, names: collections.Counter[str]) -> None:
-        self._names = names
-        self._rest = b""
-        self._skip = 0  # bytes of an argument, and its line end, that are still to come
-        self._left = 0  # arguments of the command that are still to come
-        self._first = False
-
-    def feed(self, data: bytes) -> None:
-        data, at = self._rest + data, 0
-        while at < len(data):
-            if self._skip:
-                step = min(self._skip, len(data) - at)
-                self._skip -= step
-                at += step
-                continue
-            end = data.find(b"\r\n", at)
-            if end < 0:
-                break
-            if not self._left:
-                if data[at : at + 1] == b"*":
-                    self._left, self._first = int(data[at + 1 : end]), True
-                else:
-                    self._names["(inline)"] += 1
-                at = end + 2
-                continue
-            size = int(data[at + 1 : end])
-            if self._first:
-                if len(data) < end + 2 + size:
-                    break
-                self._names[data[end + 2 : end + 2 + size].decode(errors="replace").upper()] += 1
-                self._first = False
-            self._left -= 1
-            self._skip = size + 2
-            at = end + 2
-        self._rest = data[at:]
 
 
 class _Link:
@@ -77,8 +36,6 @@ class Proxy:
     Attributes:
         port: Where it listens, on 127.0.0.1.
         delay: Seconds by which each chunk, either way, is held back.
-        sliced: Send every byte, either way, by itself.
-        names: How many commands of each name clients have sent.
         lost: How many replies were dropped.
     """
 
@@ -86,8 +43,6 @@ class Proxy:
         self._target = port
         self.port = 0
         self.delay = 0.0
-        self.sliced = False
-        self.names: collections.Counter[str] = collections.Counter()
         self.lost = 0
         self._marker: bytes | None = None
         self._hole = False
@@ -102,14 +57,6 @@ class Proxy:
     @property
     def url(self) -> str:
         return f"redis://127.0.0.1:{self.port}"
-
-    @property
-    def commands(self) -> int:
-        return sum(self.names.values())
-
-    @property
-    def connections(self) -> int:
-        return len(self._links)
 
     def drop_reply(self, marker: bytes) -> None:
         """Lose the reply to the next request that contains `marker`: it is applied, and the connection reset."""
@@ -149,8 +96,8 @@ class Proxy:
         self._do(open_hole)
 
     def heal(self) -> None:
-        """Serve new connections again, without delay or slices; those that lost bytes stay dead."""
-        self.delay, self.sliced, self._marker = 0.0, False, None
+        """Serve new connections again, without delay; those that lost bytes stay dead."""
+        self.delay, self._marker = 0.0, None
 
         def close_hole() -> None:
             self._hole = False
@@ -223,9 +170,8 @@ class Proxy:
             await asyncio.gather(*pumps, return_exceptions=True)  # may be cancelled: nothing is left to do after it
 
     async def _up(self, link: _Link, reader: asyncio.StreamReader) -> None:
-        scanner, tail = Scanner(self.names), b""
+        tail = b""
         while data := await reader.read(CHUNK):
-            scanner.feed(data)
             marker = self._marker
             if marker is not None:
                 if marker in tail + data:
@@ -250,13 +196,7 @@ class Proxy:
     async def _forward(self, data: bytes, writer: asyncio.StreamWriter) -> None:
         if self.delay:
             await asyncio.sleep(self.delay)
-        if not self.sliced:
-            writer.write(data)
-            await writer.drain()
-            return
-        for at in range(len(data)):
-            writer.write(data[at : at + 1])
-            await asyncio.sleep(0)
+        writer.write(data)
         await writer.drain()
 
 
