@@ -29,6 +29,13 @@ def fetcher_of(interface, name, fence, last_note=""):
     return fetcher, history, readings
 
 
+async def fetched(fetcher, name):
+    fetcher.want((name,), time.time())
+    task = asyncio.create_task(fetcher.run())
+    await aeventually(lambda: not fetcher.behind)
+    task.cancel()
+
+
 async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(key, apspace, binterface):
     """The second deletion is in what is read, the third is not: that of an item done twice would be seen."""
     monitor = Monitor(binterface, [key()])
@@ -42,10 +49,7 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
             readings.hear(await anext(monitor))
 
     fetcher, history, readings = fetcher_of(binterface, key(), fence)
-    fetcher.want((key(),), time.time())
-    task = asyncio.create_task(fetcher.run())
-    await aeventually(lambda: not fetcher.behind)
-    task.cancel()
+    await fetched(fetcher, key())
     assert history.tree((key(),), time.time())["l"] == [2, 3]
     await monitor.close()
 
@@ -60,10 +64,7 @@ async def test_nothing_is_waited_for_that_was_heard_of_before(key, apspace, bint
         raise AssertionError("a fence")
 
     fetcher, history, _ = fetcher_of(binterface, key(), fence, f"{event.publisher} {event.sequence}")
-    fetcher.want((key(),), time.time())
-    task = asyncio.create_task(fetcher.run())
-    await aeventually(lambda: not fetcher.behind)
-    task.cancel()
+    await fetched(fetcher, key())
     assert history.tree((key(),), time.time())["n"] == 1
     await monitor.close()
 

@@ -130,42 +130,39 @@ def test_a_server_that_throws_keys_away(own):
     assert "of 209.7 MB (maxmemory)" in report["memory"]["message"]
 
 
-@pytest.mark.long
-def test_every_node_of_a_cluster_is_examined_and_named(cluster):
-    bad = cluster.nodes[1]
-    with redis.Redis(port=bad.port) as admin:
-        admin.config_set("maxmemory", "200mb")
-        admin.config_set("maxmemory-policy", "allkeys-lru")
-        try:
-            run = CommandLine(cluster.url, "robot:")("doctor", "--json")
-            lines = CommandLine(cluster.url, "robot:").result("doctor", "--no-write").splitlines()
-        finally:
-            admin.config_set("maxmemory", "0")
-            admin.config_set("maxmemory-policy", "noeviction")
-    assert run.returncode == 0, run.stdout + run.stderr
-    rows = [json.loads(line) for line in run.stdout.splitlines()]
-    nodes = {f"127.0.0.1:{node.port}" for node in cluster.nodes}
-    for check in ("server", "json", "access", "small read", "1 MB array", "clock", "memory", "subscribers"):
-        assert {row["node"] for row in rows if row["check"] == check} == nodes, check
-    found = [(row["node"], row["status"]) for row in rows if row["check"] == "eviction"]
-    assert found[0] == (f"127.0.0.1:{bad.port}", WARN)
-    assert [status for _, status in found[1:]] == [OK, OK]
-    assert "node" not in next(row for row in rows if row["check"] == "libraries")
-    assert [line for line in lines if line.startswith(f"warn\teviction\t127.0.0.1:{bad.port}: allkeys-lru")]
+def nodes_with(report, check):
+    """What is said of a check, node by node."""
+    return [
+        (row["node"], row["status"]) for row in map(json.loads, report.stdout.splitlines()) if row["check"] == check
+    ]
 
 
 @pytest.mark.long
-def test_a_node_that_does_not_answer_is_a_finding_and_the_others_are_examined():
+def test_every_node_of_a_cluster_is_examined_and_named():
+    """The worst comes first, also where one does not answer."""
     with EmbeddedCluster(replicas=0) as cluster:
-        gone = f"127.0.0.1:{cluster.nodes[1].port}"
-        cluster.nodes[1].stop()
-        run = CommandLine(cluster.url, "")("doctor", "--json", "--no-write")
-    assert run.returncode == 1
-    rows = [json.loads(line) for line in run.stdout.splitlines()]
-    servers = [(row["node"], row["status"]) for row in rows if row["check"] == "server"]
-    assert servers[0] == (gone, FAIL)
+        cli, ports = CommandLine(cluster.url, "robot:"), [f"127.0.0.1:{node.port}" for node in cluster.nodes]
+        bad = cluster.nodes[1]
+        with redis.Redis(port=bad.port) as admin:
+            admin.config_set("maxmemory", "200mb")
+            admin.config_set("maxmemory-policy", "allkeys-lru")
+        run = cli("doctor", "--json")
+        lines = cli.result("doctor", "--no-write").splitlines()
+        bad.stop()
+        without = cli("doctor", "--json", "--no-write")
+    assert run.returncode == 0, run.stdout + run.stderr
+    for check in ("server", "json", "access", "small read", "1 MB array", "clock", "memory", "subscribers"):
+        assert {node for node, _ in nodes_with(run, check)} == set(ports), check
+    found = nodes_with(run, "eviction")
+    assert found[0] == (ports[1], WARN)
+    assert [status for _, status in found[1:]] == [OK, OK]
+    assert '"check":"libraries","status"' in run.stdout, "it is not of a node"
+    assert [line for line in lines if line.startswith(f"warn\teviction\t{ports[1]}: allkeys-lru")]
+    assert without.returncode == 1
+    servers = nodes_with(without, "server")
+    assert servers[0] == (ports[1], FAIL)
     assert [status for _, status in servers[1:]] == [OK, OK]
-    assert len([row for row in rows if row["check"] == "eviction"]) == 2
+    assert len(nodes_with(without, "eviction")) == 2
 
 
 # --- what the facts mean -------------------------------------------------

@@ -271,8 +271,6 @@ def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_
         found, count = check(damaged, names, seen)
         worst = min(worst, found if is_whole else worst)
         noticed += count > 0
-        with open_log(damaged) as log:
-            assert not is_whole or log.verify(), f"bit {place}"
         assert is_whole or count or found == whole, f"bit {place}"
     assert worst >= len(seen) // 2, "one byte must not cost more than a chunk or two"
     assert noticed > 40
@@ -338,6 +336,26 @@ def test_altered_at_random_nothing_wrong_is_returned(names, file_and_values, tmp
             list(log.updates())
             assert found == len(seen) or damaged or log.unreadable or not log.indexed, number
             log.verify()
+
+
+@pytest.mark.long
+def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_values, tmp_path):
+    """Any bit of a log time: either what is told is right, or `verify` says that something is damaged."""
+    file, seen = file_and_values
+    whole, damaged = file.read_bytes(), tmp_path / "damaged.mcap"
+    with open_log(file) as log:
+        places = [info for info in log._container.chunks if info.index_length][-2:]
+    for info in places:
+        for offset in range(info.index, info.index + info.index_length):
+            data = bytearray(whole)
+            data[offset] ^= 1 << random.Random(offset).randrange(8)
+            damaged.write_bytes(data)
+            with open_log(damaged) as log:
+                assert log.verify() >= 1
+                assert log.channels()
+                time, value = seen[-1]
+                with contextlib.suppress(DamagedRecording):  # the whole chunk is left out
+                    assert log[names("a")].at(time)["n"] <= value["n"]
 
 
 def test_history_goes_on_from_a_keyframe_behind_what_is_damaged(names, file_and_values, tmp_path):

@@ -44,38 +44,41 @@ class Writing:
         return news(self._file)
 
 
-def test_what_was_dropped_is_no_stored_change_though_the_key_is_about_to_be_read_anew(file):
-    """A look that was under way has it too; from the next read of all on, stored changes are told as such again."""
+KINDS = {Role.STORED: Kind.STORED, Role.UPDATE: Kind.PUBLISHED}
+BEGINNING = ("a", "kvs", {"n": 0, "p": 0})
+
+
+@pytest.mark.parametrize(
+    ("then", "told"),
+    [
+        (  # a look that was under way has it too; from the next read of all on, stored changes are told as such again
+            [(Role.UPDATE, 1, "p", False), (Role.STORED, {"n": 0, "p": 1}), (Role.STORED, {"n": 1, "p": 1})],
+            [("a", "kvs", {"n": 0, "p": 1}), ("a.n", "stored", 1)],
+        ),
+        (  # stored before something was dropped: it waits to be written, and lacks nothing
+            [(Role.STORED, {"n": 1, "p": 0}), (Role.UPDATE, 1, "p", False)],
+            [("a.n", "stored", 1)],
+        ),
+        (  # what could not be applied: something published is missing, or the server has refused the update
+            [
+                (Role.UPDATE, 1, "p", "y"),
+                (Role.STORED, {"n": 0, "p": {"y": 1}}),
+                (Role.STORED, {"n": 1, "p": {"y": 1}}),
+            ],
+            [("a", "kvs", {"n": 0, "p": {"y": 1}}), ("a.n", "stored", 1)],
+        ),
+    ],
+    ids=["dropped", "stored before", "not applied"],
+)
+def test_what_is_read_after_a_loss_is_no_stored_change(file, then, told):
+    """Nor what a look finds that was under way."""
     writing = Writing(file)
     writing.put(Role.STATE, {"n": 0, "p": 0}, kind=Kind.READ)
-    writing.put(Role.UPDATE, 1, "p", room=False)
-    writing.put(Role.STORED, {"n": 0, "p": 1}, kind=Kind.STORED)
-    writing.put(Role.STORED, {"n": 1, "p": 1}, kind=Kind.STORED)
-    assert writing.told() == [
-        ("a", "kvs", {"n": 0, "p": 0}),
-        ("a", "kvs", {"n": 0, "p": 1}),
-        ("a.n", "stored", 1),
-    ]
-
-
-def test_what_was_stored_before_something_was_dropped_is_told_as_stored(file):
-    """It waits to be written, and lacks nothing."""
-    writing = Writing(file)
-    writing.put(Role.STATE, {"n": 0, "p": 0}, kind=Kind.READ)
-    writing.put(Role.STORED, {"n": 1, "p": 0}, kind=Kind.STORED)
-    writing.put(Role.UPDATE, 1, "p", room=False)
-    writing.thread.behind.add("a")  # the recorder has not taken note yet
-    assert writing.told() == [("a", "kvs", {"n": 0, "p": 0}), ("a.n", "stored", 1)]
-
-
-def test_what_could_not_be_applied_makes_no_stored_change_of_what_is_read_next(file):
-    """Something published is missing then, or the server has refused the update."""
-    writing = Writing(file)
-    writing.put(Role.STATE, {"n": 0}, kind=Kind.READ)
-    writing.put(Role.UPDATE, 1, "x", "y")
-    writing.put(Role.STORED, {"n": 0, "x": {"y": 1}}, kind=Kind.STORED)
-    writing.put(Role.STORED, {"n": 1, "x": {"y": 1}}, kind=Kind.STORED)
-    assert writing.told()[-2:] == [("a", "kvs", {"n": 0, "x": {"y": 1}}), ("a.n", "stored", 1)]
+    for role, value, *path in then:
+        room = path[-1:] != [False]
+        writing.put(role, value, *path[: None if room else -1], kind=KINDS[role], room=room)
+    writing.thread.behind.update({"a"} if not room else ())  # the recorder has not taken note yet
+    assert [each for each in writing.told() if each[1] != "pub"] == [BEGINNING, *told]
 
 
 async def test_what_is_published_and_dropped_before_it_is_taken_is_no_stored_change(
