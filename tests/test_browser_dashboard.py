@@ -88,6 +88,7 @@ def test_the_rate_at_the_beginning_of_what_is_known_is_right():
         history.add(("k", "x"), number, 8, 100 + number / 20)
     for at in (100.1, 100.3, 100.9, 101.5, 104.0):
         assert history.rate("k", at) == pytest.approx(20.0, rel=0.06), at
+    assert (history.rate("k", 140.0), history.rate("other", 104.0)) == (None, None)
     history = History(1000.0, 1 << 20)
     history.add(("k", "x"), 1, 8, time.time())
     assert history.rate("k", time.time()) is None, "less than a second is known: that is no rate"

@@ -54,21 +54,6 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
     await monitor.close()
 
 
-async def test_nothing_is_waited_for_that_was_heard_of_before(key, apspace, binterface):
-    monitor = Monitor(binterface, [key()])
-    await monitor.listen()
-    await apspace[key()].write({"n": 1, "image": LARGE})
-    event = await anext(monitor)
-
-    async def fence():
-        raise AssertionError("a fence")
-
-    fetcher, history, _ = fetcher_of(binterface, key(), fence, f"{event.publisher} {event.sequence}")
-    await fetched(fetcher, key())
-    assert history.tree((key(),), time.time())["n"] == 1
-    await monitor.close()
-
-
 async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, binterface):
     """The connection of the notices breaks: it stays unknown until it is looked at again."""
     await apspace[key()].write({"n": 1, "image": LARGE})

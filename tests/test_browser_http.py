@@ -296,18 +296,6 @@ def test_arrays_of_the_past(ask, pspace, key):
     assert {value: shown(at) for value, at in times.items()} == {10: 10, 20: 20}
 
 
-def test_what_is_only_stored_is_noticed_too(ask, kvs, key):
-    kvs[key()] = {"x": 1}
-    eventually(lambda: key() in ask.rows(at=time.time()))
-    # What the page has not heard of yet it asks the server for: it is the past once the series has it.
-    eventually(lambda: any(line[-1:] == [1.0] for line in ask.json("series", path=f"{key()}.x")["lines"]))
-    at = ask.json("tree", open="1:0:")["end"]
-    kvs[key()]["x"] = 2
-    eventually(lambda: ask.json("series", path=f"{key()}.x")["lines"][0][-1] == 2.0)
-    assert ask.rows(key(), at=at)["x"]["text"] == "1"
-    assert ask.rows(key())["x"]["time"] > at
-
-
 def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(ask, pspace, kvs, key):
     """It is told from what was published, which is not taken for it."""
 
@@ -359,16 +347,6 @@ def content(ask, name, at):
     """What is shown of the past, None if it is not kept."""
     answer = ask.http.get(f"/view/{name}", params={"format": "json", "at": at})
     return answer.json() if answer.status_code == 200 else None
-
-
-def test_what_comes_back_as_it_was_is_there_again(ask, kvs, key):
-    kvs[key()] = {"inner_name": 1}
-    eventually(lambda: key() in ask.rows(at=time.time()))
-    del kvs[key()]
-    eventually(lambda: key() not in ask.rows(at=time.time()))
-    kvs[key()] = {"inner_name": 1}
-    eventually(lambda: key() in ask.rows(at=time.time()))
-    assert any("inner_name" in node["address"] for node in ask.json("search", q=f"{key()}.inner")["found"])
 
 
 def test_events_name_what_changed_and_are_few(ask, pspace, key):

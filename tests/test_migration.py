@@ -90,17 +90,6 @@ def test_old_data_is_not_read(kvs, raw, version):
                 read()
 
 
-async def test_nor_by_the_asynchronous_front(own, raw):
-    replay(raw, "reem_0_1_2")
-    async with reem_async.RedisInterface(own, ships=ships()) as interface:
-        store = reem_async.KeyValueStore(interface)
-        with pytest.raises(BadData, match="reem migrate"):
-            await store["mixed"].read()
-        done = await migration.migrate(interface)
-        assert not done.problems
-        assert_same(await store["mixed"].read(), stored("reem_0_1_2")["mixed"])
-
-
 async def test_nor_a_number_in_a_cluster(cluster):
     """Which shows in the reply itself; `foo&&&&metadata` may be on another node."""
     async with reem_async.RedisInterface(cluster, namespace="old:") as interface:
@@ -507,16 +496,6 @@ def test_the_doctor_counts_old_keys(own, raw):
     assert (code, found["status"]) == (1, "fail")
     assert found["message"] == "2 keys were written by REEM 0.1 or older and cannot be read: mixed, number"
     assert "reem migrate" in found["remedy"]
-
-
-def test_an_old_rdb_file_comes_by_reem_up_from(own, raw, tmp_path):
-    with EmbeddedServer(0, tmp_path / "old") as old, redis.Redis.from_url(old.url, decode_responses=True) as client:
-        replay(client, "reem_0_1_2")
-        client.save()
-    file = next((tmp_path / "old").rglob("*.rdb"))
-    with EmbeddedServer(0, None, None, file) as started, reem.RedisInterface(started, ships=ships()) as interface:
-        assert migrate(interface).problems == ()
-        check(reem.KeyValueStore(interface), "reem_0_1_2")
 
 
 @pytest.mark.parametrize("entry", ["x1", "it's", "x[0]"])

@@ -19,7 +19,6 @@ from conftest import assert_no_orphans, assert_same, eventually
 import reem
 import reem_async
 from reem.convenience import TolerantKeyValueStore
-from reem.server import EmbeddedServer
 from reem_async.errors import BadKey, BadType
 
 # --- names ------------------------------------------------------------------------------------------------
@@ -245,15 +244,6 @@ def test_socket_timeout_is_the_time_limit(package):
             limit("localhost", socket_timeout=wrong)
 
 
-@pytest.mark.long
-def test_a_slow_server_is_waited_for_as_socket_timeout_says():
-    with EmbeddedServer() as server, reem.RedisInterface(server, socket_timeout=20) as interface:
-        interface.client.client_pause(1500)
-        kvs, began = reem.KeyValueStore(interface), time.monotonic()
-        kvs["slow"] = 1
-        assert time.monotonic() - began > 1.2
-
-
 # --- attributes -------------------------------------------------------------------------------------------
 
 
@@ -307,15 +297,6 @@ def test_a_named_default_of_get(kvs, key):
     assert kvs[key()].get("b", default_value=5) == 5
     assert kvs[key()]["b"].get(default_value=5) == 5
     assert kvs[key()].get("b", default_value=None) is None
-
-
-async def test_the_same_of_the_asyncio_front(akvs, key):
-    await akvs[key()].write({"a": [1]})
-    place = akvs[key()]["a"]
-    assert place.path == ["a"]
-    assert await place.reader.read_from_redis(".a") == [1]
-    await place.writer.send_to_redis(".a[0]", 2)
-    assert await akvs[key()].get("b", default_value=5) == 5
 
 
 def test_a_subscribers_local_copy(interface, pspace, key):

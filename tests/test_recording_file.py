@@ -16,8 +16,8 @@ import mcap.reader
 import mcap.writer
 import numpy as np
 import pytest
-from conftest import aeventually, assert_same, eventually, python, sized
-from test_recording import FRAME, IMAGE
+from conftest import assert_same, eventually, python, sized
+from test_recording import IMAGE
 from test_recording_layout import RawImage
 
 import reem
@@ -448,20 +448,6 @@ def test_killed_with_9_all_but_the_last_second_is_there(key, server_url, pspace,
         for update in log.updates(patterns=[key("a")]):
             assert_same(update.value, known[update.value["n"]])
         assert any(value["n"] == log[key("a")].at(log.end)["n"] for _, value in sent if type(value) is dict)
-
-
-async def test_while_it_grows_it_can_be_read(key, apspace, binterface, file):
-    async with Recorder(binterface, [key("*")], file):
-        await apspace[key("a")].write({"image": FRAME})
-
-        def there():
-            with open_log(file) as log:
-                return key("a") in log.names()
-
-        await aeventually(there)
-        with open_log(file) as log:
-            assert not log.indexed
-            assert_same(log[key("a.image")].at(log.end), FRAME)
 
 
 FULL = """

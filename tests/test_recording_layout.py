@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import struct
+import weakref
 
 import google.protobuf.descriptor_pb2 as descriptors
 import google.protobuf.message_factory as factory
@@ -20,12 +21,14 @@ from reem_async.errors import BadData, BadInput, BadValue
 from reem_async.plan.paths import parse_pattern
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
+from reem_async.tools.recording import contents
+from reem_async.tools.recording.contents import Content, Recent
 from reem_async.tools.recording.layout import decode, encode, from_json, schema_bytes, to_json
 from reem_async.tools.recording.log import stacked
 from reem_async.tools.recording.sample import read_key_file
 from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
 from reem_async.tools.recording.stored import Reference, extract, planted, pruned, resolve
-from reem_async.tools.recording.times import AFTER, STEP, Clock, nanoseconds, seconds
+from reem_async.tools.recording.times import AFTER, STEP, nanoseconds, seconds
 from reem_async.transport.packing import CommandRecorder
 
 SHIPS = Ships(default_ships(), CommandRecorder)
@@ -268,13 +271,6 @@ def test_seconds_tell_log_times_apart(number):
         assert nanoseconds(np.datetime64(ns, "ns")) == ns
 
 
-def test_the_clock_only_goes_forward():
-    clock = Clock()
-    stamps = [clock.stamp(received) for received in (None, 0.0, 4e9, None, None)]
-    assert stamps == sorted(set(stamps))
-    assert all(stamp % STEP == 0 for stamp in stamps)
-
-
 @pytest.mark.parametrize("instant", ["now", True, None, float("nan"), 1.8e18, [1]])
 def test_what_is_no_instant(instant):
     with pytest.raises(BadInput):
@@ -301,14 +297,20 @@ def test_histories_are_stacked(values, dtype, shape):
 
 @pytest.mark.parametrize(
     "values",
-    [["a"], [1, None], [1, "a"], [[1], [1, 2]], [{}], [[1, "a"]], [2**64 - 1, -1], [2**60, 0.5], [True, 1]],
+    [
+        ["a"],
+        [1, None],
+        [1, "a"],
+        [[1], [1, 2]],
+        [{}],
+        [[1, "a"]],
+        [2**64 - 1, -1],
+        [2**60, 0.5],
+        [True, 1],
+        [np.zeros(2), np.zeros(3)],
+    ],
 )
 def test_what_cannot_be_stacked_exactly_stays_a_list(values):
-    assert stacked(values) is values
-
-
-def test_arrays_of_other_kinds_are_not_stacked():
-    values = [np.zeros(2), np.zeros(3)]
     assert stacked(values) is values
 
 
@@ -355,3 +357,27 @@ def test_a_key_file_that_cannot_be(tmp_path, line):
         read_key_file(file)
     with pytest.raises(BadValue, match="cannot be read"):
         read_key_file(tmp_path / "none.csv")
+
+
+def test_of_the_values_written_the_newest_bytes_are_kept_for_a_moment_and_then_their_digests(monkeypatch):
+    """By these the recorder tells later whether a value has changed."""
+    same = Content(b"<f8[2]", np.array([1.0, 2.0]).tobytes())
+    assert Content(b"<f8[2]", memoryview(np.array([1.0, 2.0])).cast("B")).digest() == same.digest()
+    for head, items in ((b"<f8[2]", [1.0, -2.0]), (b"<i8[2]", [1.0, 2.0])):
+        assert Content(head, np.array(items).tobytes()).digest() != same.digest()
+    assert same.size == 0
+    recent, kept = Recent(), Content(b"", bytes(1000))
+    recent.add(kept)
+    recent.tick()
+    assert kept.size == 1000
+    monkeypatch.setattr(contents, "_MOMENT", 0.0)
+    recent.tick()
+    assert kept.size == 0
+    monkeypatch.setattr(contents, "_MOST_KEPT", 2500)
+    three = [Content(b"", bytes(1000)) for _ in range(3)]
+    for each in three:
+        recent.add(each)
+    assert [each.size for each in three] == [0, 1000, 1000]
+    gone = weakref.ref(three.pop())
+    del each
+    assert gone() is None, "what was replaced is not kept"
