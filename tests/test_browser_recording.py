@@ -111,3 +111,11 @@ def test_it_cannot_be_written(run):
 def test_events_go_on_so_that_the_page_knows_all_is_well(ask):
     with ask.http.stream("GET", "/api/events") as stream:
         assert next(line for line in stream.iter_lines() if line.startswith("data: ")).count('"paths":[]') == 1
+
+
+def test_the_rate_near_the_start_is_of_the_time_there_was(run, steps):
+    """Not of five seconds, four of which were before the recording."""
+    source = LogSource(run)
+    count = int(np.searchsorted(source._times.concerning(("cam",)), steps[-1], "right"))
+    assert source._times.rate("cam", steps[-1]) == pytest.approx(count / 1.0, rel=0.01)
+    source.log.close()
