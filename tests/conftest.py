@@ -146,7 +146,6 @@ ONE_SERVER = {
 
 WITH_MODULE = {
     "test_the_server_never_calculates_near_the_end_of_its_range": "counts commands of the module",
-    "test_ten_thousand_keys_and_eight_megabytes": "fills the server by a pipeline of the module's commands",
     "test_a_server_takes_the_sample_configuration": "its file of users names commands of the module",
     "test_compose_starts_the_server_with_these_files": "the same",
     "test_another_namespace": "the same",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import io
 import itertools
-import os
 import socket
 import threading
 import time
@@ -13,10 +12,8 @@ import time
 import numpy as np
 import orjson
 import pytest
-import redis
 from browserkit import client_of, live, served
 from conftest import assert_same, eventually, python
-from picturekit import resident
 from PIL import Image
 
 import reem
@@ -271,31 +268,6 @@ def test_the_past_is_as_it_was(ask, page, pspace, key):
     assert name in ask.rows(at=times[0])
 
 
-def test_arrays_of_the_past(ask, pspace, key):
-    name = key("cam")
-
-    def changes():
-        return sum(ask.json("activity", path=name)["counts"])
-
-    def shown(at):
-        answer = ask.ask("table", path=f"{name}.image", at=at)
-        return int(answer.json()["cells"][0][0]) if answer.status_code == 200 else None
-
-    def is_past(value, times):
-        """Whether the buffer has a value by now: what is published then makes now the past."""
-        at, before = time.time(), changes()
-        pspace[name]["n"] = before
-        eventually(lambda: changes() > before)  # what the page has not heard of it asks the server for
-        times[value] = at
-        return shown(at) == value
-
-    times = {}
-    for value in (10, 20):
-        pspace[name] = {"image": np.full((200, 200), value, np.uint8)}
-        eventually(lambda value=value: is_past(value, times))
-    assert {value: shown(at) for value, at in times.items()} == {10: 10, 20: 20}
-
-
 def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(ask, pspace, kvs, key):
     """It is told from what was published, which is not taken for it."""
 
@@ -398,45 +370,6 @@ def test_a_server_that_goes_away_is_said_and_so_is_its_return(tmp_path):
 
 
 # --- size -------------------------------------------------
-
-
-@pytest.mark.alone
-@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="the memory is read from /proc")
-def test_ten_thousand_keys_and_eight_megabytes():
-    with EmbeddedServer() as server:
-        fill(server)
-        with served(live(server.url)) as (address, source), client_of(address) as ask:
-            began = time.monotonic()
-            assert ask.http.get("/").status_code == 200
-            (branch,) = ask.json("tree", open="100:0:")["branches"]
-            took = time.monotonic() - began
-            assert (branch["total"], len(branch["nodes"])) == (10_001, 100)
-            assert took < 1.0
-            eventually(
-                lambda: "key_09999.b" in [row["address"] for row in ask.json("search", q="key_09999.b")["found"]]
-            )
-            look(ask)
-            before = resident()
-            for _ in range(10):
-                look(ask)
-            assert resident() - before < 60 << 20
-            assert source.history.bytes < 16 << 20
-
-
-def look(ask):
-    assert ask.json("array", path="big")["shape"] == [1000, 1000]
-    assert len(ask.ask("image", path="big", side=400).content) > 1000
-    assert ask.json("table", path="big", row=999, column=999)["cells"] == [["999999"]]
-
-
-def fill(server):
-    with redis.Redis.from_url(server.url) as client:
-        pipeline = client.pipeline(transaction=False)
-        for number in range(10_000):
-            pipeline.execute_command("JSON.SET", f"key_{number:05}", "$", f'{{"a":{number},"b":[1,2]}}')
-        pipeline.execute()
-    with reem.RedisInterface(server) as interface:
-        reem.KeyValueStore(interface)["big"] = np.arange(1e6).reshape(1000, 1000)
 
 
 async def test_answers_are_sent_at_once():

@@ -124,13 +124,6 @@ def test_echo_for_programs(space, listening):
     assert [each[name] for each in (first, second, third) for name in ("missed", "gap", "skipped")] == [0, False, 0] * 3
 
 
-def test_echo_fetches_if_asked(space, listening):
-    with listening("echo", "foo", "--fetch", "--count", "1") as process:
-        space["foo"] = np.full(5000, 7)
-        said, _ = process.communicate(timeout=10)
-    assert said.rstrip().endswith("foo  int64[5000] [7 7 7 ... 7 7 7]")
-
-
 @pytest.mark.parametrize("options", [(), ("--json",)])
 def test_echo_goes_on_beside_what_it_cannot_fetch(cli, raw, listening, options):
     """It ended at the first value of a custom type."""
@@ -358,6 +351,10 @@ def event(received, *, sent=0.0, size=0, missed=0):
 
 
 def test_what_a_window_says():
+    at_once = Window(10)
+    for _ in range(2):
+        at_once.add(event(5.0))
+    assert (at_once.rate(), at_once.bandwidth(), RATE.cells(at_once)[0]) == (None, None, "-")
     window = Window(4)
     assert (window.rate(), window.bandwidth(), spread(window.intervals())) == (None, None, None)
     for number, received in enumerate((0.0, 10.0, 10.1, 10.3, 10.6)):
@@ -370,14 +367,6 @@ def test_what_a_window_says():
     assert RATE.cells(window) == ("5.00", "200.00", "100.00", "300.00", "81.65")
     assert BANDWIDTH.cells(window) == ("1.5 kB/s", "250 B", "100 B", "400 B", "112 B")
     assert DELAY.cells(window)[:3] == ("5.00", "2.00", "8.00")
-
-
-def test_updates_that_came_at_once_have_no_rate():
-    window = Window(10)
-    window.add(event(5.0))
-    window.add(event(5.0))
-    assert (window.rate(), window.bandwidth()) == (None, None)
-    assert RATE.cells(window)[0] == "-"
 
 
 def test_the_last_line_counts_so_many_paths_and_no_more(capsys, monkeypatch):

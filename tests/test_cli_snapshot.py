@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import redis
 import typer
-from clikit import environment, finished, in_terminal, invoked, running
+from clikit import environment, in_terminal, invoked, running
 from conftest import assert_same, eventually, line_of
 
 import reem
@@ -55,15 +55,6 @@ def env(server):
 
 def names(directory):
     return sorted(path.name for path in directory.iterdir())
-
-
-def test_in_a_process_of_its_own(kvs, env, tmp_path):
-    kvs["foo"] = 1
-    for words, code in ((["save", "a.zip"], 0), (["save", "a.zip"], 2), (["list"], 0)):
-        run = finished("snapshot", *words, cwd=tmp_path, **env)
-        assert (run.returncode, bool(run.stdout), bool(run.stderr)) == (code, not code, bool(code))
-        assert "a.zip" in run.stdout + run.stderr
-        assert "\x1b" not in run.stdout + run.stderr
 
 
 def test_there_and_back(kvs, env, server, tmp_path):

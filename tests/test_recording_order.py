@@ -13,7 +13,7 @@ from conftest import PATIENCE, Remembering, aeventually, assert_same
 
 import reem_async
 from reem_async.pubsub.monitor import Event
-from reem_async.tools.recording import Recorder, Replayer, key_recorder, open_log
+from reem_async.tools.recording import Recorder, Replayer, open_log
 from reem_async.tools.recording.times import published
 
 LARGE = np.zeros((300, 300))
@@ -42,66 +42,6 @@ async def test_what_is_stored_beside_what_is_published_is_seen(key, apspace, akv
         assert {update.shown for update in log.updates() if update.kind == "stored"} == {f"{key()}.y", f"{key()}.z"}
         assert_same(log[key()].at(log.end), await akvs[key()].read())
         assert log[key()]["z"].at(log.end) == 7
-
-
-async def test_a_frame_that_a_keyframe_reads_first_is_not_skipped(key, apspace, binterface, file, monkeypatch):
-    """What a state brings of updates that were only announced is theirs."""
-    monkeypatch.setattr(key_recorder, "_LET_PASS", 0.05)
-    await apspace[key()].write({"image": LARGE})
-    async with Recorder(binterface, [key()], file) as recorder:
-        for number in range(1, 4):
-            recorder._key_recorder(key()).read()  # what a keyframe does
-            await apspace[key()]["image"].write(LARGE + number)
-            await recorder.fence()
-            await aeventually(lambda: recorder._key_recorder(key()).busy is None)
-        recorder._key_recorder(key()).read()  # one comes while what was announced before waits to be fetched
-        await apspace[key()]["image"].write(LARGE + 4)
-        await asyncio.sleep(0.02)
-        recorder._key_recorder(key()).read()
-        await apspace[key()]["image"].write(LARGE + 5)
-    with open_log(file) as log:
-        found = [update for update in log.updates() if update.path == (key(), "image")]
-        assert [int(update.value[0, 0]) for update in found] == [update.sequence - 1 for update in found]
-        assert {1, 2, 3, 5} <= {update.sequence - 1 for update in found}
-        assert len(found) == 5 - recorder.status.skipped
-
-
-def fetch_behind_each(number, monkeypatch):
-    """Have what was announced be fetched when so many updates were heard of, and a multiple of it."""
-
-    async def wait(self, head):
-        await aeventually(lambda: self._queue.order % number == 0)
-
-    monkeypatch.setattr(key_recorder.KeyRecorder, "_let_pass", wait)
-
-
-async def test_what_was_deleted_before_it_could_be_fetched_is_skipped_and_counted(
-    key, apspace, akvs, binterface, file, monkeypatch
-):
-    """It is neither a deletion of its own, nor is its deletion recorded twice."""
-    fetch_behind_each(2, monkeypatch)
-    await apspace[key()].write({})
-    async with Recorder(binterface, [key()], file) as recorder:
-        for _ in range(5):
-            await apspace[key()]["image"].write(LARGE)
-            await apspace[key()]["image"].delete()
-            await recorder.fence()
-            await recorder._settled(PATIENCE)
-    assert recorder.status.skipped == 5
-    assert news(file, f"{key()}.image") == [{}, *[True] * 5]
-
-
-async def test_what_was_replaced_with_what_holds_it_is_skipped_and_counted(key, apspace, binterface, file, monkeypatch):
-    fetch_behind_each(3, monkeypatch)
-    async with Recorder(binterface, [key()], file) as recorder:
-        for number in range(4):
-            await apspace[key()].write({"image": LARGE})
-            await apspace[key()]["image"].write(LARGE + 1)
-            await apspace[key()].write({"n": number})
-            await recorder.fence()
-            await recorder._settled(PATIENCE)
-    assert recorder.status.skipped == 8
-    assert news(file, key()) == [{"n": number} for number in range(4)]
 
 
 async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(key, apspace, akvs, binterface, file):
@@ -139,27 +79,6 @@ async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(ke
         await apspace[key()].delete()
         await Replayer(binterface, log, rate=100).play()
     assert_same(await akvs[key()].read(), whole)
-
-
-async def test_a_loss_between_an_announcement_and_its_fetch_is_no_part_of_it(key, apspace, akvs, binterface, file):
-    """What is read names an update that nobody has heard of: others may have changed what was announced."""
-    async with Recorder(binterface, [key()], file) as recorder:
-        await apspace[key()].write({"x": 0, "image": LARGE})
-        await aeventually(lambda: recorder.status.messages >= 2 and recorder._key_recorder(key()).busy is None)
-        recorder._key_recorder(key())._reader._limit = turns = asyncio.Semaphore(0)
-        await apspace[key()].write({"x": 1, "image": LARGE})
-        session = apspace.interface.session
-        keys = session.keys(key())
-        publisher, number = session.stamp(keys)
-        await akvs[key()]["x"].write("lost")
-        await session.transport.roundtrip([("SET", keys.last, f"{publisher} {number}", "EX", 60)])
-        await recorder.fence()
-        for _ in range(8):
-            turns.release()
-        await aeventually(lambda: recorder.status.skipped == 1)
-    with open_log(file) as log:
-        assert [update.value["x"] for update in log.updates() if update.kind == "pub"] == [0]
-        assert log[key()]["x"].at(log.end) == "lost"
 
 
 async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, akvs, binterface, file):

@@ -2,7 +2,6 @@
 
     python -m tests.fuzz                       # every target, 100,000 inputs each, with a seed that is printed
     python -m tests.fuzz npy --runs 1000000 --seed 7
-    python -m tests.fuzz npy --atheris -max_total_time=600    # guided by coverage, if atheris is installed
 
 A short run with a fixed seed is part of the tests (tests/test_hostile.py).
 """

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import argparse
 import random
-import sys
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import orjson
@@ -210,21 +207,7 @@ def main(arguments):
     parser.add_argument("target", nargs="?", choices=list(TARGETS))
     parser.add_argument("--runs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(10**9))
-    parser.add_argument("--atheris", action="store_true")
-    given, rest = parser.parse_known_args(arguments)
-    if given.atheris:
-        import atheris
-
-        if given.target is None:
-            parser.error("--atheris takes one target")
-        corpus = Path(tempfile.mkdtemp(prefix=f"reem-fuzz-{given.target}-"))
-        for number, seed in enumerate(SEEDS[given.target]):
-            (corpus / f"seed{number}").write_bytes(seed)
-        print(f"what is found on the way is kept in {corpus}")
-        atheris.instrument_all()
-        atheris.Setup([sys.argv[0], *rest, str(corpus)], TARGETS[given.target])
-        atheris.Fuzz()
-        return
+    given = parser.parse_args(arguments)
     print(f"seed {given.seed}")
     for name in [given.target] if given.target else list(TARGETS):
         for data in mutants(name, given.runs, given.seed):
