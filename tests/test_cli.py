@@ -9,13 +9,11 @@ import importlib
 import json
 import signal
 import socket
-import subprocess
-import sys
 
 import numpy as np
 import pytest
-from clikit import REEM, CommandLine, finished, invoked
-from conftest import assert_same, nothing_sent
+from clikit import CommandLine, finished, invoked
+from conftest import assert_same, nothing_sent, python
 
 import reem as blocking
 from reem_async.server import EmbeddedServer
@@ -48,7 +46,7 @@ SNAPSHOT = [["snapshot", command] for command in ("save", "list", "restore")]
 
 def test_help_has_every_command_under_its_heading():
     """The lines of the table are those of the docstrings, so `reem --help` and `reem NAME --help` agree."""
-    run = subprocess.run([REEM, "--help"], capture_output=True, text=True, timeout=30, check=True)
+    run = finished("--help", COLUMNS="100")
     for entry in COMMANDS:
         assert entry.panel in run.stdout
         assert f" {entry.name} " in run.stdout
@@ -65,7 +63,7 @@ def test_help_needs_none_of_the_commands():
     code = "import sys; sys.argv = ['reem', '--help']\nfrom reem_async.tools.cli import main\n"
     code += "try: main()\nexcept SystemExit: "
     code += "print([name for name in sys.modules if name.startswith('reem_async.tools.cli')])"
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    run = python(code)
     loaded = run.stdout.splitlines()[-1]
     light = ["", ".commands"]
     assert loaded == str([f"reem_async.tools.cli{name}" for name in light])
@@ -168,9 +166,7 @@ def test_completion_of_paths(cli, kvs):
     def completed(*words, **changes):
         typed = ["reem", "get", "--namespace", cli.namespace, *words]
         changes = {"_REEM_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(typed), "COMP_CWORD": "4", **changes}
-        run = subprocess.run(
-            [REEM], env=cli.environment(**changes), capture_output=True, text=True, timeout=30, check=True
-        )
+        run = finished(**{"REEM_URL": cli.url, **changes})
         assert run.stderr == ""
         return run.stdout.split()
 

@@ -16,7 +16,7 @@ import numpy as np
 import orjson
 import pytest
 import typer
-from clikit import REEM, invoked
+from clikit import REEM, finished, invoked
 from conftest import assert_same
 from snapshotkit import servers  # noqa: F401 - a fixture
 
@@ -147,20 +147,17 @@ def test_a_restore_that_fails_says_how_far_it_came(servers, tmp_path):  # noqa: 
         admin.close()
 
 
+def shell(cli, words, rest):
+    """Run a command in a shell, with something behind it."""
+    line, env = f"{shlex.join(words)} {rest}", cli.environment()
+    return subprocess.run(["sh", "-c", line], env=env, capture_output=True, text=True, timeout=20, check=False)
+
+
 @pytest.mark.long
 def test_saving_by_period_ends_with_its_reader(cli, kvs, tmp_path):
     kvs["a"] = 1
-    words = shlex.join(
-        [REEM, "snapshot", "save", "--namespace", cli.namespace, "--every", "1s", "-d", str(tmp_path), "--keep", "3"]
-    )
-    run = subprocess.run(
-        ["sh", "-c", f"{words} | head -1"],
-        env=cli.environment(),
-        capture_output=True,
-        text=True,
-        timeout=20,
-        check=False,
-    )
+    options = ["--namespace", cli.namespace, "--every", "1s", "-d", str(tmp_path), "--keep", "3"]
+    run = shell(cli, [REEM, "snapshot", "save", *options], "| head -1")
     assert (run.stdout.count("\n"), run.stderr.replace("Stopped; what is listed above is complete.\n", "")) == (1, "")
 
 
@@ -317,10 +314,7 @@ def test_a_terminal_that_does_not_know_all_characters(cli, kvs):
 
 def test_without_an_output(cli, kvs):
     kvs["a"] = 1
-    words = shlex.join(cli.words("ls"))
-    run = subprocess.run(
-        ["sh", "-c", f"{words} >&-"], env=cli.environment(), capture_output=True, text=True, timeout=20, check=False
-    )
+    run = shell(cli, cli.words("ls"), ">&-")
     assert (run.returncode, run.stderr) == (0, "")
 
 
@@ -354,15 +348,7 @@ def test_paths_are_shown_as_they_can_be_typed(path):
     assert parse(shown) == path
 
 
-def test_a_pipe_is_no_snapshot(cli, tmp_path):
+def test_a_pipe_is_no_snapshot(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    environment = cli.environment()
-    run = subprocess.run(
-        [cli.words("up")[0], "up", "--from", str(tmp_path / "pipe")],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=20,
-        check=False,
-    )
+    run = finished("up", "--from", tmp_path / "pipe")
     assert (run.returncode, "is no file" in run.stderr) == (1, True)

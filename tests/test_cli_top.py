@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
 import threading
 import time
 
 import numpy as np
 import pytest
-from clikit import REEM
+from clikit import finished
 from rich.console import Console
 
 import reem as blocking
@@ -116,7 +115,7 @@ def test_a_recording_of_nothing_warns(cli, tmp_path):
 
 def test_a_server_on_the_port_is_named(cli, server_url):
     port = str(blocking.RedisInterface(server_url).client.connection_pool.connection_kwargs.get("port"))
-    run = subprocess.run([REEM, "up", "--port", port], capture_output=True, text=True, timeout=30, check=False)
+    run = finished("up", "--port", port)
     assert run.returncode == 1
     assert f"connect to redis://localhost:{port}" in run.stderr
 

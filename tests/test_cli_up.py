@@ -9,12 +9,12 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 
 import numpy as np
 import pytest
 import redis
 from clikit import environment, finished, in_terminal, running, said_until
+from conftest import python
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
@@ -74,9 +74,7 @@ print("done")
 
 def test_a_signal_may_come_at_any_moment():
     """Also while the main thread looks whether one has come, and while another is handled."""
-    run = subprocess.run(
-        [sys.executable, "-c", STORM], env=environment(), capture_output=True, text=True, timeout=30, check=False
-    )
+    run = python(STORM, flags=())
     assert (run.stdout, run.returncode) == ("done\n", 0), run.stderr
 
 
@@ -180,14 +178,7 @@ def test_from_a_snapshot(snapshots, name, what):
 @pytest.mark.parametrize("missing", ["typer", "rich"])
 def test_without_the_extra(missing):
     code = f"import sys; sys.modules['{missing}'] = None; from reem_async.tools.cli import main; main()"
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    run = python(code, flags=())
     assert run.returncode == 1
     assert "pip install 'reem-async[server]'" in run.stderr
 

@@ -7,14 +7,12 @@ import enum
 import functools
 import importlib
 import pickle
-import subprocess
-import sys
 import time
 
 import numpy as np
 import pytest
 import redis
-from conftest import assert_no_orphans, assert_same, eventually
+from conftest import assert_no_orphans, assert_same, eventually, python
 
 import reem
 import reem_async
@@ -78,7 +76,7 @@ def test_a_new_program_imports_nothing_of_it():
         "assert not [each for each in old if f'reem.{each}' in sys.modules]\n"
         "assert 'reem_async.transport.client' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    assert python(program).returncode == 0
 
 
 def test_paths_as_text_and_nested_dicts():

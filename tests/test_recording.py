@@ -9,7 +9,7 @@ import time
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from conftest import aeventually, assert_same, eventually
+from conftest import aeventually, assert_same, eventually, sized
 from hypothesis import HealthCheck, given, settings
 from test_values import mixed
 
@@ -68,7 +68,7 @@ async def test_trees_without_their_arrays(key, apspace, binterface, file):
         }
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=sized(6, 12), deadline=None, suppress_health_check=list(HealthCheck))
 @given(batch=st.lists(st.tuples(mixed, st.sampled_from(["whole", "inside", "delete"])), min_size=3, max_size=8))
 def test_anything_recorded_replays_to_the_same(server_url, tmp_path_factory, batch):
     """Random trees with arrays, written whole, below a path and deleted: record, look, replay, read back."""
