@@ -1,11 +1,11 @@
 """A primary, a replica and three sentinels on loopback, for tests."""
 
 import contextlib
-import socket
 import subprocess
 
 import redis
 from conftest import eventually
+from own_servers import free_port
 
 from reem_async.server import EmbeddedServer
 from reem_async.server.programs import find_program
@@ -33,7 +33,7 @@ class Watched:
         self.ports = []
         self.sentinels = []
         for number in range(3):
-            port = _free_port()
+            port = free_port()
             file = directory / f"sentinel{number}.conf"
             file.write_text(
                 f"port {port}\nbind 127.0.0.1\ndir {directory}\n"
@@ -93,12 +93,6 @@ class Watched:
 
     def pid(self, port):
         return next(server.pid for server in self.servers if server.port == port)
-
-
-def _free_port():
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return free.getsockname()[1]
 
 
 def _ended(process):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import redis
 
+import reem
+import reem.snapshots
 import reem_async
 import reem_async.snapshots
-from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 
 STRANGE = [
@@ -53,11 +54,20 @@ TREE = {
 @pytest.fixture(scope="module")
 def servers():
     """Two private servers: where from, and where to."""
-    with contextlib.ExitStack() as stack:
-        try:
-            yield [stack.enter_context(EmbeddedServer()) for _ in range(2)]
-        except ServerMissing as missing:
-            pytest.skip(f"needs servers of its own: {missing}")
+    with EmbeddedServer() as source, EmbeddedServer() as target:
+        yield [source, target]
+
+
+@pytest.fixture
+def snapshots(tmp_path):
+    """A portable snapshot and an RDB file of one server, whose keys are under a namespace."""
+    with EmbeddedServer() as server, reem.RedisInterface(server, namespace="r1:") as interface:
+        kvs = reem.KeyValueStore(interface)
+        kvs["foo"] = {"x": np.arange(3), "n": 1.5}
+        kvs["image"] = np.zeros((1000, 1000))
+        reem.snapshots.save(interface, tmp_path / "a.zip")
+        reem.snapshots.save_rdb(interface, tmp_path / "b.rdb")
+    return tmp_path
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import re
 import socket
@@ -13,7 +12,6 @@ import redis
 from clikit import CommandLine
 from conftest import PLAIN
 
-from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
 from reem_async.tools.cli import checks
@@ -22,12 +20,8 @@ from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts
 
 @pytest.fixture(scope="module")
 def own():
-    with contextlib.ExitStack() as stack:
-        try:
-            url = stack.enter_context(EmbeddedServer()).url
-        except ServerMissing as missing:
-            pytest.skip(f"needs a server of its own: {missing}")
-        yield url, stack.enter_context(redis.Redis.from_url(url, decode_responses=True))
+    with EmbeddedServer() as server, redis.Redis.from_url(server.url, decode_responses=True) as admin:
+        yield server.url, admin
 
 
 def findings(run):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import json
 import os
@@ -18,7 +17,6 @@ from clikit import environment, in_terminal, invoked, running
 from conftest import assert_same, eventually, line_of
 
 import reem
-from reem_async.errors import ServerMissing
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import period
 from reem_async.tools.snapshots import files, portable, rdb
@@ -33,11 +31,8 @@ def snapshot(*arguments, code=0, **changes):
 
 @pytest.fixture(scope="module")
 def server():
-    with contextlib.ExitStack() as stack:
-        try:
-            yield stack.enter_context(EmbeddedServer())
-        except ServerMissing as missing:
-            pytest.skip(f"needs a server of its own: {missing}")
+    with EmbeddedServer() as started:
+        yield started
 
 
 @pytest.fixture

@@ -19,7 +19,6 @@ from clikit import REEM
 from conftest import eventually
 
 import reem
-from reem_async.server.programs import find_program
 from reem_async.tools.demo.robot import place_of
 from reem_async.tools.demo.scene import BALL_RADIUS, REACH, Camera, angles_to, points_of
 
@@ -27,10 +26,6 @@ from reem_async.tools.demo.scene import BALL_RADIUS, REACH, Camera, angles_to, p
 @contextlib.contextmanager
 def demo(**environment):
     """The running command, and what it has printed until it said how to go on."""
-    try:
-        find_program()
-    except reem.ServerMissing as missing:
-        pytest.skip(f"there is no embedded server here: {missing}")
     clean = {name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")}
     with subprocess.Popen(
         [REEM, "demo"],

@@ -15,7 +15,6 @@ import pytest
 from conftest import ROOT, eventually
 
 import reem
-from reem.server import EmbeddedServer
 
 FILES = sorted((ROOT / "examples").rglob("*.py"))
 KEYS = ["raw_image", "processed_info", "processed_image", "processor", "actuator", "set_point", "room"]
@@ -96,10 +95,6 @@ def test_the_image_system_runs_as_three_processes(front, url, tmp_path):
 @pytest.mark.long
 def test_the_demo_needs_no_server(tmp_path):
     """`make demo`, but shorter: it starts one of its own."""
-    try:
-        EmbeddedServer().start()
-    except reem.ServerMissing as missing:
-        pytest.skip(str(missing))
     printed = run("image_system", "--seconds", 1, "--out", tmp_path / "last.png")
     assert counts(printed)[0][0] == 30
     assert (tmp_path / "last.png").stat().st_size > 10_000

@@ -19,7 +19,7 @@ import reem
 import reem_async
 from reem.migration import migrate
 from reem_async import migration
-from reem_async.errors import BadData, BadType, NotAllowed, ServerMissing
+from reem_async.errors import BadData, BadType, NotAllowed
 from reem_async.legacy.values import array_of
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.options import ship_named
@@ -27,11 +27,8 @@ from reem_async.tools.cli.options import ship_named
 
 @pytest.fixture(scope="module")
 def own():
-    with contextlib.ExitStack() as stack:
-        try:
-            yield stack.enter_context(EmbeddedServer())
-        except ServerMissing as missing:
-            pytest.skip(f"needs a server of its own: {missing}")
+    with EmbeddedServer() as started:
+        yield started
 
 
 @pytest.fixture

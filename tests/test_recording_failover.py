@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from clusterkit import Move, kill_primary, owner, whole_again
 from conftest import aeventually, assert_same, eventually
-from sentinelkit import Watched
 from test_recording_stored import is_followed, news, recording
 
 import reem_async
@@ -26,12 +25,6 @@ from reem_async.tools.recording import open_log
 
 FRAME = np.arange(60 * 80 * 3, dtype=np.uint32).astype(np.uint8).reshape(60, 80, 3)
 NAMES = [f"k{number}" for number in range(6)]
-
-
-@pytest.fixture(scope="module")
-def watched(tmp_path_factory):
-    with contextlib.ExitStack() as stack:
-        yield Watched(tmp_path_factory.mktemp("sentinels"), stack)
 
 
 @pytest.fixture(scope="module")

@@ -23,6 +23,7 @@ import anyio.to_thread
 import numpy as np
 import pytest
 import redis
+import snapshotkit
 from conftest import eventually, python
 from redis.backoff import NoBackoff
 from redis.retry import Retry
@@ -721,19 +722,11 @@ class TestPrograms:
 # --- beginning with a snapshot -------------------------------------------------
 
 
-@pytest.fixture
-def snapshots(tmp_path):
-    with EmbeddedServer() as server, reem.RedisInterface(server) as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs["foo"] = {"x": np.arange(3), "n": 1.5}
-        kvs["image"] = np.zeros((1000, 1000))
-        reem.snapshots.save(interface, tmp_path / "a.zip")
-        reem.snapshots.save_rdb(interface, tmp_path / "b.rdb")
-    return tmp_path
+snapshots = snapshotkit.snapshots
 
 
 def holds_it(server: EmbeddedServer) -> bool:
-    with reem.RedisInterface(server) as interface:
+    with reem.RedisInterface(server, namespace="r1:") as interface:
         kvs = reem.KeyValueStore(interface)
         return kvs["foo"]["x"].read().tolist() == [0, 1, 2] and kvs["image"].read().shape == (1000, 1000)
 
