@@ -222,7 +222,7 @@ def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name
 
         return done
 
-    monkeypatch.setattr(files, "new_name", new_name)
+    monkeypatch.setattr("reem_async.tools.cli.snapshot.new_name", new_name)
     monkeypatch.setattr(portable, "survey", meanwhile(survey))
     monkeypatch.setattr(rdb, "_place", meanwhile(place))
     said, errors = snapshot("save", "-d", tmp_path, *options, **env)

@@ -73,7 +73,9 @@ class ClusterOptions(Options):
         self.seeds: list[Address] = [address_of(one, 6379) for one in urls]
         super().__init__(urls[0], timeout, options)
         if self.database:
-            raise BadValue(f"db={self.database}: a cluster has only database 0; use namespace= to keep programs apart")
+            raise BadValue(
+                f"db={self.database}: a cluster has only database 0; use namespace= (--namespace) to keep programs apart"
+            )
 
     @property
     def address(self) -> str:
