@@ -74,7 +74,8 @@ class ClusterOptions(Options):
         super().__init__(urls[0], timeout, options)
         if self.database:
             raise BadValue(
-                f"db={self.database}: a cluster has only database 0; use namespace= (--namespace) to keep programs apart"
+                f"db={self.database}: a cluster has only database 0; "
+                "use namespace= (--namespace) to keep programs apart"
             )
 
     @property
