@@ -12,6 +12,7 @@ names its keys through the `key` fixture, and what carries its prefix is unlinke
 
 import asyncio
 import contextlib
+import itertools
 import operator
 import os
 import re
@@ -21,6 +22,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 import uuid
 import zlib
@@ -691,6 +693,26 @@ async def aeventually(condition, timeout=PATIENCE):
         await asyncio.sleep(0.005)
     assert value, f"did not come true within {timeout} s"
     return value
+
+
+@contextlib.contextmanager
+def repeated(work, pause=0.0):
+    """Call `work` in a thread of its own with 1, 2, 3 and so on, until the block ends."""
+    over = threading.Event()
+
+    def run():
+        for number in itertools.count(1):
+            if over.wait(pause):
+                return
+            work(number)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 def line_of(descriptor, patience=60.0):

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 
 import numpy as np
 import pytest
 from browserkit import client_of, live, served
-from conftest import eventually
+from conftest import eventually, repeated
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
 
 from reem.server import EmbeddedServer
@@ -26,28 +25,17 @@ expect = playwright.expect
 def test_the_figures_beside_an_array_are_of_that_array(pspace, address, key):
     """They were asked for separately, and were of another frame than the table."""
     pspace[key()] = {"a": np.zeros((40, 40))}
-    ended = threading.Event()
-
-    def publish():
-        number = 0
-        while not ended.is_set():
-            number += 1
-            pspace[key()]["a"] = np.full((40, 40), number, np.float64)
-
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
-        with client_of(address) as ask:
-            for _ in range(20):
-                for view in ("table", "line", "histogram"):
-                    said = ask.json(view, path=f"{key()}.a")
-                    low, high = said["statistics"]["low"], said["statistics"]["high"]
-                    found = {"table": "cells", "line": "lines", "histogram": "low"}[view]
-                    shown = said[found] if view == "histogram" else said[found][0][0]
-                    assert float(low) == float(high) == float(shown), view
-    finally:
-        ended.set()
-        thread.join()
+    with (
+        repeated(lambda number: pspace[key()]["a"].write(np.full((40, 40), number, np.float64))),
+        client_of(address) as ask,
+    ):
+        for _ in range(20):
+            for view in ("table", "line", "histogram"):
+                said = ask.json(view, path=f"{key()}.a")
+                low, high = said["statistics"]["low"], said["statistics"]["high"]
+                found = {"table": "cells", "line": "lines", "histogram": "low"}[view]
+                shown = said[found] if view == "histogram" else said[found][0][0]
+                assert float(low) == float(high) == float(shown), view
 
 
 def test_only_what_has_another_value_is_marked_as_changed(pspace, address, key):

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import io
-import itertools
 import socket
-import threading
 import time
 
 import numpy as np
 import orjson
 import pytest
 from browserkit import client_of, live, served
-from conftest import assert_same, eventually, python, sized
+from conftest import assert_same, eventually, python, repeated, sized
 from PIL import Image
 
 import reem
@@ -283,21 +281,15 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
 
     pspace[key()] = {"x": 0, "mode": "idle", "items": [0] * 5, "image": np.zeros((300, 300), np.uint8)}
     eventually(lambda: mode(time.time()) == '"idle"')
-    ended = threading.Event()
 
-    def publish():
-        for number in itertools.count(1):
-            if ended.wait(0.01):
-                return
-            pspace[key()]["x"] = number
-            pspace[key()]["items"].append(number)
-            del pspace[key()]["items"][0]
-            if number % 5 == 0:
-                pspace[key()]["image"] = np.full((300, 300), number % 255, np.uint8)
+    def publish(number):
+        pspace[key()]["x"] = number
+        pspace[key()]["items"].append(number)
+        del pspace[key()]["items"][0]
+        if number % 5 == 0:
+            pspace[key()]["image"] = np.full((300, 300), number % 255, np.uint8)
 
-    publisher = threading.Thread(target=publish)
-    publisher.start()
-    try:
+    with repeated(publish, 0.01):
         time.sleep(0.5)  # what comes now is of a key that has been published for a while
         before = writes()
         time.sleep(sized(1.2, 2.5))
@@ -307,9 +299,6 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
         eventually(lambda: writes() > before)
         eventually(lambda: was_running(time.time()))  # since the document has arrays it is read once more
         assert mode(earlier - 0.1) == '"idle"'
-    finally:
-        ended.set()
-        publisher.join()
     assert writes() == before + 1
     items = [node["text"] for node in ask.rows(f"{key()}.items", at=time.time()).values()]
     assert items == [str(item) for item in kvs[key()]["items"].read()]
@@ -327,24 +316,12 @@ def test_events_name_what_changed_and_are_few(ask, pspace, key):
         assert stream.headers["content-type"].startswith("text/event-stream")
         lines = stream.iter_lines()
         next(lines)
-        stop = threading.Event()
-
-        def publish():
-            number = 0
-            while not stop.is_set():
-                pspace[key()]["x"] = number = number + 1
-
-        thread = threading.Thread(target=publish)
-        thread.start()
-        try:
+        with repeated(lambda number: pspace[key()]["x"].write(number)):
             said, began = [], time.monotonic()
             while len(said) < 5:
                 line = next(lines)
                 if line.startswith("data: ") and f"{key()}.x" in orjson.loads(line[6:])["paths"]:
                     said.append(time.monotonic() - began)
-        finally:
-            stop.set()
-            thread.join()
     assert said[4] - said[0] > 0.3, "more than ten a second"
 
 

@@ -7,12 +7,11 @@ import json
 import re
 import select
 import signal
-import threading
 import time
 
 import numpy as np
 import pytest
-from conftest import RawCluster, eventually, subscribed, subscriptions
+from conftest import RawCluster, eventually, repeated, subscribed, subscriptions
 
 import reem as blocking
 from examples.custom_ship import Scan, ScanShip
@@ -322,22 +321,14 @@ def test_hz_reports_as_it_goes_and_at_the_end(listening, announced):
 
 @pytest.mark.parametrize("columns", [100, 50])
 def test_the_live_table_in_a_terminal(cli, columns, announced, raw):
-    before, stop = subscriptions(raw), threading.Event()
+    before = subscriptions(raw)
 
-    def publish():
+    def publish(sequence):
         eventually(lambda: subscriptions(raw) > before)
-        sequence = 0
-        while not stop.wait(0.02):
-            sequence += 1
-            announced("camera", sequence, size=1000)
+        announced("camera", sequence, size=1000)
 
-    thread = threading.Thread(target=publish)
-    thread.start()
-    try:
+    with repeated(publish, 0.02):
         shown, code = cli.in_terminal("hz", "cam*", keys=[(b"camera", b"\x03")], columns=columns)
-    finally:
-        stop.set()
-        thread.join()
     assert code == 0
     assert "waiting for updates of cam*" in shown
     last = shown.rsplit("lost", 2)[-2]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import json
-import threading
 import time
 
 import numpy as np
 import pytest
 from clikit import finished
+from conftest import repeated
 from rich.console import Console
 
 import reem as blocking
@@ -21,23 +21,18 @@ from reem_async.tools.cli.values import preview
 
 @pytest.fixture
 def robot(cli):
-    over = threading.Event()
     with (
         blocking.RedisInterface(cli.url, namespace=cli.namespace) as one,
         blocking.RedisInterface(cli.url, namespace=cli.namespace) as two,
     ):
         spaces = blocking.PublishSpace(one), blocking.PublishSpace(two)
 
-        def publish():
-            while not over.wait(0.02):
-                spaces[0].update(arm={"x": 1}, cam={"n": 1})
-                spaces[1]["arm"] = {"x": 2}
+        def publish(_):
+            spaces[0].update(arm={"x": 1}, cam={"n": 1})
+            spaces[1]["arm"] = {"x": 2}
 
-        thread = threading.Thread(target=publish)
-        thread.start()
-        yield
-        over.set()
-        thread.join()
+        with repeated(publish, 0.02):
+            yield
 
 
 def test_top_shows_keys_and_points_out_two_publishers(cli, robot):

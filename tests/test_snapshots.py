@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import struct
-import threading
 import tracemalloc
 
 import numpy as np
@@ -12,7 +11,7 @@ import orjson
 import pytest
 import redis
 import snapshotkit
-from conftest import PLAIN, aeventually, assert_no_orphans, assert_same, commands_run
+from conftest import PLAIN, aeventually, assert_no_orphans, assert_same, commands_run, repeated
 from snapshotkit import everything, hard_floats, left_in
 from test_ships import Pose, PoseShip
 
@@ -237,36 +236,28 @@ async def test_only_what_matches(here, there, raws, tmp_path):
 
 
 async def test_no_pair_is_torn_while_others_write(servers, here, there, raws, tmp_path):
-    stop, count = threading.Event(), 0
+    with reem.RedisInterface(servers[0]) as writing:
+        pair, written = reem.KeyValueStore(writing), []
 
-    def write():
-        nonlocal count
-        with reem.RedisInterface(servers[0]) as interface:
-            kvs = reem.KeyValueStore(interface)
-            while not stop.is_set():
-                count += 1
-                array = np.full(20_000, count)
-                value = {"n": count, "a": array, "l": [array, {"x": array}]}
-                kvs["pair"] = value if count % 3 else {"n": count, "other": array, "l": [count]}
+        def write(count):
+            array = np.full(20_000, count)
+            value = {"n": count, "a": array, "l": [array, {"x": array}]}
+            pair["pair"] = value if count % 3 else {"n": count, "other": array, "l": [count]}
+            written.append(count)
 
-    writer = threading.Thread(target=write)
-    writer.start()
-    try:
-        await aeventually(lambda: count > 3)
-        kvs = reem_async.KeyValueStore(there)
-        seen = set()
-        for number in range(15):
-            saved = await save(here, tmp_path / f"{number}.zip", "p*")
-            assert saved.foreign == 0
-            await restore(there, tmp_path / f"{number}.zip", replace=True)
-            got = await kvs["pair"].read()
-            seen.add(got["n"])
-            arrays = [got["a"], got["l"][0], got["l"][1]["x"]] if "a" in got else [got["other"]]
-            assert {each.min() for each in arrays} | {each.max() for each in arrays} == {got["n"]}
-            assert_no_orphans(redis.Redis.from_url(servers[1].url, decode_responses=True), "pair")
-    finally:
-        stop.set()
-        writer.join()
+        with repeated(write):
+            await aeventually(lambda: len(written) > 3)
+            kvs = reem_async.KeyValueStore(there)
+            seen = set()
+            for number in range(15):
+                saved = await save(here, tmp_path / f"{number}.zip", "p*")
+                assert saved.foreign == 0
+                await restore(there, tmp_path / f"{number}.zip", replace=True)
+                got = await kvs["pair"].read()
+                seen.add(got["n"])
+                arrays = [got["a"], got["l"][0], got["l"][1]["x"]] if "a" in got else [got["other"]]
+                assert {each.min() for each in arrays} | {each.max() for each in arrays} == {got["n"]}
+                assert_no_orphans(redis.Redis.from_url(servers[1].url, decode_responses=True), "pair")
     assert len(seen) > 5
 
 
