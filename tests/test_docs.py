@@ -211,8 +211,18 @@ def port():
         yield server.port
 
 
+FIRST = {ROOT / "README.md", DOCS / "tutorial.md"}
+"""What a newcomer follows first. The fast run leaves out the others: each program of theirs takes a second to start."""
+
+
 @pytest.mark.parametrize(
-    "path", [page for page in PAGES if RUN & {language for language, _ in fenced(page)}], ids=title
+    "path",
+    [
+        pytest.param(page, marks=() if page in FIRST else pytest.mark.long)
+        for page in PAGES
+        if RUN & {language for language, _ in fenced(page)}
+    ],
+    ids=title,
 )
 def test_a_page_is_followed_word_for_word(path, port, tmp_path):
     blocks = fenced(path)
