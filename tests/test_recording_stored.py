@@ -12,7 +12,6 @@ import pytest
 from conftest import PLAIN, RawCluster, Remembering, aeventually, assert_same, eventually, server_without_right
 
 import reem_async
-from reem_async.pubsub.manager import manager_of
 from reem_async.tools.recording import Recorder, Replayer, open_log
 from reem_async.tools.recording.export import export
 
@@ -189,40 +188,6 @@ async def test_what_is_changed_right_behind_the_touch_is_not_in_what_is_read(key
         assert await touching
         await aeventually(lambda: looks.due)
         looks.cancel()
-
-
-async def test_an_array_is_not_taken_for_the_old_one_while_the_word_of_its_change_is_still_on_its_way(
-    key, akvs, binterface, file, monkeypatch
-):
-    """What is read comes over another connection and may overtake it."""
-    states = [{"a": FRAME + np.uint8(number), "n": number} for number in range(3)]
-    await akvs[key()].write(states[0])
-    async with recording(binterface, [key()], file) as recorder:
-        await aeventually(lambda: is_followed(recorder, key()))
-        transport, wires = binterface.session.transport, [*manager_of(binterface.session)._wires.values()]
-        roundtrip, read = transport.roundtrip, []
-
-        async def overtaken(commands, **options):
-            if not read and any(command[0] in ("JSON.GET", "GET") for command in commands):
-                read.append(commands)
-                for wire in wires:
-                    wire._transport.pause_reading()
-                await akvs[key()].update(states[2])
-                replies = await roundtrip(commands, **options)
-                for wire in wires:
-                    asyncio.get_running_loop().call_soon(wire._transport.resume_reading)
-                return replies
-            return await roundtrip(commands, **options)
-
-        monkeypatch.setattr(transport, "roundtrip", overtaken)
-        await akvs[key()]["n"].write(1)
-        await aeventually(lambda: read)
-        await recorder.written(key())
-    with open_log(file) as log:
-        trees = [log.value_at((key(),), update.time) for update in log.updates()]
-    assert len(trees) > 1
-    for tree in trees:
-        assert_same(tree, states[0] if tree["n"] == 0 else states[2])
 
 
 async def test_what_changed_its_place_or_type_is_right(key, akvs, binterface, file):
