@@ -7,7 +7,6 @@ import dataclasses
 import json
 import os
 import random
-import resource
 import signal
 import subprocess
 import sys
@@ -25,21 +24,13 @@ COMPLAINTS = ("never retrieved", "never awaited", "Exception ignored", "Tracebac
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One line of the scoreboard.
-
-    Attributes:
-        number: Up to 20 as in research/reliability.md, section 3.
-        what: What is done.
-        target: What must come out, for people; the bounds themselves are in the row's function.
-        function: Does it.
-        limit: Seconds after which it hangs.
-    """
+    """One line of the scoreboard."""
 
     number: int
     what: str
-    target: str
+    target: str  # for people; the bounds themselves are in the row's function
     function: Callable[[Run], None]
-    limit: float
+    limit: float  # seconds after which it hangs
 
 
 ROWS: dict[int, Row] = {}
@@ -62,17 +53,11 @@ class NotBuilt(Exception):
 class Run:
     """One run of a row: how much to do, with which seed, and what came out.
 
-    Attributes:
-        full: At full size; else a small part, for every `make test-all`.
-        seed: What all chance in the row comes from.
-        rng: A generator with that seed.
-        figures: What was measured, in words.
-        failures: Those that miss their bound.
+    At full size, or a small part for every `make test-all`. What misses its bound is among the failures too.
     """
 
     def __init__(self, scale: str, seed: int) -> None:
         self.full = scale == "full"
-        self.seed = seed
         self.rng = random.Random(seed)
         self.figures: list[str] = []
         self.failures: list[str] = []
@@ -136,7 +121,6 @@ def perform(number: int, scale: str, seed: int) -> dict[str, Any]:
         "status": status or ("FAIL" if it.failures else "PASS"),
         "figures": it.figures,
         "failures": it.failures,
-        "peak": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024,
     }
 
 

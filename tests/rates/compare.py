@@ -48,15 +48,7 @@ def truths(name: str, seed: int) -> Iterator[Truth]:
 
 
 class Key:
-    """Goes through the calls of one publisher and the news of its key at once.
-
-    Args:
-        log: The recording.
-        name: The key.
-        seed: What its publisher began with.
-        times: When each call began and ended.
-        share: The part of the instants to compare.
-    """
+    """Goes through the calls of one publisher and the news of its key at once, and compares a share of the instants."""
 
     def __init__(self, log: Log, name: str, seed: int, times: Any, share: float) -> None:
         self._log = log

@@ -30,22 +30,11 @@ _MEASURED = 120.0
 
 
 class Outcome(NamedTuple):
-    """What was found.
-
-    Attributes:
-        keys: By top-level key.
-        said: What the recorder said at its end.
-        memory: Its resident megabytes, every second.
-        played: Updates that were played, and
-        refused: those of them that the server refused: what they are inside of was skipped.
-        faults: What is wrong.
-    """
-
     keys: dict[str, Compared]
-    said: str
-    memory: list[float]
+    said: str  # by the recorder, at its end
+    memory: list[float]  # its resident megabytes, every second
     played: int
-    refused: int
+    refused: int  # of those played: what they are inside of was skipped
     faults: list[str]
 
 
