@@ -93,7 +93,7 @@ mcap: $(VENV)/ready  ## recordings, read by the TypeScript implementation of MCA
 	npm install --silent --no-fund --no-audit --no-package-lock --prefix tests/mcapcheck
 	$(BIN)/python -m tests.mcapcheck
 
-bench: .venv-bench/ready  ## every benchmark, under ten minutes; BENCH=--quick for about one
+bench: .venv-bench/ready  ## every benchmark, about twenty minutes; BENCH=--quick for about three
 	.venv-bench/bin/python -m benchmarks $(BENCH)
 
 bench-recorder: .venv-bench/ready  ## what a recorder costs the writers beside it, 14 to 40 minutes

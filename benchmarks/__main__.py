@@ -4,13 +4,14 @@ import argparse
 import datetime
 import fnmatch
 import pathlib
+import tempfile
 import time
 
 import redis
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from . import environment, figures, page, report, results, summary, targets
+from . import environment, figures, one_host, page, report, results, summary, targets
 from .measure import Bench, Case
 from .process import Workers
 from .results import Results
@@ -23,7 +24,7 @@ FIGURES = environment.FOLDER.parent / "docs" / "lab" / "images" / "performance"
 def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="about a minute, coarse figures")
+    parser.add_argument("--quick", action="store_true", help="a few minutes, coarse figures")
     parser.add_argument("--only", metavar="PATTERN", help="cases that match, such as 'array.*.get' or 'publish'")
     parser.add_argument("--list", action="store_true", help="name the cases and end")
     parser.add_argument("--draw", action="store_true", help="draw the figures again from the last whole run and end")
@@ -51,9 +52,9 @@ def run(cases: list[Case], quick: bool, mode: str, console: Console) -> Results:
         with console.status(f"virtual environment of {name}"):
             _prepare_environment(name, console)
     begin = time.monotonic()
-    with private_server() as server:
+    with private_server() as server, tempfile.TemporaryDirectory(prefix="bench-") as folder:
         found = Results(mode, started, environment.line(server.version()))
-        bench = Bench(Workers(server), quick)
+        bench = Bench(Workers(server, folder), quick)
         columns = (
             TextColumn("{task.description:32s}"),
             BarColumn(),
@@ -119,6 +120,7 @@ def main() -> None:
         page.rewrite(found)
         summary.rewrite(found)
         report.show(found, console, options.all)
+        one_host.show(found, console)
         return
     cases = chosen(options.only, options.quick)
     if options.before:
@@ -135,6 +137,7 @@ def main() -> None:
         page.rewrite(found)
         summary.rewrite(found)
     report.show(found, console, options.all or bool(options.only))
+    one_host.show(found, console)
     console.print(f"kept in {path} and {folder}", highlight=False)
 
 

@@ -48,6 +48,28 @@ CONTENDERS = {
     "iceoryx2": Contender("iceoryx2", "iceoryx2_pubsub", "#556b2f", environment="iceoryx2"),
 }
 
+HOST = {
+    "reem-local": CONTENDERS["reem-local"],
+    "reem-host-early": Contender(
+        "REEM, early, at localhost", "reem_blocking", "#073b66", host="localhost", options={"local": "early"}
+    ),
+    # A way of REEM's, such as early without waiting, is one line here; "publish" in its options is for PublishSpace.
+    "zenoh": CONTENDERS["zenoh"],
+    "pyzmq-ipc": Contender("pyzmq, ipc", "pyzmq_pubsub", "#e0a030", options={"ipc": True}),
+    "redis-socket": Contender("redis-py, Unix socket", "redis_blocking", "#5c5c5c", options={"socket": True}),
+    "iceoryx2": CONTENDERS["iceoryx2"],
+    "datagram": Contender("floor, Unix datagram", "datagram", "#000000"),
+}
+"""The ways between programs of one host."""
+
+SHOWN = {
+    viewer: Contender(f"REEM and {viewer}", "viewed", "#0b5fa5", host="localhost", options={"viewer": viewer})
+    for viewer in ("rerun", "foxglove")
+}
+"""REEM's programs that also log to a viewer."""
+
+CONTENDERS |= HOST | SHOWN
+
 LOCAL = {"reem": "reem-local", "async": "async-local"}
 """Who goes by TCP, as all do in every comparison, and the same at `localhost`: through the server's Unix socket."""
 

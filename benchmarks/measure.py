@@ -22,6 +22,12 @@ def fresh_key() -> str:
     return f"bench_{next(_key_numbers)}"
 
 
+def rotated(names: list[str], number: int) -> list[str]:
+    """The names in the order of a round: each one begins with another name."""
+    shift = number % max(1, len(names))
+    return names[shift:] + names[:shift]
+
+
 @dataclasses.dataclass
 class Bench:
     """What a case needs to be measured."""
@@ -96,9 +102,7 @@ class CallCase(Case):
     def _rounds(self, bench: Bench, ready: dict[str, str], samples: dict[str, list[float]]) -> Found:
         """Blocks of all in turn; whoever fails is left out from then on."""
         for number in range(self.rounds):
-            order = list(ready)
-            shift = number % max(1, len(order))
-            for name in order[shift:] + order[:shift]:
+            for name in rotated(list(ready), number):
                 try:
                     samples[name] += self._block(bench, bench.workers.get(ready[name]))
                 except ContenderError as error:

@@ -6,11 +6,12 @@ import itertools
 import time
 from typing import Any
 
-from .measure import Bench, Case, Found, fresh_key
+from .measure import Bench, Case, Found, fresh_key, rotated
 from .process import ContenderError, Worker
 from .results import failure, summary
 
 SETTLED = 10.0  # seconds within which every subscriber must have heard something
+FEWEST = 6  # messages in a round
 
 
 class Audience:
@@ -24,6 +25,9 @@ class Audience:
         if self.herd:
             return list(self.worker.ask("all", request={"do": do, **keywords}))
         return [self.worker.ask(do, **keywords)]
+
+
+Pairs = dict[str, tuple[Worker, Audience]]
 
 
 @dataclasses.dataclass
@@ -79,43 +83,60 @@ class Channel:
 
 @dataclasses.dataclass(frozen=True)
 class PublishCase(Case):
-    """One publisher, one subscriber, contenders in turn."""
+    """One publisher, one subscriber or more, each in a process of its own; contenders in turn."""
 
     payload: str = "small"
     count: int = 300
     gap: float = 0.004
     rounds: int = 3
+    subscribers: int = 1
 
     def measure(self, bench: Bench) -> Found:
-        """All pairs stay alive; they take turns."""
+        """Start all publishers and subscribers, which stay alive, and have them take turns."""
+        with contextlib.ExitStack() as stack:
+            pairs: Pairs = {}
+            for name in self.contenders:
+                try:
+                    members = self.subscribers if self.subscribers > 1 else 0
+                    publisher, subscriber = stack.enter_context(bench.workers.pair(name, members))
+                    pairs[name] = publisher, Audience(subscriber, herd=members > 0)
+                except ContenderError as error:
+                    for part in self.parts():
+                        yield part.identifier, name, failure(error)
+            for part in self.parts():
+                yield from part.measure_pairs(bench, pairs)
+
+    def parts(self) -> list["PublishCase"]:
+        """What the same processes measure, one after the other."""
+        return [self]
+
+    def measure_pairs(self, bench: Bench, pairs: Pairs) -> Found:
+        """Measure processes that run already; each round begins with another contender."""
         rounds = int(bench.scaled(self.rounds, 1))
-        count = max(10, int(bench.scaled(self.count, self.count / 5) / rounds))
+        count = max(FEWEST, int(bench.scaled(self.count, self.count / 5) / rounds))
         ages: dict[str, list[float]] = {}
         calls: dict[str, list[float]] = {}
         servers: dict[str, list[float]] = {}
-        with contextlib.ExitStack() as stack:
-            channels: dict[str, Channel] = {}
-            for name in self.contenders:
+        channels: dict[str, Channel] = {}
+        for name, (publisher, audience) in pairs.items():
+            try:
+                channel = Channel(publisher, audience, self.payload)
+                channel.open(1)
+                channels[name], ages[name], calls[name], servers[name] = channel, [], [], []
+            except ContenderError as error:
+                yield self.identifier, name, failure(error)
+        for number in range(rounds):
+            for name in rotated(list(channels), number):
                 try:
-                    publisher, subscriber = stack.enter_context(bench.workers.pair(name))
-                    channels[name] = Channel(publisher, Audience(subscriber, herd=False), self.payload)
-                    channels[name].open(1)
-                    ages[name], calls[name], servers[name] = [], [], []
+                    before = bench.workers.server.seconds()
+                    calls[name] += channels[name].publish(count, self.gap)
+                    ages[name] += channels[name].collect(count * self.subscribers)
+                    servers[name].append((bench.workers.server.seconds() - before) / count)
                 except ContenderError as error:
-                    channels.pop(name, None)
+                    del channels[name]
                     yield self.identifier, name, failure(error)
-            for _ in range(rounds):
-                for name, channel in list(channels.items()):
-                    try:
-                        before = bench.workers.server.seconds()
-                        calls[name] += channel.publish(count, self.gap)
-                        ages[name] += channel.collect(count)
-                        servers[name].append((bench.workers.server.seconds() - before) / count)
-                    except ContenderError as error:
-                        del channels[name]
-                        yield self.identifier, name, failure(error)
         for name in channels:
-            yield self.identifier, name, summary(ages[name], sent=count * rounds)
+            yield self.identifier, name, summary(ages[name], sent=count * rounds * self.subscribers)
             yield f"{self.identifier}.call", name, summary(calls[name])
             # What the server does for one message, with the heartbeats of all pairs in it.
             yield f"{self.identifier}.server", name, summary(servers[name])

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from .environment import FOLDER
-from .measure import Bench, Case, Found
+from .measure import Bench, Case, Found, rotated
 from .process import ContenderError
 from .results import failure, summary
 from .server import socket_of
@@ -70,9 +70,7 @@ class RecorderCase(Case):
                 yield f"{self.identifier}.{what}", name, entry
 
     def _round(self, bench: Bench, number: int, seconds: float, windows: Windows, folder: str) -> Found:
-        names = list(windows)
-        shift = number % max(1, len(names))
-        for name in names[shift:] + names[:shift]:
+        for name in rotated(list(windows), number):
             try:
                 with beside(name, bench.workers.server.url, folder):
                     time.sleep(SETTLED)

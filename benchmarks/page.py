@@ -4,6 +4,7 @@ import pathlib
 import re
 from collections.abc import Callable
 
+from . import one_host
 from .environment import FOLDER
 from .report import label
 from .results import Results
@@ -11,6 +12,7 @@ from .targets import Row, bare, floor, nearby, rows
 
 PAGE = FOLDER.parent / "docs" / "lab" / "performance.md"
 _TABLE = re.compile(r"<!-- goals -->\n.*?<!-- end of goals -->\n", re.DOTALL)
+_HOST = re.compile(r"<!-- one host -->\n.*?<!-- end of one host -->\n", re.DOTALL)
 
 
 def table(results: Results) -> str:
@@ -37,7 +39,8 @@ def _other(row: Row | None, of: Callable[[Row], Row | None], results: Results) -
 
 
 def rewrite(results: Results, page: pathlib.Path = PAGE) -> None:
-    """Put the table, and the line on where it was measured, into the page."""
+    """Put the tables, and the line on where they were measured, into the page."""
     told = f"Measured {results.started[:10]}: {results.environment}.\n\n"
     block = f"<!-- goals -->\n{told}{table(results)}<!-- end of goals -->\n"
-    page.write_text(_TABLE.sub(lambda _: block, page.read_text()))
+    host = f"<!-- one host -->\n{one_host.markdown(results)}<!-- end of one host -->\n"
+    page.write_text(_HOST.sub(lambda _: host, _TABLE.sub(lambda _: block, page.read_text())))

@@ -41,6 +41,8 @@ class Worker:
     def ask(self, do: str, patience: float = PATIENCE, **keywords: Any) -> Any:
         """Send one request and wait for its reply."""
         assert self._process.stdin
+        if self._process.stdin.closed:
+            raise ContenderError("the worker was ended")
         try:
             self._process.stdin.write(json.dumps({"do": do, **keywords}).encode() + b"\n")
             self._process.stdin.flush()
@@ -89,13 +91,17 @@ class Worker:
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
+        assert self._process.stdout
+        self._process.stdout.close()
+        self._errors.close()
 
 
 class Workers:
     """One measuring process per contender, started when first needed, and others on demand."""
 
-    def __init__(self, server: Server) -> None:
+    def __init__(self, server: Server, folder: str) -> None:
         self.server = server
+        self.folder = folder  # for Unix sockets; each pair has its own port in the names
         self.versions: dict[str, str] = {}
         self.unavailable: dict[str, str] = {}
         self._running: dict[str, Worker] = {}
@@ -107,7 +113,7 @@ class Workers:
             self._running[name] = worker = self.start(name)
         return worker
 
-    def target(self, contender: Contender, peer_port: int) -> dict[str, Any]:
+    def target(self, contender: Contender, peer_port: int, hub: bool | None = None) -> dict[str, Any]:
         """What a worker needs to know to connect."""
         server = self.server
         return {
@@ -116,18 +122,23 @@ class Workers:
             "port": server.port,
             "loop": contender.loop,
             "peer_port": peer_port,
+            "folder": self.folder,
+            "hub": hub,
             "options": contender.options,
         }
 
-    def start(self, name: str, peer_port: int = 0) -> Worker:
-        """Start and connect one process; what cannot start once is not tried again."""
+    def start(self, name: str, peer_port: int = 0, hub: bool | None = None) -> Worker:
+        """Start and connect one process; what cannot start once is not tried again.
+
+        Of more than a publisher and a subscriber, one is the `hub`, to which the others connect.
+        """
         if name in self.unavailable:
             raise ContenderError(self.unavailable[name])
         contender = CONTENDERS[name]
         worker = None
         try:
             worker = Worker(environment.interpreter(contender.environment), contender.module)
-            self.versions[name] = worker.ask("open", target=self.target(contender, peer_port))
+            self.versions[name] = worker.ask("open", target=self.target(contender, peer_port, hub))
         except (environment.VenvError, ContenderError) as error:
             if worker is not None:
                 worker.end()

@@ -14,6 +14,9 @@ OTHERS = {
     "fetches": "a bare client that subscribes and fetches",
     "recorder": "reem record",
     "background": "reem record --background",
+    "no viewer": "REEM's loop, no viewer",
+    "page": "REEM's page, seen from elsewhere",
+    "page in Chromium": "REEM's page, Chromium here",
 }
 
 STYLES = {
@@ -85,6 +88,8 @@ def _columns(entry: Entry) -> list[str]:
     remarks = []
     if "measured_by" in entry:
         remarks.append(f"measured: {label(entry['measured_by'])}, because {entry['because']}")
+    if "missed" in entry:
+        remarks.append(f"{entry['missed']} of {entry['periods']} deadlines missed")
     if "rate" in entry:
         remarks.append(f"{entry['rate']:.0f} per second in all")
     if entry.get("sent", entry["count"]) > entry["count"]:

@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from .contenders import BEFORE, EARLY, LOCAL, OFF
+from .contenders import BEFORE, EARLY, HOST, LOCAL, OFF
 from .measure import CallCase, Case, ClientsCase
+from .measure_host import LOOP, VIEWERS, ControlLoopCase, HostCase
 from .measure_other import IMPORTS, CameraCase, ImportCase
 from .measure_pubsub import PublishCase, SubscribersCase
 from .measure_recorder import BESIDE, RecorderCase
@@ -21,6 +22,7 @@ BYTES = (100, 1_000, 10_000, 100_000, 1_000_000, 8_000_000, 64_000_000)
 CALLERS = (1, 10, 100, 1000)
 THREADS = (1, 2, 4, 8)
 CLIENTS = (1, 5, 20, 50)
+ON_HOST = (1, 5, 20)
 SUBSCRIBERS = {1: (1, 1), 10: (10, 1), 100: (100, 1), 1000: (10, 100)}  # processes, subscribers in each
 
 # The same in a quick run.
@@ -34,6 +36,7 @@ QUICK = {
     THREADS: (1, 8),
     CLIENTS: (1, 20),
     tuple(SUBSCRIBERS): (100,),
+    ON_HOST: (1,),
 }
 
 FRONTS = ("reem", "async")
@@ -90,7 +93,9 @@ def subscribers(grown: Grown) -> list[Case]:
     others = ("pyzmq", "zenoh", "zenoh-tcp", "iceoryx2", "floor")
     ways = (*OFF.values(), *EARLY.values())
     cases: list[Case] = [
-        PublishCase("publish.small", (*fronts, *NEARBY, *OFF.values(), *others), payload="small", count=600, gap=0.004),
+        PublishCase("publish.small", (*fronts, *NEARBY, *others), payload="small", count=600, gap=0.004),
+        # What differs by a few percent: alone, in many turns.
+        PublishCase("publish.ways", (*FRONTS, *OFF.values()), payload="small", count=600, gap=0.004, rounds=12),
         PublishCase("publish.frame", (*fronts, *NEARBY, *ways, *others), payload="frame", count=60, gap=0.05, rounds=5),
         PublishCase("publish.image", (*fronts, *ways, *others), payload="image", count=100, gap=0.03, rounds=5),
     ]
@@ -152,6 +157,16 @@ def programs(grown: Grown) -> list[Case]:
     ]
 
 
+def one_host(grown: Grown) -> list[Case]:
+    """The programs of a robot's computer."""
+    publishing = tuple(name for name in HOST if name != "redis-socket")
+    return [
+        *(HostCase(f"host.{subscribers}", publishing, subscribers=subscribers) for subscribers in grown(ON_HOST)),
+        ControlLoopCase("host.loop", tuple(LOOP), ways=LOOP),
+        ControlLoopCase("host.viewer", tuple(VIEWERS), ways=VIEWERS),
+    ]
+
+
 def beside_before(cases: list[Case]) -> list[Case]:
     """The cases, those in which nothing may have changed with REEM of an earlier commit among the contenders."""
     return [
@@ -168,5 +183,5 @@ def every_case(quick: bool = False) -> list[Case]:
     def grown(axis: tuple[int, ...]) -> tuple[int, ...]:
         return QUICK[axis] if quick else axis
 
-    parts = (small, strings_and_arrays, array_rates, comparison, growth, crowds, programs, subscribers)
+    parts = (small, strings_and_arrays, array_rates, comparison, growth, crowds, programs, subscribers, one_host)
     return [case for part in parts for case in part(grown)]

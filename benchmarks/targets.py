@@ -113,8 +113,19 @@ _OFF = [
     ("server's CPU for a frame", f"{_FRAME}.server", 0.65, 0.5),
     ("the publisher's call, frame", f"{_FRAME}.call", 1.1, 1.0),
     ("the publisher's call, image of 0.92 MB", f"{_IMAGE}.call", 1.1, 1.0),
-    ("publish to callback, small", _SMALL, 1.03, 1.0),
-    ("the publisher's call, small", f"{_SMALL}.call", 1.03, 1.0),
+    ("publish to callback, small", "publish.ways", 1.03, 1.0),
+    ("the publisher's call, small", "publish.ways.call", 1.03, 1.0),
+]
+
+# Text, case, REEM's way, the other's, must, hope, statistic: programs of one host.
+_HOST = [
+    ("100 B to callback, early / zenoh", "host.1.state", "reem-host-early", "zenoh", 0.5, 0.3, "median"),
+    ("100 B to callback, early / pyzmq", "host.1.state", "reem-host-early", "pyzmq-ipc", 1.0, 0.6, "median"),
+    ("0.92 MB to callback, early / zenoh", "host.1.image", "reem-host-early", "zenoh", 0.6, 0.45, "median"),
+    ("7.4 MB to callback, early / zenoh", "host.1.frame", "reem-host-early", "zenoh", 0.4, 0.3, "median"),
+    ("7.4 MB to callback / zenoh", "host.1.frame", "reem-local", "zenoh", 1.2, 0.9, "median"),
+    ("control loop, p99 / zenoh", "host.loop", "reem-local", "zenoh", 1.0, 0.8, "p99"),
+    ("control loop with REEM's page, p99 / without", "host.viewer", "page", "no viewer", 1.2, 1.0, "p99"),
 ]
 
 
@@ -173,6 +184,10 @@ def rows() -> list[Row]:
             for front, ours in FRONTS.items()
         ]
     found += _shared_memory()
+    found += [
+        Row(f"one host: {text}", (case, ours), (case, theirs), must, hope, statistic)
+        for text, case, ours, theirs, must, hope, statistic in _HOST
+    ]
     found.append(
         Row(
             "100 concurrent async reads, throughput / redis.asyncio",

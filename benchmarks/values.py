@@ -1,6 +1,7 @@
 """The values that are written and read, built alike in every process from a short description."""
 
 import json
+import time
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,10 @@ TEXT = "A" * 100
 FRAME_SHAPE = (640, 480, 3)
 PIXELS = {"frame": "float64", "image": "uint8"}
 """What pixels are made of, by payload: 7.4 MB and 0.92 MB of them."""
+ARRAYS = {"scan": ((2560,), "float32"), **{payload: (FRAME_SHAPE, dtype) for payload, dtype in PIXELS.items()}}
+"""Shape and dtype of the array in a message, by payload. The scan has 10 KB."""
+FIELDS = {"state": {"q": [0.1234567, -1.2345678, 0.5, 1.57079633, -0.25, 3.1415]}}
+"""What a message without an array has beside its stamp: with it, a state is a JSON text of 100 bytes."""
 
 
 def copies(count: int, data: dict[str, Any]) -> dict[str, Any]:
@@ -32,9 +37,22 @@ def random_array(shape: list[int]) -> np.ndarray[Any, Any]:
 
 def picture(payload: str) -> np.ndarray[Any, Any]:
     """A frame that no compressor could shrink."""
-    if PIXELS[payload] == "uint8":
-        return np.random.default_rng(1).integers(0, 256, FRAME_SHAPE, np.uint8)
-    return random_array(list(FRAME_SHAPE))
+    shape, dtype = ARRAYS[payload]
+    if dtype == "uint8":
+        return np.random.default_rng(1).integers(0, 256, shape, np.uint8)
+    return random_array(list(shape)).astype(dtype, copy=False)
+
+
+def message(payload: str, **fields: Any) -> dict[str, Any]:
+    """A message stamped now, without its array."""
+    return {"timestamp": time.monotonic_ns(), **FIELDS.get(payload, {}), **fields}
+
+
+def complete(payload: str, data: Any) -> bool:
+    """Whether an array as it is sent, or received as bytes, has the payload's shape."""
+    shape, dtype = ARRAYS[payload]
+    found = data if isinstance(data, np.ndarray) else np.frombuffer(data, dtype).reshape(shape)
+    return found.shape == shape
 
 
 def build(spec: Spec) -> Any:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..values import Spec, below, build, same
+from .control import control_loop
 
 Call = Callable[[], Any]
 clock = time.perf_counter
@@ -144,6 +145,20 @@ class BlockingSession:
 
         for _ in range(subscribers):
             self.contender.subscribe(channel, payload, heard)
+
+    def stream(self, channel: str, payload: str, rate: float) -> None:
+        """Publish at `rate` from a thread, until the process ends."""
+        publish = self.contender.publishing(channel, payload)
+        arguments = (publish, rate, threading.Event(), [])
+        threading.Thread(target=self._stream, args=arguments, daemon=True).start()
+
+    def prepare_control(self, command: str, state: str) -> None:
+        """Follow the channel of the command, and be ready to publish the state."""
+        self.newest, self.call = self.contender.following(command), self.contender.publishing(state, "state")
+
+    def control(self, periods: int, rate: float) -> dict[str, Any]:
+        """Run the control loop that was prepared."""
+        return control_loop(self.newest, self.call, periods, rate)
 
     def heard(self) -> list[float]:
         """The ages since the last time this was asked."""

@@ -1,10 +1,9 @@
 """The documented blocking API, as this REEM and the original both have it."""
 
-import time
 from collections.abc import Callable
 from typing import Any
 
-from ..values import FRAME_SHAPE, picture
+from ..values import ARRAYS, complete, message, picture
 
 
 def walk(store: Any, path: list[str]) -> Any:
@@ -14,12 +13,10 @@ def walk(store: Any, path: list[str]) -> Any:
     return store
 
 
-def message_maker(payload: str) -> Callable[[], dict[str, Any]]:
+def message_maker(payload: str) -> Callable[..., dict[str, Any]]:
     """What makes the next stamped message."""
-    if payload == "small":
-        return lambda: {"timestamp": time.monotonic_ns()}
-    image = picture(payload)
-    return lambda: {"timestamp": time.monotonic_ns(), "image": image}
+    image = {"image": picture(payload)} if payload in ARRAYS else {}
+    return lambda **fields: message(payload, **image, **fields)
 
 
 class DocumentedContender:
@@ -44,12 +41,12 @@ class DocumentedContender:
         """`store["a"]["b"].read()`."""
         return lambda: walk(self.store, path).read()
 
-    def publishing(self, channel: str, payload: str) -> Callable[[], None]:
+    def publishing(self, channel: str, payload: str) -> Callable[..., None]:
         """`space["channel"] = {"timestamp": now, ...}`."""
-        message = message_maker(payload)
+        make = message_maker(payload)
 
-        def call() -> None:
-            self.space[channel] = message()
+        def call(**fields: Any) -> None:
+            self.space[channel] = make(**fields)
 
         return call
 
@@ -57,7 +54,7 @@ class DocumentedContender:
         """A `CallbackSubscriber` that hands on the stamp once it has the data."""
 
         def callback(data: Any, updated_path: Any, **_: Any) -> None:
-            if payload == "small" or data["image"].shape == FRAME_SHAPE:
+            if payload not in ARRAYS or complete(payload, data["image"]):
                 heard(data["timestamp"])
 
         subscriber = self.callback_subscriber(channel, self.interface, callback, {})

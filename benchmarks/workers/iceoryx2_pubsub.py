@@ -12,10 +12,11 @@ import iceoryx2
 import numpy as np
 import orjson
 
-from ..values import FRAME_SHAPE, PIXELS, picture
+from ..values import ARRAYS, complete, message, picture
 
 _STAMP = 8  # bytes before a frame's own
 _ROOM = 1024  # bytes of a small message
+_MOST = 32  # processes of a service; without this it has room for eight subscribers
 
 
 class Contender:
@@ -37,14 +38,15 @@ class Contender:
 
     def _services(self, channel: str) -> tuple[Any, Any]:
         name = iceoryx2.ServiceName.new(f"{self.prefix}/{channel}")
-        data = self.node.service_builder(name).publish_subscribe(iceoryx2.Slice[ctypes.c_uint8]).open_or_create()
-        event = self.node.service_builder(name).event().open_or_create()
+        data = self.node.service_builder(name).publish_subscribe(iceoryx2.Slice[ctypes.c_uint8])
+        data = data.max_subscribers(_MOST).max_nodes(_MOST).open_or_create()
+        event = self.node.service_builder(name).event().max_listeners(_MOST).max_nodes(_MOST).open_or_create()
         self.kept += [data, event]
         return data, event
 
     def publishing(self, channel: str, payload: str) -> Callable[[], Any]:
         """Small: a JSON text; frame: the stamp and the array's bytes, copied once into memory that is lent."""
-        image = None if payload == "small" else picture(payload)
+        image = picture(payload) if payload in ARRAYS else None
         if channel not in self.publishers:
             data, event = self._services(channel)
             room = _ROOM if image is None else _STAMP + image.nbytes
@@ -62,7 +64,7 @@ class Contender:
             notifier.notify()
 
         if image is None:
-            return lambda: send(np.frombuffer(orjson.dumps({"timestamp": time.monotonic_ns()}), np.uint8))
+            return lambda: send(np.frombuffer(orjson.dumps(message(payload)), np.uint8))
         flat = image.reshape(-1).view(np.uint8)
         return lambda: send(np.frombuffer(time.monotonic_ns().to_bytes(_STAMP), np.uint8), flat)
 
@@ -72,9 +74,9 @@ class Contender:
         subscriber, listener = data.subscriber_builder().create(), event.listener_builder().create()
 
         def take(content: memoryview) -> None:
-            if payload == "small":
+            if payload not in ARRAYS:
                 heard(int(orjson.loads(bytes(content))["timestamp"]))
-            elif np.frombuffer(content[_STAMP:], PIXELS[payload]).reshape(FRAME_SHAPE).shape == FRAME_SHAPE:
+            elif complete(payload, content[_STAMP:]):
                 heard(int.from_bytes(content[:_STAMP]))
 
         def listen() -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from ..values import FRAME_SHAPE
+from ..values import ARRAYS, complete
 from .documented import message_maker, walk
 
 
@@ -55,7 +55,7 @@ class Contender:
         from reem_async.datatypes import CallbackSubscriber
 
         def callback(data: Any, updated_path: str, **_: Any) -> None:
-            if payload == "small" or data["image"].shape == FRAME_SHAPE:
+            if payload not in ARRAYS or complete(payload, data["image"]):
                 heard(data["timestamp"])
 
         subscriber = CallbackSubscriber(channel, self.interface, callback, {})

@@ -1,5 +1,6 @@
 """This REEM, blocking front."""
 
+from collections.abc import Callable
 from typing import Any
 
 from .documented import DocumentedContender
@@ -12,11 +13,21 @@ class Contender(DocumentedContender):
         from reem.connection import RedisInterface
         from reem.datatypes import CallbackSubscriber, KeyValueStore, PublishSpace
 
-        self.interface = RedisInterface(host=target["url"], **target["options"])
+        options = dict(target["options"])
+        publish = options.pop("publish", {})
+        self.interface = RedisInterface(host=target["url"], **options)
         self.interface.initialize()
         self.store = KeyValueStore(self.interface)
-        self.space = PublishSpace(self.interface)
+        self.space = PublishSpace(self.interface, **publish)
         self.callback_subscriber = CallbackSubscriber
+
+    def following(self, channel: str) -> Callable[[], Any]:
+        """A `SilentSubscriber`, whose local copy answers."""
+        from reem.datatypes import SilentSubscriber
+
+        mirror = SilentSubscriber(channel=channel, interface=self.interface)
+        mirror.listen()
+        return mirror.value
 
     @staticmethod
     def preload() -> None:
