@@ -9,11 +9,7 @@ async with RedisInterface("localhost") as interface:
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ._moved import keep_old_names
-
 __version__ = "1.0.0rc1"
-
-keep_old_names(__name__)
 
 if TYPE_CHECKING:
     from .concurrency.queues import Every, Last, Newest
@@ -41,28 +37,18 @@ __all__ = [
 ]  # fmt: skip
 
 _HOMES = {
-    "BlobShip": ".ships",
-    "BytesShip": ".ships",
-    "CallbackSubscriber": ".pubsub.subscribers",
-    "Every": ".concurrency.queues",
-    "KeyValueStore": ".store",
-    "Last": ".concurrency.queues",
-    "Newest": ".concurrency.queues",
-    "NumpyShip": ".ships",
-    "Origin": ".pubsub.events",
-    "PublishSpace": ".store.publish",
-    "Publisher": ".store.publish",
-    "Reader": ".store",
-    "RedisInterface": ".connection",
-    "SilentSubscriber": ".pubsub.subscribers",
-    "SpecialDatatypeShip": ".ships",
-    "StateChange": ".transport.state",
-    "Unreadable": ".plan.placeholders",
-    "Update": ".pubsub.events",
-    "Writer": ".store",
-    "timeout": ".concurrency.timeouts",
+    ".concurrency.queues": ["Every", "Last", "Newest"],
+    ".concurrency.timeouts": ["timeout"],
+    ".connection": ["RedisInterface"],
+    ".plan.placeholders": ["Unreadable"],
+    ".pubsub.events": ["Origin", "Update"],
+    ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],
+    ".ships": ["BlobShip", "BytesShip", "NumpyShip", "SpecialDatatypeShip"],
+    ".store": ["KeyValueStore", "Reader", "Writer"],
+    ".store.publish": ["PublishSpace", "Publisher"],
+    ".transport.state": ["StateChange"],
 }
-"""Where each name is that is no error. Imported when first used: `reem --help` starts sooner."""
+"""Where the names are that are no errors. Imported when first used: `reem --help` starts sooner."""
 
 
 def load_ipython_extension(shell: Any) -> None:
@@ -78,5 +64,6 @@ def unload_ipython_extension(shell: Any) -> None:
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES.get(name, ".errors"), __name__), name)
+    home = next((module for module, names in _HOMES.items() if name in names), ".errors")
+    value = globals()[name] = getattr(import_module(home, __name__), name)
     return value

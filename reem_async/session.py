@@ -12,7 +12,7 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from operator import attrgetter
-from typing import Any, Protocol
+from typing import Any
 
 from .concurrency.tasks import Tasks
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
@@ -46,6 +46,7 @@ class _Numbers:
     """The publisher's id, and the number of its last update of each top-level key; idle keys are forgotten.
 
     A key that is published again after that gets another id and starts from 1: numbers of one id never go back.
+    `_last` also has when that update was, and until when the key is fresh.
     """
 
     def __init__(self) -> None:
@@ -54,7 +55,7 @@ class _Numbers:
         self._looked = 0.0
         self._looking = threading.Lock()  # tried, never waited for
         self.publisher = secrets.token_hex(6)
-        self._last: collections.OrderedDict[str, tuple[str, int, float]] = collections.OrderedDict()
+        self._last: collections.OrderedDict[str, tuple[str, int, float, float]] = collections.OrderedDict()
 
     def next(self, channel: str) -> tuple[str, int]:
         if self._pid != os.getpid():  # a forked child is another publisher
@@ -62,8 +63,10 @@ class _Numbers:
         now = time.monotonic()
         # No lock between threads: calls on one key come one after the other (`Transport.ordered`), and those on other
         # keys touch other entries.
-        publisher, number, _ = self._last.get(channel) or (self.publisher, 0, now)
-        self._last[channel] = publisher, number + 1, now
+        publisher, number, before, fresh = self._last.get(channel) or (self.publisher, 0, -math.inf, 0.0)
+        if now - before > QUIET:
+            fresh = now + _FRESH
+        self._last[channel] = publisher, number + 1, now, fresh
         with contextlib.suppress(KeyError):  # another thread has just forgotten it
             self._last.move_to_end(channel)
         if len(self._last) > _KEPT and now - self._looked > _LOOKS and self._looking.acquire(blocking=False):
@@ -74,15 +77,15 @@ class _Numbers:
                 self._looking.release()
         return publisher, number + 1
 
-    def is_quiet(self, channel: str) -> bool:
+    def is_fresh(self, channel: str) -> bool:
         last = self._last.get(channel)
-        return last is None or time.monotonic() - last[2] > QUIET
+        return last is not None and time.monotonic() < last[3]
 
     def take_back(self, channel: str, publisher: str, number: int) -> None:
         """Make a number free again, if it was the last."""
         last = self._last.get(channel)
         if last is not None and last[:2] == (publisher, number):
-            self._last[channel] = publisher, number - 1, -math.inf  # nothing was published: still quiet
+            self._last[channel] = publisher, number - 1, -math.inf, last[3]  # nothing was published: still quiet
 
     def _forget(self, before: float) -> None:
         # The order of the dict is that of the last use, so the idlest key is the first.
@@ -96,29 +99,6 @@ class _Numbers:
             return self._last[next(iter(self._last))][2] < moment
         except (KeyError, RuntimeError):  # another thread has published it now
             return False
-
-
-class LoopSubscriptions(Protocol):
-    """The subscriptions of an interface in one event loop: `pubsub.manager.SubscriptionManager`."""
-
-    async def close(self) -> None: ...
-
-    def end_loops(self) -> None:
-        """End the loops of threads over subscribers. Any thread may call this."""
-
-
-class Background(Protocol):
-    """Runs coroutines beside the calls of an interface."""
-
-    def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> object: ...
-
-    async def end(self) -> None: ...
-
-
-class Closing(Protocol):
-    """An object that is closed with the interface."""
-
-    def close(self) -> None: ...
 
 
 class Session:
@@ -140,8 +120,8 @@ class Session:
         transport: Sends commands to the server.
         interface: The interface this belongs to: pickled in its place.
         subscriptions: The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
-        tasks: The background tasks of publishers; ended by `close`.
-        closing: Objects to close with this.
+        tasks: The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.
+        closing: Objects with a method `close`, to close with this.
         closed: Whether it is closed, or about to be.
     """
 
@@ -165,10 +145,9 @@ class Session:
         self.local = local or LocalPath()
         self.interface: Any = None
         self._numbers = _Numbers()
-        self._fresh: dict[str, float] = {}
-        self.subscriptions: LoopSubscriptions | None = None
-        self.tasks: Background = Tasks()
-        self.closing: weakref.WeakSet[Closing] = weakref.WeakSet()
+        self.subscriptions: Any = None
+        self.tasks: Any = Tasks()
+        self.closing: weakref.WeakSet[Any] = weakref.WeakSet()
         self.closed = False
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -200,35 +179,23 @@ class Session:
 
     def stamp(self, keys: Keys) -> tuple[str, int]:
         """Return the publisher's id, and the number of its next update of a top-level key."""
-        is_quiet = self.transport.sharded and self._numbers.is_quiet(keys.channel)
-        publisher, number = self._numbers.next(keys.channel)
-        # In a cluster, notices go to the key's own node. Clients that find keys by pattern do not follow a new key
-        # there yet, or not any more.
-        if is_quiet or (number == 1 and self.transport.sharded):
-            now = time.monotonic()
-            if len(self._fresh) >= _KEPT:
-                for channel in [channel for channel, until in self._fresh.copy().items() if until < now]:
-                    self._fresh.pop(channel, None)
-            self._fresh[keys.channel] = now + _FRESH
-        return publisher, number
+        return self._numbers.next(keys.channel)
 
     def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
         """Make the number of a stamp free again.
 
-        The caller holds the turn of the key, see `Transport.ordered`. If a signal handler on the same thread has
-        published in between, the number is never used.
+        The caller holds the turn of the key, see `Transport.ordered`. If a call out of a `__del__` has published in
+        between, the number is never used.
         """
         self._numbers.take_back(keys.channel, *stamp)
 
     def is_fresh(self, keys: Keys) -> bool:
-        """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know."""
-        until = self._fresh.get(keys.channel)
-        if until is None:
-            return False
-        if time.monotonic() < until:
-            return True
-        self._fresh.pop(keys.channel, None)
-        return False
+        """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know.
+
+        Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet, or not
+        any more.
+        """
+        return self.transport.sharded and self._numbers.is_fresh(keys.channel)
 
     async def initialize(self) -> None:
         """Connect and check that the server can be used."""

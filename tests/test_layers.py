@@ -113,7 +113,7 @@ def test_what_is_forbidden_would_be_found(tmp_path, monkeypatch):
 
 
 ORDER = [
-    {"errors", "_moved", "_installation"},
+    {"errors", "_installation"},
     {"plan", "ships", "legacy.olddata"},
     {"plain"},
     {"concurrency"},

@@ -51,7 +51,6 @@ class Carrier(Protocol):
 
     def describe(self, value: Any, /) -> tuple[int, str]:
         """Return bytes and a summary; raises BadType or BadValue."""
-        ...
 
 
 Fits = Callable[[Any], Carrier | None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Sequence
 from types import TracebackType
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -96,18 +96,6 @@ class Turn:
 _SILENT_TURN = Turn()
 
 
-class Outages(Protocol):
-    """`outage.Outage`."""
-
-    async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
-        """Send the assignments of one call; in an outage, keep or drop them."""
-        ...
-
-    async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
-        """Send a change that depends on the stored value, after the kept updates; raises in an outage."""
-        ...
-
-
 # Seconds, 300 years: servers refuse what leaves 64 bits of milliseconds.
 _LONGEST_EXPIRY = 1e10
 
@@ -133,7 +121,7 @@ class DocumentWriter:
     Args:
         session: The server.
         name: The key.
-        outages: The policy for outages; None if calls raise.
+        outages: The policy for outages, an `outage.Outage`; None if calls raise.
 
     Attributes:
         encoder: Encodes the values.
@@ -143,7 +131,7 @@ class DocumentWriter:
     # A task awaits each of its calls, so they are in order. Those of several tasks need not be.
     keeps_order = False
 
-    def __init__(self, session: Session, name: object, outages: Outages | None = None) -> None:
+    def __init__(self, session: Session, name: object, outages: Any = None) -> None:
         self.session = session
         self.keys = session.keys(name)
         self.name = self.keys.name
@@ -175,11 +163,11 @@ class DocumentWriter:
             await self.encoder.check_sizes(path, [text])
         await self._set(path, text, ())
 
-    def _store(self, assignments: Sequence[Assignment]) -> Awaitable[None]:
+    def _store(self, assignments: Sequence[Assignment]) -> Awaitable[Any]:
         return self.in_turn(self.send, assignments) if self._outages is None else self._outages.put(self, assignments)
 
-    def _set(self, path: Path, text: bytes, attachments: Attachments) -> Awaitable[None]:
-        if self._outages is None:
+    def _set(self, path: Path, text: bytes, attachments: Attachments) -> Awaitable[Any]:
+        if self._outages is None:  # the hot path
             return self.in_turn(self._put, path, text, attachments)
         return self._store([Assignment(path, text, attachments)])
 
@@ -286,13 +274,12 @@ class DocumentWriter:
                     raise error.with_traceback(None) from None
                 raise
 
-    async def send(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
+    def send(self, turn: Turn, assignments: Sequence[Assignment]) -> Awaitable[None]:
         """Send the assignments of one call, in its turn: all in one transaction."""
         if len(assignments) > 1 or assignments[0].is_entry:
-            await self._put_all(turn, assignments)
-            return
+            return self._put_all(turn, assignments)
         path, text, attachments, _ = assignments[0]
-        await (self._remove(turn, path) if text is None else self._put(turn, path, text, attachments))
+        return self._remove(turn, path) if text is None else self._put(turn, path, text, attachments)
 
     async def _put(self, turn: Turn, path: Path, text: bytes, attachments: Attachments) -> None:
         """Store a value; a single array just below a top-level key that is not there makes that."""

@@ -31,7 +31,6 @@ class Held(Protocol):
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         """Send `commands` in one go and return their replies; error replies are returned, not raised."""
-        ...
 
 
 class Transport(Held, Protocol):
@@ -49,64 +48,50 @@ class Transport(Held, Protocol):
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit."""
-        ...
 
     @property
     def options(self) -> Options:
         """How the server is reached; in a cluster, one of its nodes."""
-        ...
 
     @property
     def timeout(self) -> float:
         """Seconds without a byte moving after which a call made now is given up."""
-        ...
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         """Return the way to the server that has `key`; `refresh` if it was not where it was thought to be."""
-        ...
 
     async def nodes(self) -> Sequence[Transport]:
         """Return the ways to the servers that have all keys together."""
-        ...
 
     async def pause(self, seconds: float) -> None:
         """Wait."""
-        ...
 
     async def let_pass(self) -> bool:
         """Wait, before something large is sent, until small calls of the same thread that are under way are answered.
 
         Returns whether anything else could happen meanwhile.
         """
-        ...
 
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers that were cancelled since, is on its way to `document`."""
-        ...
 
     async def settle(self, document: str) -> None:
         """Wait until it has arrived: it must not come after what is written next."""
-        ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return a lock: what is sent inside arrives in the order of entering, per `key`."""
-        ...
 
     def broken_off(self) -> None:
         """Give back what a call of this thread holds that was broken off between two steps, by Ctrl-C for example."""
-        ...
 
     def check(self) -> None:
         """Raise if this cannot be used here: closed, or bound to another event loop."""
-        ...
 
     async def release(self) -> None:
         """Close the connections that are not in use; new ones are made when needed."""
-        ...
 
     async def close(self) -> None:
         """Close all connections. Idempotent."""
-        ...
 
 
 class Contention:

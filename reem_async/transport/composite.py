@@ -19,7 +19,6 @@ class ToOneServer(Transport, Protocol):
 
         To be called again if not. One that is given back, in a blocking program, is closed then.
         """
-        ...
 
 
 NewTransport = Callable[[Options], ToOneServer]

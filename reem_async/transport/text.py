@@ -57,11 +57,9 @@ class Lending(Protocol):
 
     def hold(self) -> AbstractAsyncContextManager[Held]:
         """Lend a connection."""
-        ...
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
         """Return the lock of `key`."""
-        ...
 
 
 class Text:
