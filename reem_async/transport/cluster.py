@@ -61,8 +61,7 @@ class ClusterOptions(Options):
 
     Args:
         url: `redis+cluster://user:password@host:port,host:port`, or `rediss+cluster://`; some of the nodes.
-        timeout: Seconds without a byte moving after which a call is given up.
-        options: redis-py's connection options, the same for all nodes.
+        timeout, options: As for `Options`; the same for all nodes.
 
     Attributes:
         seeds: The nodes that the URL names.
@@ -80,26 +79,15 @@ class ClusterOptions(Options):
 
     @property
     def address(self) -> str:
-        """Where the nodes are that were named, for messages."""
         return ",".join(f"{host}:{port}" for host, port in self.seeds)
 
     @property
     def url(self) -> str:
-        """What to write to get there, without user and password."""
         return f"{'rediss' if self.tls else 'redis'}+cluster://{self.address}"
-
-    def node(self, address: Address) -> Options:
-        """Return how to reach one node."""
-        return NodeOptions(self, address)
 
 
 class ClusterTransport(CompositeTransport):
-    """Connections to the nodes of a cluster, made when first needed.
-
-    Attributes:
-        sharded: Notices go through the node that has the key's slot.
-        states: What the interface's user gets to know of the connections.
-    """
+    """Connections to the nodes of a cluster, made when first needed."""
 
     sharded = True
 
@@ -125,7 +113,7 @@ class ClusterTransport(CompositeTransport):
         """Return the transport to one node, connected or not."""
         node = self._nodes.get(address)
         if node is None:
-            node = self._new_transport(self._options.node(address))
+            node = self._new_transport(NodeOptions(self._options, address))
             node.states = _NodeStates(self, address)
             node = self._nodes.setdefault(address, node)  # another thread may have made it meanwhile
         return node
@@ -155,7 +143,6 @@ class ClusterTransport(CompositeTransport):
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[Held]:
-        """Lend a connection to the node that has what is watched, wherever that moves."""
         held = HeldAcross(self)
         try:
             yield held
@@ -424,15 +411,12 @@ class _NodeStates(States):
         self._node = address
 
     def opened(self, address: str, server: str | None) -> None:
-        """Pass it on."""
         self._cluster.opened(self._node, server)
 
     def tell(self) -> None:
-        """Pass it on."""
         self._cluster.states.tell()
 
     def lost(self, reason: Exception) -> bool:
-        """Pass it on."""
         return self._cluster.lost(self._node, reason)
 
 
@@ -441,11 +425,7 @@ Outcome = tuple[Exception | None, list[Reply] | None]
 
 
 class Publication:
-    """One transaction with a notice, on its way to the node that has its keys.
-
-    Args:
-        commands: MULTI, what it does, the notice, EXEC.
-    """
+    """One transaction with a notice (MULTI, what it does, the notice, EXEC), on its way to the node with its keys."""
 
     def __init__(self, commands: Sequence[Command]) -> None:
         multi, *body, execute = commands

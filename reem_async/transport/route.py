@@ -30,7 +30,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from functools import lru_cache
-from typing import Any, Protocol
+from typing import Any
 
 import redis.crc
 import redis.exceptions
@@ -60,23 +60,12 @@ Unapplied = (
 _KEYLESS = frozenset(
     ["SCAN", "PING", "INFO", "TIME", "CONFIG", "ACL", "CLUSTER", "CLIENT", "COMMAND", "DBSIZE", "MODULE", "UNWATCH"]
 )
-_NO_KEYS_IN_TRANSACTIONS = frozenset(["MULTI", "EXEC", "UNWATCH", "PUBLISH", "SPUBLISH"])
+_NO_KEYS_IN_TRANSACTIONS = _KEYLESS | frozenset(["MULTI", "EXEC", "PUBLISH", "SPUBLISH"])
 
 _ASKING: Command = ("ASKING",)
 _UNWATCH: Command = ("UNWATCH",)
 _PAUSES = (0.0, 0.0, 0.005, 0.01, 0.02, 0.05)
 """Seconds to wait before each further try; redirections are followed at once, twice."""
-
-
-def key_of(command: Command) -> bytes | None:
-    """Return the key that decides where a command belongs; None if any node may have it.
-
-    All commands that REEM sends have their key behind their name, and all of a plan have the same hash tag.
-    """
-    if len(command) < 2 or command[0] in _KEYLESS:
-        return None
-    word = command[1]
-    return word if type(word) is bytes else str(word).encode()
 
 
 def slot_of(commands: Sequence[Command]) -> int | None:
@@ -86,18 +75,20 @@ def slot_of(commands: Sequence[Command]) -> int | None:
 
 
 def _slot(command: Command) -> int | None:
-    if len(command) < 2 or command[0] in _KEYLESS:
-        return None
-    return _slot_of_word(command[1])
+    # All commands that REEM sends have their key behind their name, and all of a plan have the same hash tag.
+    return None if len(command) < 2 or command[0] in _KEYLESS else _slot_of_word(command[1])
 
 
 @lru_cache(maxsize=4096)
 def _slot_of_word(word: str | bytes) -> int:
-    return key_slot(word if type(word) is bytes else str(word).encode())
+    return key_slot(_encoded(word))
+
+
+def _encoded(word: Any) -> bytes:
+    return word if type(word) is bytes else str(word).encode()
 
 
 def slots_of(commands: Sequence[Command]) -> list[int | None]:
-    """Return the slot of each command."""
     return [_slot(command) for command in commands]
 
 
@@ -112,9 +103,9 @@ def keys_in(commands: Sequence[Command]) -> list[bytes]:
     for command in commands:
         # The only commands of REEM with more than one key.
         if command[0] in ("UNLINK", "RENAME", "WATCH"):
-            found.update(dict.fromkeys(word if type(word) is bytes else str(word).encode() for word in command[1:]))
-        elif command[0] not in _NO_KEYS_IN_TRANSACTIONS and (key := key_of(command)) is not None:
-            found[key] = None
+            found.update(dict.fromkeys(map(_encoded, command[1:])))
+        elif command[0] not in _NO_KEYS_IN_TRANSACTIONS and len(command) > 1:
+            found[_encoded(command[1])] = None
     return list(found)
 
 
@@ -136,24 +127,13 @@ def is_unapplied(reply: object) -> bool:
     return isinstance(reply, Unapplied)
 
 
-class Layout(Protocol):
-    """What a route needs of `cluster.ClusterTransport`."""
-
-    @property
-    def timeout(self) -> float: ...
-    async def owner_of(self, slot: int, *, refresh: bool = False) -> Transport: ...
-    async def nodes(self) -> Sequence[Transport]: ...
-    def moved(self, problem: Any, asked: Transport) -> Transport: ...
-    async def pause(self, seconds: float) -> None: ...
-
-
 class Route:
-    """The way of one call: which node is next, until the call's time is over."""
+    """The way of one call through a `cluster.ClusterTransport`: which node is next, until the call's time is over."""
 
-    def __init__(self, cluster: Layout, slot: int | None, asked: Transport | None = None) -> None:
+    def __init__(self, cluster: Any, slot: int | None, asked: Transport | None = None) -> None:
         self._cluster = cluster
         self._slot = slot
-        self._node = asked
+        self._node: Any = asked
         self._began = time.monotonic()
         self._deadline = 0.0
         self._tries = 0
@@ -164,8 +144,8 @@ class Route:
         """Whether the node does not have the slot yet, and must be told that this is known."""
         return self._source is not None
 
-    async def node(self) -> Transport:
-        """Return where to send next."""
+    async def node(self) -> Any:
+        """Return the transport to send with next."""
         if self._node is None:
             # The first try believes what is known. Each later one looks again, since what was known has failed.
             if self._slot is not None:
@@ -235,7 +215,7 @@ def _reason(problem: Exception) -> str:
 class HeldAcross:
     """A connection to the node that has what is watched; each WATCH may find it elsewhere."""
 
-    def __init__(self, cluster: Layout) -> None:
+    def __init__(self, cluster: Any) -> None:
         self._cluster = cluster
         self._node: Transport | None = None
         self._lent: AbstractAsyncContextManager[Held] | None = None

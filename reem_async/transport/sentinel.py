@@ -46,9 +46,8 @@ class SentinelOptions(Options):
 
     Args:
         url: `redis+sentinel://user:password@host:port,host:port/service`; user and password are the servers'.
-        timeout: Seconds without a byte moving after which a call is given up.
-        options: redis-py's connection options for the servers; besides, `sentinel_username` and
-            `sentinel_password` for the sentinels.
+        timeout: As for `Options`.
+        options: Those of the servers; besides, `sentinel_username` and `sentinel_password` for the sentinels.
 
     Attributes:
         service: What the sentinels call the primary.
@@ -85,23 +84,22 @@ class SentinelOptions(Options):
         }
 
     @property
+    def _hosts(self) -> str:
+        return ",".join(f"{host}:{port}" for host, port in self._sentinels)
+
+    @property
     def address(self) -> str:
-        """What is watched and by whom, for messages."""
-        return f"{self.service} (sentinels {','.join(f'{host}:{port}' for host, port in self._sentinels)})"
+        return f"{self.service} (sentinels {self._hosts})"
 
     @property
     def url(self) -> str:
-        """What to write to get there, without user and password."""
-        hosts = ",".join(f"{host}:{port}" for host, port in self._sentinels)
         database = f"/{self.database}" if self.database else ""
-        return f"{'rediss' if self.tls else 'redis'}+sentinel://{hosts}/{self.service}{database}"
+        return f"{'rediss' if self.tls else 'redis'}+sentinel://{self._hosts}/{self.service}{database}"
 
     def asynchronous_connection(self) -> Any:
-        """Return a fresh connection that will look for the primary when it connects."""
         return connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
 
     def blocking_connection(self) -> Any:
-        """Return a fresh connection that will look for the primary when it connects."""
         return connecting_by(super().blocking_connection(), self._connect)
 
     async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
@@ -213,12 +211,7 @@ def _check_role(role: Any, connection: Any) -> None:
 
 
 class SentinelTransport(CompositeTransport):
-    """Connections to the primary of the moment.
-
-    Attributes:
-        sharded: One server has all keys.
-        states: What the interface's user gets to know of the connections.
-    """
+    """Connections to the primary of the moment."""
 
     sharded = False
 
@@ -248,7 +241,7 @@ class SentinelTransport(CompositeTransport):
     def _current(self) -> ToOneServer:
         """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
-            self._lookout = _Lookout(self._options, self, SentinelTransport._on_moved)
+            self._lookout = _Lookout(self._options, self)
             self._options.changed = self._lookout.tell
         if self._moved:
             self._moved = False
@@ -257,7 +250,7 @@ class SentinelTransport(CompositeTransport):
             self._demoted = [each for each in self._demoted if not each.retire()]
         return self._now
 
-    def _on_moved(self) -> None:
+    def on_moved(self) -> None:
         """Take note that the sentinels name another primary. Runs on a thread of its own."""
         self._moved = True
         reason = ConnectionLost(f"the sentinels name another primary for {self._options.service!r}")
@@ -336,12 +329,10 @@ class _Lookout:
         pid: The process it runs in.
     """
 
-    def __init__(
-        self, options: SentinelOptions, owner: SentinelTransport, told: Callable[[SentinelTransport], None]
-    ) -> None:
+    def __init__(self, options: SentinelOptions, owner: SentinelTransport) -> None:
         self.pid = os.getpid()
         self._options = options
-        self._owner, self._told = weakref.ref(owner), told  # no WeakMethod: see `pubsub.refresh`
+        self._owner = weakref.ref(owner)
         self._stopped = threading.Event()
         threading.Thread(target=self._run, name="reem-sentinel", daemon=True).start()
 
@@ -356,7 +347,7 @@ class _Lookout:
     def tell(self) -> None:
         """Say that it is another one."""
         if (owner := self._owner()) is not None:
-            self._told(owner)
+            owner.on_moved()
 
     def stop(self) -> None:
         """End the thread, within a second or so."""

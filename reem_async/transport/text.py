@@ -9,8 +9,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 from zlib import crc32
 
 from ..concurrency.timeouts import time_limit
@@ -19,7 +18,7 @@ from ..plain.batches import Known, Steps, Watched, concerns, has_json
 from ..plain.changes import after_look
 from ..plain.translation import directly, finished, looked_at, shortcut, translated
 from ..plan import Command, Reply
-from ..plan.sizes import KEPT, as_given, is_large, stage
+from ..plan.sizes import KEPT, Staged, as_given, stage
 from . import Contention, Held
 from .parsing import error_of
 
@@ -52,22 +51,8 @@ Send = Callable[..., Awaitable[list[Reply]]]
 """Sends commands that any server takes: `send(commands, bulk=...)`."""
 
 
-class Lending(Protocol):
-    """What a transport has for it: a connection of the caller's own, and a lock."""
-
-    def hold(self) -> AbstractAsyncContextManager[Held]:
-        """Lend a connection."""
-
-    def ordered(self, key: str) -> AbstractAsyncContextManager[Any]:
-        """Return the lock of `key`."""
-
-
 class Text:
-    """The documents of one server without JSON, as one transport meets them.
-
-    Args:
-        timeout: The interface's time limit, in seconds.
-    """
+    """The documents of one server without JSON, as one transport meets them."""
 
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
@@ -83,7 +68,8 @@ class Text:
         """Return the answers to commands for which there was a shortcut."""
         return finished(commands, replies, self.known, error_of)
 
-    async def roundtrip(self, send: Send, lending: Lending, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+    async def roundtrip(self, send: Send, lending: Any, commands: Sequence[Command], bulk: bool) -> list[Reply]:
+        """Do as `Transport.roundtrip`: `send` sends, and `lending` has that transport's `hold` and `ordered`."""
         keys = looked_at(commands, self.known)
         if keys:
             return await self._after_look(lending, keys, commands, bulk)
@@ -94,7 +80,7 @@ class Text:
         return replies
 
     async def _after_look(
-        self, lending: Lending, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
+        self, lending: Any, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
     ) -> list[Reply]:
         """Look, then change; retry if another client wrote in between. Two round trips.
 
@@ -117,13 +103,9 @@ class Text:
             if replies is not None:
                 return replies
             contention.given_up(commands)
-            # Another client was first, and will be again while the array is on its way: from now on it is sent ahead.
-            if type(attempt) is _Attempt and commands[-1][0] == "EXEC" and any(map(is_large, commands)):
-                attempt = _Ahead(keys, commands)
+            attempt.send_ahead()
 
-    async def _in_turn(
-        self, turns: Sequence[str], lending: Lending, attempt: _Attempt, bulk: bool
-    ) -> list[Reply] | None:
+    async def _in_turn(self, turns: Sequence[str], lending: Any, attempt: _Attempt, bulk: bool) -> list[Reply] | None:
         if turns:
             came = time.monotonic()
             async with lending.ordered(turns[0]):
@@ -137,7 +119,8 @@ class Text:
         attempt.begun = time.monotonic()
         async with lending.hold() as held:
             if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
-                return await held.roundtrip(attempt.given, bulk=bulk)
+                replies: list[Reply] = await held.roundtrip(attempt.given, bulk=bulk)
+                return replies
             return await attempt.made(held, bulk)
 
     def _check_reached(self, turn: str, came: float) -> None:
@@ -155,12 +138,7 @@ class Text:
 
 
 class HeldText:
-    """A connection of one caller's own, to a server without JSON.
-
-    Args:
-        held: The connection.
-        text: The server's documents.
-    """
+    """A connection of one caller's own, to a server without JSON."""
 
     def __init__(self, held: Held, text: Text) -> None:
         self._held = held
@@ -205,43 +183,28 @@ class _Lost(NamedTuple):
 class _Attempt:
     """A batch that is retried until no other client writes in between.
 
-    Args:
-        keys: Of the documents.
-        commands: The batch.
-
     Attributes:
-        given: The batch.
+        given: The batch, which concerns the documents of `keys`.
         begun: When it had its turn last.
     """
 
     def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
         self._keys = keys
-        self.given = commands
+        self.given = self._commands = commands
         self.begun = 0.0
-
-    async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
-        """Try once; return None if another client was first."""
-        return await held.attempt(self._keys, self.given, bulk)
-
-
-class _Ahead(_Attempt):
-    """A transaction whose large values are sent before it: others would always be first while they are on their way.
-
-    Args:
-        keys: Of the documents; all are in one slot.
-        commands: MULTI, what it does, EXEC.
-    """
-
-    def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
-        super().__init__(keys, commands)
-        tag = f"{{{keys[0].decode(errors='surrogateescape')}}}"
-        self._commands, self._coming = stage(commands, tag, secrets.token_hex(5))
+        self._coming: list[Staged] = []
         self._sent = -float(KEPT)
+
+    def send_ahead(self) -> None:
+        """From now on, send large values before their transaction: others are first while they are on their way."""
+        if not self._coming and self.given[-1][0] == "EXEC":
+            tag = f"{{{self._keys[0].decode(errors='surrogateescape')}}}"
+            self._commands, self._coming = stage(self.given, tag, secrets.token_hex(5))
 
     async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
         """Try once; return None if another client was first."""
         # Sent again well before the server forgets it.
-        if time.monotonic() - self._sent > KEPT / 2:
+        if self._coming and time.monotonic() - self._sent > KEPT / 2:
             self._sent = time.monotonic()
             refused = await self._upload(held)
             if refused is not None:
