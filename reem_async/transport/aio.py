@@ -36,13 +36,7 @@ It would take megabytes at once, and the event loop stands still meanwhile."""
 
 
 class AsyncTransport:
-    """Connections of one interface in one event loop, made when first needed.
-
-    Attributes:
-        sharded: One server has all keys.
-        states: What the interface's user gets to know of the connections.
-        at_end: What closes all connections of an event loop; called if it ends before that was done.
-    """
+    """Connections of one interface in one event loop, made when first needed."""
 
     sharded = False
 
@@ -90,7 +84,6 @@ class AsyncTransport:
         return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))
 
     async def _as_text(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        """Send to a server that has no JSON."""
         sent = self._text.shortcut(commands)
         if sent is not None:
             return self._text.finished(commands, await self._as_it_is(sent, bulk=bulk))
@@ -403,16 +396,12 @@ class AsyncTransport:
 
 
 class _Lent:
-    """A connection in the hands of one caller.
-
-    Attributes:
-        is_uploading: Something large was sent, and whether it has arrived is not known.
-    """
+    """A connection in the hands of one caller."""
 
     def __init__(self, transport: AsyncTransport, wire: Wire) -> None:
         self._transport = transport
         self._wire = wire
-        self.is_uploading = False
+        self.is_uploading = False  # something large was sent, and whether it has arrived is not known
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         return self._upload(commands) if has_large(commands) else self._wire.roundtrip(commands)

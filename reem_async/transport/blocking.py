@@ -246,13 +246,7 @@ def keep_open_at_exit() -> None:
 
 
 class BlockingTransport:
-    """Connections for the threads of one process: as many as there are calls at the same time.
-
-    Attributes:
-        sharded: One server has all keys.
-        states: What the interface's user gets to know of the connections.
-        at_end: Never called: no event loop is in use.
-    """
+    """Connections for the threads of one process: as many as there are calls at the same time."""
 
     sharded = False
 
@@ -377,15 +371,13 @@ class BlockingTransport:
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
 
     async def let_pass(self) -> bool:
-        """Return False: a call has a connection of its own, and keeps no other thread."""
-        return False
+        return False  # a call has a connection of its own, and keeps no other thread
 
     def is_settled(self, document: str) -> bool:
-        """Return True: no caller can leave before the reply is there."""
-        return True
+        return True  # no caller can leave before the reply is there
 
     async def settle(self, document: str) -> None:
-        """Return: there is nothing to wait for."""
+        return None
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         return self._orders.of(key)

@@ -129,15 +129,11 @@ class Options:
         if self.socket_path is not None or is_this_machine(str(self.settings.get("host", "localhost"))):
             return
         if not self.tls:
-            danger, remedy = (
-                "is not encrypted: others on the network can read and change data and password",
-                "rediss://",
-            )
+            danger = "is not encrypted: others on the network can read and change data and password"
+            remedy = "rediss://"
         elif self.settings.get("ssl_cert_reqs", "required") in ("none", ssl.CERT_NONE):
-            danger, remedy = (
-                "does not check who the server is",
-                "the option ssl_ca_certs, not ssl_cert_reqs",
-            )
+            danger = "does not check who the server is"
+            remedy = "the option ssl_ca_certs, not ssl_cert_reqs"
         else:
             return
         message = (
@@ -165,9 +161,6 @@ class Options:
         if self.socket_path is not None:
             return f"unix://{self.socket_path}" + (f"?db={self.database}" if self.database else "")
         return f"{'rediss' if self.tls else 'redis'}://{self.address}" + (f"/{self.database}" if self.database else "")
-
-    def __repr__(self) -> str:
-        return f"<Options for {self.address}>"
 
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
@@ -268,13 +261,7 @@ def _greeted(connection: Any) -> Any:
 
 
 class NodeOptions(Options):
-    """How to reach one of several servers.
-
-    Args:
-        of: How to reach them all: the time limit and, if nothing else is given,
-        settings: the connection options.
-        address: Where this one is.
-    """
+    """How to reach one of several servers: as all of them, `of`, unless it has other connection `settings`."""
 
     def __init__(self, of: Options, address: Address, settings: dict[str, Any] | None = None) -> None:
         host, port = address
@@ -416,9 +403,6 @@ def look_nearby(options: Options) -> None:
 class ServerSocket:
     """The Unix socket of the server at an address, as far as it is known.
 
-    Args:
-        options: How to reach the server by its address.
-
     Attributes:
         way: How to reach it through the socket; None as long as none is known, or of use.
     """
@@ -426,7 +410,7 @@ class ServerSocket:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._vain: str | None = None
-        self.way: Options | None = None
+        self.way: SocketOptions | None = None
 
     def learn(self, replies: Any) -> None:
         """Note what the server at the address says of itself, asked who it is.
@@ -441,7 +425,7 @@ class ServerSocket:
         if port and pid and path and int(port[1]) == int(self._options.settings.get("port", 6379)):
             self.way = SocketOptions(self._options, os.fsdecode(path[1]), process, int(pid[1]))
 
-    def give_up(self, way: Options, error: Exception) -> None:
+    def give_up(self, way: SocketOptions, error: Exception) -> None:
         """Note that `way` could not be gone. As long as the same process is at the address, it is not tried again.
 
         Raises:
@@ -449,22 +433,15 @@ class ServerSocket:
         """
         if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
             raise error
-        self._vain, self.way = (way.process if isinstance(way, SocketOptions) else None), None
+        self._vain, self.way = way.process, None
 
 
 class SocketOptions(Options):
-    """How to reach a server through its Unix socket, and no other one: the login is for this process alone.
-
-    Args:
-        by_address: How to reach it by its address.
-        path: The socket.
-        process: What the server's process calls itself.
-        pid: Its number in this system.
-    """
+    """How to reach a server through its Unix socket, and no other one: the login is for this process alone."""
 
     def __init__(self, by_address: Options, path: str, process: str, pid: int) -> None:
         self._by_address = by_address.address
-        self.process = process
+        self.process = process  # what the server's process calls itself
         self._pid = pid
         settings = {name: value for name, value in by_address.settings.items() if not name.startswith("socket_keepa")}
         settings.pop("socket_type", None)
@@ -474,11 +451,9 @@ class SocketOptions(Options):
 
     @property
     def address(self) -> str:
-        """Where the user said that the server is, for messages."""
         return self._by_address
 
     def asynchronous_connection(self) -> Any:
-        """Return a connection that makes sure, before it logs in, which process listens."""
         connection = connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
         log_in = connection.on_connect_check_health
 
@@ -491,12 +466,11 @@ class SocketOptions(Options):
         return connection
 
     def blocking_connection(self) -> Any:
-        """Return a connection that makes sure, before it logs in, which process listens."""
         connection = connecting_by(super().blocking_connection(), self._connect)
         log_in = connection.on_connect_check_health
 
         def check_first(**options: Any) -> None:
-            self._check_listener(connection._sock)
+            self._check_listener(connection._sock)  # before AUTH is sent, as above
             log_in(**options)
 
         connection.on_connect_check_health = check_first

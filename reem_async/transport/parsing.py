@@ -56,9 +56,6 @@ _parse_error: Any = BaseParser.parse_error
 class SmallReader:
     """hiredis, handing out error replies as redis-py's exceptions.
 
-    Args:
-        largest: Bytes a string in a reply may have.
-
     Attributes:
         fed: Bytes received of the reply that is under way; to be set to 0 when a reply is taken.
         gets: Returns the next reply, or MORE; raises redis.exceptions.InvalidResponse for what is not the protocol.
@@ -129,11 +126,7 @@ class _Open:
 
 
 class LargeReader:
-    """The Redis protocol, version 3; strings over 32 KB are received in place and come as bytearrays.
-
-    Args:
-        largest: Bytes a string in a reply may have.
-    """
+    """The Redis protocol, version 3; strings over 32 KB are received in place and come as bytearrays."""
 
     def __init__(self, largest: int = LARGEST) -> None:
         self.fed = 0

@@ -57,13 +57,9 @@ class StateChanges(Stream[StateChange]):
 
 
 class _Turn:
-    """To call back: it ends with the call that has it, also where that is interrupted.
+    """To call back: it ends with the call that has it, also where that is interrupted."""
 
-    Attributes:
-        over: It has ended; a traceback may keep it.
-    """
-
-    over = False
+    over = False  # it has ended; a traceback may keep it
 
 
 def _nobody() -> None:
