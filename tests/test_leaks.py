@@ -14,6 +14,7 @@ import reem
 import reem_async
 from reem_async import session as sessions
 from reem_async.concurrency.locks import Locks
+from reem_async.plan.placeholders import Placeholder
 from reem_async.plan.reads import RawRead
 from reem_async.plan.shapes import ShapeCache
 from reem_async.pubsub.manager import manager_of
@@ -188,16 +189,15 @@ def test_what_is_remembered_of_documents_is_bounded():
     memory = ShapeCache()
     for number in range(25_000):
         document = str(number)
-        memory.saw_members(document, frozenset([b"x"]))
-        memory.saw_interrupted(document)
-        memory.saw_layout(document, (), ())
-        memory.saw_number(document, (), 1.0)
-        memory.saw_number("one", (document,), 1.0)
-    kept = (memory._members, memory._interrupted, memory._layouts, memory._numbers)
-    sizes = [len(each) for each in kept]
-    assert max(sizes) <= 10_001
-    assert len(memory._numbers["one"]) <= 100
-    assert memory.sure_members("24999") == frozenset()
+        memory.of(document).saw_members(frozenset([b"x"]))
+        memory.of(document).saw_interrupted()
+        memory.of("one").saw_layout((document,), (Placeholder("numpy", ".x"),))
+        memory.of("one").saw_number((document,), 1.0)
+    assert len(memory._shapes) <= 10_000
+    one = memory.of("one")
+    assert 0 < len(one._layouts) <= 1000
+    assert 0 < len(one._numbers) <= 1000
+    assert memory.of("24999").sure_members() == frozenset()
 
 
 def test_a_number_is_taken_back_only_if_it_was_the_last():
@@ -226,8 +226,8 @@ async def test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks(ainterfa
 
 def test_after_a_change_that_was_broken_off_an_empty_registry_shows_that_nothing_was_left():
     """So the next changes need not look again."""
-    cache = ShapeCache()
-    cache.saw_interrupted("foo")
-    assert cache.is_unsure("foo")
-    cache.saw_members("foo", frozenset())
-    assert not cache.is_unsure("foo")
+    shape = ShapeCache().of("foo")
+    shape.saw_interrupted()
+    assert shape.interrupted
+    shape.saw_members(frozenset())
+    assert not shape.interrupted

@@ -27,9 +27,9 @@ IMAGE = (EncodedAttachment(".x.image", "numpy", (("SET", "{a}.x.image", b"1"),),
 def full_cache():
     """What an interface knows that has worked with a document for a while."""
     cache = ShapeCache()
-    cache.saw_members("a", frozenset([b".x.image", b".y"]))
-    cache.saw_number("a", ("n",), 5)
-    cache.saw_new("a")
+    cache.of("a").saw_members(frozenset([b".x.image", b".y"]))
+    cache.of("a").saw_number(("n",), 5)
+    cache.of("a").saw_new()
     return cache
 
 

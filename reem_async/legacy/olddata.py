@@ -51,7 +51,8 @@ def special_paths(reply: Reply) -> dict[str, str] | None:
 
 
 def is_new(keys: Keys, path: Path, cache: ShapeCache) -> bool:
-    return keys.document in (cache.new_below if path else cache.new)
+    shape = cache.of(keys.document)
+    return shape.is_new_below if path else shape.is_new
 
 
 def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
@@ -74,7 +75,7 @@ def first_read(plan: Plan, keys: Keys, path: Path, cache: ShapeCache) -> Plan:
         _check_places(replies[end:], keys)
         if _may_be_rooted(read[0]):
             return Plan([root_command(keys.document)], lambda rooted: decode_new(rooted, read))
-        cache.saw_new(keys.document, path)
+        cache.of(keys.document).saw_new(path)
         return plan.decode(read)
 
     def decode_new(rooted: Sequence[Reply], read: Sequence[Reply]) -> Any:
@@ -116,7 +117,7 @@ def _check_new(replies: Sequence[Reply], keys: Keys, cache: ShapeCache) -> None:
     if is_rooted(rooted):
         raise _old(keys)
     _check_places(second, keys)
-    cache.saw_new(keys.document)
+    cache.of(keys.document).saw_new()
 
 
 def _old(keys: Keys) -> BadData:

@@ -71,7 +71,7 @@ def calculate(
         result = present(replies[2], keys, path)
         new, due = loads(result, keys)[0], operation(old, operand)
         if type(new) is type(due) and new == due:
-            cache.saw_number(keys.document, path, new)
+            cache.of(keys.document).saw_number(path, new)
             return new
         return _corrected(keys, path, result, old, due, announcement)
 
@@ -79,7 +79,7 @@ def calculate(
         # If another client wrote in between, the number that was read is such a guess for the next attempt.
         return compute(keys, path, lambda number: operation(number, operand), announcement, cache, attempt)
 
-    return attempt(cache.number(keys.document, path))
+    return attempt(cache.of(keys.document).number(path))
 
 
 def compute(
@@ -108,7 +108,7 @@ def compute(
         return compute(keys, path, function, announcement, cache) if otherwise is None else otherwise(old)
 
     def finish(new: Any) -> Any:
-        cache.saw_number(keys.document, path, new)
+        cache.of(keys.document).saw_number(path, new)
         return new
 
     return Plan([("WATCH", keys.document), get_command(keys, path), *lengths(keys, path)], look, held=True)

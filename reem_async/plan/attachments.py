@@ -73,7 +73,7 @@ def clean(
             text = None  # a foreign type refers to nothing
         members = registered(replies[2], keys)
         orphans = sorted(members - _referred(text, keys))
-        cache.saw_members(keys.document, members)
+        cache.of(keys.document).saw_members(members)
         if not orphans:
             return Plan([("UNWATCH",)], lambda _: then(), held=True)
         tag = keys.tag.encode()
@@ -84,7 +84,7 @@ def clean(
     def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
         if replies is None:  # the document was changed in between
             return clean(keys, cache, then, unfinished)
-        cache.saw_members(keys.document, left)
+        cache.of(keys.document).saw_members(left)
         return then()
 
     commands = [watch(keys), get_command(keys, ()), ("SMEMBERS", keys.registry)]
@@ -140,7 +140,8 @@ def remove_orphans(keys: Keys, found: Sequence[bytes], cache: ShapeCache) -> Pla
             return remove_orphans(keys, found, cache)
         for reply in replies:
             checked(reply, keys, ())
-        cache.saw_members(keys.document, cache.members(keys.document) - frozenset(gone))
+        shape = cache.of(keys.document)
+        shape.saw_members(shape.members - frozenset(gone))
         return gone
 
     return Plan([watch(keys), *_look_for_orphans(keys, found)], look, held=True)
@@ -190,10 +191,10 @@ class ChangeOutcome:
         # In the order in which `writes._change` sends: the command, SADD if there are attachments, then SMEMBERS.
         reply = self.replies[self.main + (2 if self.it.attachments else 1)]
         if isinstance(reply, Exception):
-            self.cache.may_not_look(self.it.keys.document)
+            self.cache.of(self.it.keys.document).may_look = False
             return frozenset()
         members = registered(reply, self.it.keys)
-        self.cache.saw_members(self.it.keys.document, members)
+        self.cache.of(self.it.keys.document).saw_members(members)
         return members
 
     def _judged(self) -> Any:
@@ -219,7 +220,9 @@ class ChangeOutcome:
         return self._finish(judged)
 
     def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
-        if members and self.cache.pop_interrupted(self.it.keys.document):
+        shape = self.cache.of(self.it.keys.document)
+        if members and shape.interrupted:
+            shape.interrupted = False
             return True
         if judged is REFUSED or isinstance(judged, Exception):
             # A deletion of nothing may have found leftovers of an interrupted call.

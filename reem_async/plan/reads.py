@@ -132,7 +132,7 @@ def read(
     """
     # Without a guess, first ask for the document alone; if it has no placeholders, that is all. Else `_Fetch` asks for
     # document and arrays in one transaction, until the placeholders are those that were asked for.
-    known = cache.layout(keys.document, path)
+    known = cache.of(keys.document).layout(path)
     # A missing ship is an error only if the reply still has its placeholder.
     known = tuple([each for each in known if ships.has(each.label) or each.size > largest])
     if known:
@@ -258,7 +258,7 @@ class _Fetch:
             for place in places
         ):
             return self._again(met)
-        self.cache.saw_layout(self.keys.document, self.path, met)
+        self.cache.of(self.keys.document).saw_layout(self.path, met)
         placed: list[tuple[PlaceholderSlot, Registered, Reply]] = []
         unfetched: dict[tuple[str, str], Unfetched] = {}
         raw, also = (text, *replies[1:end]), tuple(replies[end:])

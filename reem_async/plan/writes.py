@@ -103,7 +103,7 @@ def takes(keys: Keys, path: Path, attachments: tuple[EncodedAttachment, ...], ca
     The transaction would store the attachments even if the server refused to set the document.
     """
     # An array that was seen at just this place shows that the place can hold one.
-    known = cache.sure_members(keys.document)
+    known = cache.of(keys.document).sure_members()
     if not path or any(each.suffix.encode() in known for each in attachments):
         return None
     return settable(keys, path)
@@ -126,7 +126,7 @@ def _change(
     it: DocumentChange, cache: ShapeCache, *, held: bool = False, given_up: Callable[[], Plan] | None = None
 ) -> Plan:
     """Plan the transaction; if keys are watched (`held`), `given_up` makes the next plan if one has changed."""
-    known = cache.members(it.keys.document)
+    known = cache.of(it.keys.document).members
     stale = _stale(it, known) if known or it.gone else []
     commands: list[Command] = []
     after: list[Command] = []
@@ -150,9 +150,10 @@ def _change(
             it.announcement.unsent()
             return given_up()
         # The write may have replaced the result of a calculation.
-        cache.forget_numbers(it.keys.document)
+        shape = cache.of(it.keys.document)
+        shape.forget_numbers()
         if (replies if not notices else replies[:-1]) == usual and (not notices or type(replies[-1]) is int):
-            cache.saw_members(it.keys.document, _NO_MEMBERS)
+            shape.saw_members(_NO_MEMBERS)
             return None
         return ChangeOutcome(it, cache, commands, replies, main).next()
 
@@ -167,14 +168,14 @@ def _is_tried(it: DocumentChange, cache: ShapeCache) -> bool:
     until the registry was read once. Not where a transaction fails for other reasons: deletions, since a Redis that is
     out of memory accepts only single ones, and clusters, where it would wait while its slot moves.
     """
-    if cache.may_look(it.keys.document):
+    if cache.of(it.keys.document).may_look:
         return False
     return it.command[0] != "JSON.DEL" and not it.keys.sharded
 
 
 def _moves(it: DocumentChange, cache: ShapeCache) -> bool:
     """Return whether a change in a list may replace attachments that have moved since they were named."""
-    known = cache.members(it.keys.document)
+    known = cache.of(it.keys.document).members
     return it.replaces and any(may_hold(it.path, place_of(member)) for member in known)
 
 

@@ -265,10 +265,11 @@ class DocumentWriter:
                 return await send(turn, *what)
             except BaseException as error:
                 # Cancelled, interrupted, or without a reply: it is unknown what was applied. A later change cleans up.
+                shape = session.cache.of(document)
                 if _may_have_left(error):
-                    session.cache.saw_interrupted(document)
+                    shape.saw_interrupted()
                 else:
-                    session.cache.forget_numbers(document)
+                    shape.forget_numbers()
                 # The message says all; REEM's own frames would only hide the caller's line.
                 if isinstance(error, SELF_EXPLANATORY):
                     raise error.with_traceback(None) from None
@@ -295,16 +296,12 @@ class DocumentWriter:
             if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
                 raise
         else:
-            self._saw_new(path)
+            if not path:  # the whole document was written: nothing of an old version is left
+                self.session.cache.of(self.keys.document).saw_new()
             return
         turn.release()  # the refusal was announced with numbers of its own
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
-
-    def _saw_new(self, path: Path) -> None:
-        """Note that nothing of an old version is left, if the whole document was written."""
-        if not path and self.keys.document not in self.session.cache.new:
-            self.session.cache.saw_new(self.keys.document)
 
     async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
         shipped = next((each for each in assignments if each.attachments), None)

@@ -404,6 +404,6 @@ class _Put:
                     "restore this key again"
                 )
         # What this interface remembers of the key no longer holds.
-        self._cache.saw_members(self._keys.document, frozenset(suffix.encode() for suffix in self._registry))
-        self._cache.forget_numbers(self._keys.document)
+        self._cache.of(self._keys.document).saw_members(frozenset(suffix.encode() for suffix in self._registry))
+        self._cache.of(self._keys.document).forget_numbers()
         return None
