@@ -26,12 +26,7 @@ __all__ = ["Accessor", "Edit", "PublishAccessor", "Publisher", "Reader", "Writer
 
 @documented_by(core.Reader)
 class Reader:
-    """Reads one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Reads one top-level key."""
 
     def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
         self.interface = interface
@@ -45,12 +40,7 @@ class Reader:
 
 @documented_by(core.Writer)
 class Writer:
-    """Writes one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Writes one top-level key."""
 
     _kind: type[core.Writer] = core.Writer
 
@@ -64,13 +54,9 @@ class Writer:
         self.interface._run(self._core.send_to_redis(set_path, set_value))
 
 
+@documented_by(core_publish.Publisher)
 class Publisher(Writer):
-    """Writes one top-level key and notifies its subscribers, in the same transaction.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Writes one top-level key and notifies its subscribers, in the same transaction."""
 
     _kind = core_publish.Publisher
 

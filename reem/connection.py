@@ -186,33 +186,6 @@ class RedisInterface:
     ships with `async def` methods run on a background event loop, one daemon thread per interface,
     started when first needed and ended by `close()` or at exit. Calls work until the process ends, in functions of
     `atexit`, log handlers and `__del__` too.
-
-    Args:
-        host: A host name, `host:port`, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`; if none is
-            given, the URL in the environment variable REEM_URL, else `localhost`. Several servers:
-            `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an
-            `EmbeddedCluster`; `redis+sentinel://host:26379,host:26380/mymaster` for the primary that
-            sentinels name. With TLS they begin with `rediss+`. See docs/fleet.md.
-        ships: What carries values that are not JSON, first fit first; replaces the default list of
-            `NumpyShip` and `BytesShip`. A number in its place is the port.
-        namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
-            separator, any character but a letter or digit: "robot1:", "robots/r1:".
-        timeout: Seconds without a byte moving after which a call times out; `reem.timeout` sets another
-            limit for some calls.
-        local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
-            through shared memory, if available; the server stores every update too, and a subscriber that cannot read
-            the memory fetches it there. "off": always from the server. "early": updates of this interface reach
-            subscribers on this host before the server has stored them (`update.early`); if the server never gets an
-            update, they get the server's value, with `gap`. See docs/guarantees.md.
-        local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
-            of an update for each top-level key. Beyond that, values go through the server.
-        options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
-            is another name of `timeout`. Besides, `largest_value`: the bytes that a string in a reply may have
-            (an array, or the text of a document); 512 MB if not given, as a server's own `proto-max-bulk-len`. What is
-            larger, or over eight times that in one reply, closes the connection: ConnectionLost.
-
-    Raises:
-        BadType, BadValue: An option or URL that means nothing.
     """
 
     def __init__(

@@ -6,38 +6,16 @@ from typing import Any
 
 from reem_async.store import publish as core
 
+from ._twin import documented_by
 from .accessor import PublishAccessor, Publisher
 from .store import KeyValueStore
 
 __all__ = ["PublishSpace", "Publisher"]
 
 
+@documented_by(core.PublishSpace)
 class PublishSpace(KeyValueStore):
-    """A store that can only be written, and that notifies subscribers of every change.
-
-    Written like a `KeyValueStore`. A change and its notice are one transaction. The notice carries a small value; a
-    large one is announced, and subscribers fetch the newest.
-
-    `outage` is the policy for writing, `update` and deleting in an outage (NotConnected, ConnectionLost or
-    ServerNotReady). They raise, or return at once until the server answers again:
-
-    - "drop": Updates are dropped, and counted in `dropped`.
-    - "newest": The newest update of each place is kept, with the bytes and the time of its call, and sent when the
-      server is back, in the order of the calls, each by itself. A replaced update is counted in `dropped`. Removals of
-      list items are all kept, since an index names another item after each of them. Over 256 MB of values, in all, the
-      oldest of a key are dropped, and counted.
-
-    Nothing is applied twice: an update in progress when the connection broke was applied or not, is not sent again, and
-    counts as dropped. Subscribers see dropped updates like lost ones, by `gap` and `missed`. `append`, `extend` and
-    arithmetic depend on the stored value, so they always raise in an outage; once the server is back they come after
-    the kept updates. A kept update that the server refuses is logged and counted, and closing the interface drops the
-    rest. The beginning and the end of an outage are logged ("reem.publish").
-
-    Args:
-        interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.
-        outage: What to do in an outage: "raise", "drop" or "newest".
-        options: With a host, what else RedisInterface takes.
-    """
+    """A store that can only be written, and that notifies subscribers of every change."""
 
     _accessor = PublishAccessor
 

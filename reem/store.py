@@ -23,10 +23,6 @@ class KeyValueStore:
 
     `kvs["foo"] = value` and `kvs["foo"]["bar"] = value` write; `kvs["foo"]["bar"]` alone is an
     `Accessor`, a path that is read with `read()`.
-
-    Args:
-        interface: The server: a RedisInterface, another store, or what RedisInterface takes as host.
-        options: With a host, what else RedisInterface takes: `KeyValueStore("localhost", port=7400)`.
     """
 
     _kind: type[core.KeyValueStore] = core.KeyValueStore
