@@ -35,10 +35,6 @@ class PublishSpace(KeyValueStore):
         """How many updates are kept until the server is back, or on their way then and not answered yet."""
         return self._core.waiting
 
-    def get(self, path: str, default: Any = None) -> Any:
-        """Raise WriteOnly."""
-        return self.interface._run(self._core.get(path, default))
-
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> Any:
         """Raise WriteOnly."""
         return self._core.watch(*patterns, policy=policy, largest=largest)

@@ -47,6 +47,7 @@ class Accessor(Handle):
 
     __slots__ = ("_path", "_reader", "_writer")
     _how_to_read = "await handle.read()"
+    _reads: type[DocumentReader] = DocumentReader
 
     def __init__(self, reader: DocumentReader, writer: DocumentWriter, path: Path) -> None:
         self._reader = reader
@@ -443,7 +444,7 @@ class Accessor(Handle):
 
 def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> Any:
     """Make an accessor from the parts of a pickled one."""
-    return kind(DocumentReader(session, path[0]), writer(session, path[0]), path[1:])
+    return kind(kind._reads(session, path[0]), writer(session, path[0]), path[1:])
 
 
 class Edit:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -17,9 +16,10 @@ from ..plan.keys import Keys
 from ..plan.notices import Slot, announce, in_slot, notify_path, published, sizes_of_parts, with_value
 from ..plan.paths import Path, counts_from_end, show
 from ..session import Session
-from .accessor import _NOTHING, Accessor, Writer
+from .accessor import Accessor, Writer
 from .document import Attachments, DocumentWriter, Turn
 from .outage import Outage
+from .reader import DocumentReader
 from .store import KeyValueStore
 
 _Stamp = tuple[str, int]
@@ -202,11 +202,19 @@ def _cannot_read(path: Path) -> str:
     )
 
 
+class WriteOnlyReader(DocumentReader):
+    def _refuse(self, path: Path, *_: Any) -> NoReturn:
+        raise WriteOnly(_cannot_read((self.name, *path)))
+
+    raw_read = contains_at = keys_at = type_at = length_at = _refuse  # type: ignore[assignment]
+
+
 class PublishAccessor(Accessor):
     """One place of a PublishSpace: as `Accessor`, but reading raises WriteOnly."""
 
     __slots__ = ()
     _how_to_read = "a KeyValueStore"
+    _reads = WriteOnlyReader
 
     def _refuse(self) -> NoReturn:
         raise WriteOnly(_cannot_read(self.full_path))
@@ -221,38 +229,8 @@ class PublishAccessor(Accessor):
         """The publisher of the top-level key."""
         return Publisher(self._reader.name, self._reader.session.interface)
 
-    async def read(self) -> Any:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def get(self, *default: Any, default_value: Any = _NOTHING) -> Any:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def length(self) -> int:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def type(self) -> builtins.type:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def contains(self, key: str) -> bool:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def keys(self) -> list[str]:
-        """Raise WriteOnly."""
-        self._refuse()
-
     async def outline(self) -> NoReturn:
         """Raise WriteOnly."""
-        self._refuse()
-
-    async def _take(self, *default: Any) -> Any:
-        self._refuse()
-
-    async def _read_or_put(self, default: Any) -> Any:
         self._refuse()
 
     def edit(self) -> NoReturn:
@@ -323,10 +301,6 @@ class PublishSpace(KeyValueStore):
     def waiting(self) -> int:
         """How many updates are kept until the server is back, or on their way then and not answered yet."""
         return 0 if self._outages is None else self._outages.waiting
-
-    async def get(self, path: str, default: Any = None) -> Any:
-        """Raise WriteOnly."""
-        await self.at(path).read()
 
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> NoReturn:
         """Raise WriteOnly."""

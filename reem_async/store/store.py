@@ -15,7 +15,6 @@ from .accessor import _NOTHING as _NOTHING
 from .accessor import Accessor
 from .catalog import names
 from .document import DocumentWriter
-from .reader import DocumentReader
 
 _MOST_TOPS = 1000
 """Accessors of top-level keys that are cached."""
@@ -67,7 +66,7 @@ class KeyValueStore:
         if len(self._tops) >= _MOST_TOPS:
             self._tops.clear()
         # Another thread may have made one in between: all use the same.
-        return self._tops.setdefault(name, self._accessor(DocumentReader(session, name), writer, ()))
+        return self._tops.setdefault(name, self._accessor(self._accessor._reads(session, name), writer, ()))
 
     def __setitem__(self, key: str, value: Any) -> None:
         raise BadType(f"assignment cannot wait for the server; use: await store[{key!r}].write(value)")
