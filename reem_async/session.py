@@ -102,22 +102,9 @@ class _Numbers:
 
 
 class Session:
-    """One server as one interface sees it.
-
-    Args:
-        host: A host name, a URL, an `EmbeddedServer` or an `EmbeddedCluster`.
-        ships: What carries values that are not JSON; None for the default list.
-        namespace: Goes before every key and channel; ends with a separator.
-        timeout: Seconds without a byte moving after which a call times out.
-        options: redis-py's connection options.
-        new_transport: Makes the transport to one server.
-        local: The shared memory of publishers and subscribers; None for the default.
+    """One server as one interface, whose arguments it takes, sees it.
 
     Attributes:
-        ships: Chooses ships.
-        cache: The shape cache.
-        local: The shared memory of publishers and subscribers.
-        transport: Sends commands to the server.
         interface: The interface this belongs to: pickled in its place.
         subscriptions: The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
         tasks: The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.

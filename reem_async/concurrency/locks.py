@@ -16,11 +16,7 @@ _MOST = 1000
 
 
 class Locks(Generic[Lock]):
-    """The locks of the last thousand keys, and of all that are held or waited for.
-
-    Args:
-        new: Makes a lock, which can be referred to weakly.
-    """
+    """The locks of the last thousand keys, and of all that are held or waited for."""
 
     def __init__(self, new: Callable[[], Lock]) -> None:
         self._new = new
@@ -29,7 +25,7 @@ class Locks(Generic[Lock]):
         self._trimming = threading.Lock()
 
     def of(self, key: str) -> Lock:
-        """Return the lock of `key`; the caller keeps it while in use."""
+        """Return the lock of `key`, to which the caller refers while it is in use."""
         lock = self._recent.get(key)
         return lock if lock is not None else self._put(key)
 

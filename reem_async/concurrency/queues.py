@@ -81,9 +81,6 @@ class BoundedQueue:
     another is named, and not the first at that moment. A loss is noted before the update after it is put in, so that
     the next one taken out reports it, however many were dropped in between.
 
-    Args:
-        policy: How many to keep, and what happens to the next one.
-
     Attributes:
         dropped: How many updates were skipped and will never be taken out.
         wake: Called after each change, from the putting thread.

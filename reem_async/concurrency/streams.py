@@ -36,12 +36,7 @@ class Following:
 
 
 class Stream(Following, Generic[Item]):
-    """Yields what arrives in a bounded queue, one by one. Cancelling a waiting loop loses nothing.
-
-    Args:
-        policy: What to keep for a loop that is slower than what arrives.
-        queue: Where it arrives, if it is not to be a plain one.
-    """
+    """Yields what arrives in a bounded queue, one by one. Cancelling a waiting loop loses nothing."""
 
     def __init__(self, policy: Policy, queue: BoundedQueue | None = None) -> None:
         self.queue = queue or BoundedQueue(policy)

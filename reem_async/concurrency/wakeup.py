@@ -11,9 +11,6 @@ class Descriptor:
     """A file descriptor that is closed with this object, unless its number is another file's by then.
 
     A program that becomes a daemon closes all descriptors, and the numbers are its own files' afterwards.
-
-    Args:
-        number: What the operating system has given.
     """
 
     def __init__(self, number: int) -> None:

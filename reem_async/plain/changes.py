@@ -35,14 +35,9 @@ _SEEING = frozenset(["GET", "TYPE", "GETRANGE"])
 def after_look(
     commands: Sequence[Command], keys: Sequence[bytes], known: Known, error: MakeError, watched: Watched | None
 ) -> Steps:
-    """Return the translation of a batch that changes documents which must be read before; see `translation`.
+    """Return the translation of a batch that changes the documents `keys`, which must be read before.
 
-    Args:
-        commands: The batch.
-        keys: The keys of the documents.
-        known: The keys that hold documents.
-        error: Makes error replies.
-        watched: The keys that the plan itself watches on this connection, or None.
+    `watched` are the keys that the plan itself watches on this connection.
     """
     # First WATCH and read. If that fails, nothing else is sent. Then the transaction. If another client wrote in
     # between, the transport starts again, unless the plan itself watches keys: then the plan does.

@@ -40,14 +40,7 @@ _DEEPEST = 128
 
 
 class TextDocument:
-    """One document on which commands are executed.
-
-    Args:
-        text: The key's string; None if there is no key.
-
-    Attributes:
-        changed: Whether a command has changed it.
-    """
+    """One document, given the key's string, or None if there is no key, on which commands are executed."""
 
     def __init__(self, text: bytes | bytearray | None) -> None:
         # The text is None while the tree has newer changes, the tree until it is needed.

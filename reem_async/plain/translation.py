@@ -77,13 +77,9 @@ def looked_at(commands: Sequence[Command], known: Known) -> list[bytes]:
 
 
 def translated(commands: Sequence[Command], known: Known, error: MakeError, watched: Watched | None = None) -> Steps:
-    """Return the translation of a batch.
+    """Return the translation of a batch, MULTI and EXEC included.
 
-    Args:
-        commands: The batch of a plan, MULTI and EXEC included.
-        known: The keys that hold documents.
-        error: Makes error replies.
-        watched: The keys that the plan watches, if it keeps the connection for longer than this batch.
+    `watched` are the keys that the plan watches, if it keeps the connection for longer than this batch.
     """
     keys = looked_at(commands, known)
     if keys:

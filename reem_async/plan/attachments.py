@@ -108,11 +108,8 @@ def orphans(keys: Keys, found: Sequence[bytes]) -> Plan:
     """Plan to find the attachments of one top-level key that its document does not refer to; the result is suffixes.
 
     One transaction. They are left behind if a document expires, or is deleted or renamed by a program without REEM.
-    Only keys that the registry names, or that hold an array, count as attachments.
-
-    Args:
-        keys: The top-level key.
-        found: The suffixes of the Redis keys that carry its tag, found by SCAN.
+    Only keys that the registry names, or that hold an array, count as attachments. SCAN has `found` the suffixes of
+    the Redis keys that carry the tag.
 
     Raises (in decode):
         BadData, RedisError: Document or registry cannot be read, so it is not known what belongs to the key.

@@ -58,10 +58,7 @@ _PAGE = "1000"
 def page(glob: str = "", kind: str = "", cursor: Any = b"0") -> Plan:
     """Plan to list about 1000 keys of one server; the result is the next cursor and the names, as bytes.
 
-    Args:
-        glob: A pattern of the names, in the server's syntax; all if it is empty.
-        kind: The Redis type; any if it is empty.
-        cursor: Where to go on.
+    Only those of a `glob` in the server's syntax and of a Redis type `kind`, if they are given.
     """
     return Plan([_scan(glob, kind, cursor)], lambda replies: _raised(replies[0]))
 

@@ -66,13 +66,10 @@ class Registered:
 
 
 class Ships:
-    """Chooses ships for values and finds them by label.
-
-    Args:
-        ships: The ships; the first that fits is used.
-        new_recorder: Makes an object with redis-py's command methods and a list `commands`.
+    """Chooses ships for values, the first that fits, and finds them by label.
 
     Attributes:
+        new_recorder: Makes an object with redis-py's command methods and a list `commands`.
         claimed: JSON types of which a ship takes some values.
         asks_first: Whether there are such types, or asynchronous ships were not asked yet.
     """

@@ -116,19 +116,10 @@ def _may_have_left(error: BaseException) -> bool:
 
 
 class DocumentWriter:
-    """Writes one top-level key.
+    """Writes one top-level key; in an outage by the policy of an `outage.Outage`, without one its calls raise."""
 
-    Args:
-        session: The server.
-        name: The key.
-        outages: The policy for outages, an `outage.Outage`; None if calls raise.
-
-    Attributes:
-        encoder: Encodes the values.
-        keeps_order: A later call must not overtake an earlier one.
-    """
-
-    # A task awaits each of its calls, so they are in order. Those of several tasks need not be.
+    # Whether a later call must not overtake an earlier one. A task awaits each of its calls, so they are in order.
+    # Those of several tasks need not be.
     keeps_order = False
 
     def __init__(self, session: Session, name: object, outages: Any = None) -> None:

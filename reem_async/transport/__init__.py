@@ -95,11 +95,7 @@ class Transport(Held, Protocol):
 
 
 class Contention:
-    """The attempts of one call that were given up, since another client had written to the same top-level key.
-
-    Args:
-        limit: Seconds for which it is tried again.
-    """
+    """The attempts of one call, for `limit` seconds, that another client's writes to its top-level key have ended."""
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
@@ -225,12 +221,7 @@ async def scanned(transport: Transport, glob: str = "", kind: str = "") -> Async
     """Yield the names of all keys, about 1000 at a time; one round trip for each 1000, and a node at least one.
 
     A key that is there from the beginning to the end is among them, unless it moves from node to node
-    meanwhile. Others may or may not be, and any may be twice.
-
-    Args:
-        transport: The way to the servers.
-        glob: A pattern of the names, in the server's syntax; all if it is empty.
-        kind: The Redis type; any if it is empty.
+    meanwhile. Others may or may not be, and any may be twice. See `plan.keys.page` for `glob` and `kind`.
 
     Raises:
         ClusterNode: It is the way to one node of several.

@@ -289,12 +289,8 @@ class ClusterTransport(CompositeTransport):
     ) -> list[Reply]:
         """Send `commands` until a node has applied them all, each once; what was not in time is answered by an error.
 
-        Args:
-            commands: What to send.
-            bulk: Many bytes are expected back.
-            problem: Why they, or some of them, were not applied by
-            asked: the node that was asked already, and
-            replies: what it replied.
+        The `problem` is why they, or some of them, were not applied by the node that was `asked` already, and which
+        gave these `replies`.
 
         Raises:
             NotConnected: Nothing was applied in time.

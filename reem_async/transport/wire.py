@@ -80,10 +80,6 @@ class _Due:
 class Wire(asyncio.BufferedProtocol):
     """The protocol over a connection that has shaken hands.
 
-    Args:
-        timeout: Seconds without a byte moving, while a reply is due, after which a call is given up.
-        reader: Parses what is received.
-
     Attributes:
         on_push: Called with each message the server sends unasked.
         on_lost: Called once when the connection is gone, with the reason.
