@@ -185,7 +185,6 @@ class Session:
         return self.transport.sharded and self._numbers.is_fresh(keys.channel)
 
     async def initialize(self) -> None:
-        """Connect and check that the server can be used."""
         await self.ships.ready()
         # Any key will do: the test is whether the server knows the command and the user may send it.
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
@@ -205,7 +204,6 @@ class Session:
                 steps.push_async_callback(subscriptions.close)
 
     async def close(self) -> None:
-        """End all subscriptions and close all connections."""
         self.closed = True
         async with contextlib.AsyncExitStack() as steps:  # as above
             steps.callback(self.local.close)

@@ -45,7 +45,6 @@ class Locks(Generic[Lock]):
         return lock
 
     def all(self) -> list[Lock]:
-        """Return all there are."""
         older = (reference() for reference in self._older.valuerefs())
         return [*list(self._recent.values()), *(lock for lock in older if lock is not None)]
 

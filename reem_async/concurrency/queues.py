@@ -191,7 +191,6 @@ class PlaceQueue(BoundedQueue):
     """A bounded queue that delivers which places were updated and their present value, not what was written."""
 
     def overtaken(self, update: Any) -> None:
-        """Deliver the place."""
         if update is None:
             self.skip()
         else:

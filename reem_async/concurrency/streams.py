@@ -76,7 +76,6 @@ class Stream(Following, Generic[Item]):
             await (self._changed() if self._following else self.listen())
 
     async def _changed(self) -> None:
-        """Wait until something was put into the queue."""
         if self._waiter is not None and not self._waiter.get_loop().is_closed():
             raise BadType("two tasks take updates from one subscription; make one for each")
         waiter = self._waiter = asyncio.get_running_loop().create_future()

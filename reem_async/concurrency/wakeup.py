@@ -63,7 +63,6 @@ Wakeups = Pipe | queue.SimpleQueue[None]
 
 
 def wakeups() -> Wakeups:
-    """Return the wakeups that wake fastest here."""
     try:
         return Pipe()
     except OSError:  # no descriptor is left

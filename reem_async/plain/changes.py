@@ -91,7 +91,6 @@ class _Look:
         return None
 
     def documents(self, replies: Sequence[Reply]) -> dict[bytes, TextDocument | Exception]:
-        """Return the document under each key, or the module's error."""
         found: dict[bytes, TextDocument | Exception] = {}
         answers = iter([reply for reply, look in zip(replies, self.commands, strict=True) if look[0] in _SEEING])
         for key in self._keys:

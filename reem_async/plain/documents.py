@@ -61,7 +61,6 @@ class TextDocument:
         return self._text is not None or bool(self._holder)
 
     def string(self) -> bytes:
-        """Return the new string of the key."""
         if self._text is None:
             assert self._holder
             self._text = MARK + orjson.dumps(self._holder[0])

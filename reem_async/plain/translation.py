@@ -175,7 +175,6 @@ class _Answers:
         return reply
 
     def text(self, place: int) -> Reply:
-        """Return the text in the reply to the GET at `place`, or an error."""
         return document_text(self._replies[place], key_of(self._sent[place]), self._known, self._error)
 
     def _document(self, place: int) -> TextDocument | Exception:

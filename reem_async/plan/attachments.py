@@ -25,7 +25,6 @@ _ARRAY = b"\x93NUMPY"
 
 
 def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
-    """Return the WATCH of document, registry and staged values."""
     return ("WATCH", keys.document, keys.registry, *(each.name for each in coming))
 
 
@@ -172,7 +171,6 @@ class ChangeOutcome:
     refusal: PathRefused | None = None  # in the server's words
 
     def next(self) -> Any:
-        """Return the result, or the next plan; raise what the replies mean."""
         members = self._members()
         judged = self._judged()
         # The notice went out in the same transaction as the command that was refused.

@@ -162,7 +162,6 @@ def _may_be_converted(text: bytes, value: Any) -> bool:
 
 
 def _levels(value: Any, limit: int) -> int:
-    """Return how deep containers are nested; stops past the limit."""
     level, depth = [value] if isinstance(value, dict | list | tuple) else [], 0
     while level and depth <= limit:
         depth += 1

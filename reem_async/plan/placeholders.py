@@ -181,7 +181,6 @@ def place_of(name: str, suffix: str) -> str:
 
 
 def _place(tree: Any, text: str) -> str:
-    """Return the path of the string `text` in `tree`, as text."""
     stack: list[tuple[Path, Any]] = [((), tree)]
     while stack:
         path, node = stack.pop()

@@ -46,8 +46,6 @@ class ServerProgram:
 
 
 class PortTaken(ServerFailed):
-    """Another program listens on the port."""
-
     def __init__(self, port: int) -> None:
         super().__init__(
             f"port {port} on {HOST} is taken by another program: stop that one, or use another port"

@@ -18,7 +18,7 @@ from ..plan.documents import number_text
 from ..plan.paths import Path, check_element, check_name, parse, show
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
-from .catalog import Outline, outline_at
+from .catalog import Outline, outline
 from .document import DocumentWriter
 from .reader import DocumentReader, opened
 
@@ -208,7 +208,7 @@ class Accessor(Handle):
             MissingKey: Nothing is here.
             BadData: The value here was not written by REEM.
         """
-        return await outline_at(self._reader.session, self.full_path)
+        return await outline(self._reader.session.interface, self.full_path)
 
     async def pop(self, key: str | int = -1, *default: Any) -> Any:
         """Remove the element `key`, by default the last item of a list, and return what it was.

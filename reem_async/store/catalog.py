@@ -14,7 +14,6 @@ from ..plan.paths import Path, parse, parse_pattern, shorten, show
 from ..plan.placeholders import Placeholder, find, marked
 from ..plan.reads import get_command, present
 from ..plan.replies import from_front, lengths, loads
-from ..session import Session
 
 _PLAIN = frozenset({"str", "int", "float", "bool", "NoneType"})
 # Lines of an outline that are printed: more would fill a terminal, or a cell of a notebook.
@@ -79,38 +78,18 @@ class Outline:
 
 
 async def names(interface: RedisInterface, pattern: str = "*") -> AsyncIterator[str]:
-    """Yield the top-level keys that `pattern` names, in no order, each once.
+    """Yield the top-level keys that a glob names, in no order, each once; raises and costs as `KeyValueStore.keys`.
 
-    Args:
-        interface: The server.
-        pattern: A glob: `*` and `?` stand for other characters.
-
-    One round trip for about 1000 keys of the server, foreign ones too; in a cluster all primaries are asked, one after
-    the other. A key that is written, deleted or moved to another node in between may or may not be among them.
-
-    Raises:
-        ClusterNode: The server is one node of several.
+    In a cluster all primaries are asked, one after the other; a connection to one node alone raises ClusterNode.
     """
     async for name in interface.session.names(parse_pattern(pattern)):
         yield name
 
 
 async def outline(interface: RedisInterface, path: str | Path) -> Outline:
-    """Return what is at a dotted path, or at a path of keys and indexes, top-level key first.
-
-    One round trip. Arrays are not fetched: the document says what they are.
-
-    Raises:
-        MissingKey: Nothing is there.
-        BadData: What is there was not written by REEM.
-    """
-    return await outline_at(interface.session, parse(path) if isinstance(path, str) else path)
-
-
-async def outline_at(session: Session, path: Path) -> Outline:
-    """Do as `outline`, with a session."""
-    name, *rest = path
-    keys, below = session.keys(name), tuple(rest)
+    """Return what is at a dotted path, or at a path of keys and indexes; raises and costs as `Accessor.outline`."""
+    name, *rest = parse(path) if isinstance(path, str) else path
+    keys, below = interface.session.keys(name), tuple(rest)
     counted = lengths(keys, below)
 
     def decode(replies: Sequence[Reply]) -> Outline:
@@ -122,7 +101,7 @@ async def outline_at(session: Session, path: Path) -> Outline:
         return _outlined(holder[0], (keys.name, *from_front(replies[1:], keys, below, MissingKey)))
 
     # A transaction only where the path counts from the end of a list: its length is to be of the same instant.
-    it: Outline = await session.run(Plan([get_command(keys, below), *counted], decode, atomic=bool(counted)))
+    it: Outline = await interface.session.run(Plan([get_command(keys, below), *counted], decode, atomic=bool(counted)))
     return it
 
 

@@ -43,7 +43,6 @@ class DocumentReader:
         return found
 
     async def raw_read(self, path: Path) -> RawRead:
-        """Return the value at `path` before ships interpret their replies."""
         if self.session.ships.asynchronous:
             await self.session.ships.ready()
         session = self.session

@@ -15,7 +15,6 @@ _SCHEMES = ("redis://", "rediss://", "unix://")
 
 
 def settings_of(host: Any) -> dict[str, Any]:
-    """Return the connection settings that `host` stands for."""
     socket_path = getattr(host, "socket_path", None)
     if socket_path is not None:
         password = getattr(host, "password", None)

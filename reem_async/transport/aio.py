@@ -90,7 +90,6 @@ class AsyncTransport:
         return await self._text.roundtrip(self._as_it_is, self, commands, bulk)
 
     async def _as_it_is(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send what any server takes."""
         large = has_large(commands)
         wire = self._lanes.get(bulk or large)
         if wire is None or not wire.alive:

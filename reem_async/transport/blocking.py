@@ -97,7 +97,6 @@ class _Line:
         return self.exchange(commands, bulk)
 
     def exchange(self, commands: Sequence[Command], bulk: bool = False) -> list[Reply]:
-        """Send `commands` and read their replies."""
         pieces = pack(commands)
         self.broken = True  # until all is read: a Ctrl-C anywhere must not leave a reply for the next caller
         limit = time_limit(self._timeout)
@@ -211,7 +210,6 @@ class _Line:
         return False
 
     def lost(self, reason: str) -> ConnectionLost:
-        """Close the connection and return the error that says why."""
         self.close()
         error = ConnectionLost(reason)
         self._states.lost(error)

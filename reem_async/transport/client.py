@@ -36,7 +36,6 @@ class _Client(redis.Redis):
         return reply
 
     def parse_response(self, connection: Any, command_name: Any, **options: Any) -> Any:
-        """Return a reply; raises NoJsonSupport where the server has no JSON."""
         try:
             return super().parse_response(connection, command_name, **options)  # type: ignore[no-untyped-call]
         except redis.exceptions.ResponseError as error:
@@ -53,7 +52,6 @@ class _AsyncioClient(redis.asyncio.Redis):
     """The same for asyncio, without rejson-py's names."""
 
     async def parse_response(self, connection: Any, command_name: Any, **options: Any) -> Any:
-        """Return a reply; raises NoJsonSupport where the server has no JSON."""
         try:
             return await super().parse_response(connection, command_name, **options)
         except redis.exceptions.ResponseError as error:

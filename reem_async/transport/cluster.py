@@ -110,7 +110,6 @@ class ClusterTransport(CompositeTransport):
         self._root = self._node(options.seeds[0])
 
     def _node(self, address: Address) -> Transport:
-        """Return the transport to one node, connected or not."""
         node = self._nodes.get(address)
         if node is None:
             node = self._new_transport(NodeOptions(self._options, address))

@@ -147,7 +147,6 @@ class Options:
 
     @property
     def database(self) -> int:
-        """The number of the database."""
         return int(self.settings.get("db") or 0)
 
     @property

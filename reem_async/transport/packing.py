@@ -59,7 +59,6 @@ class Packer(HiredisRespSerializer):
     """redis-py's way of packing what it sends itself, with numbers as text, such as that of the protocol in HELLO."""
 
     def pack(self, *words: Any) -> Any:
-        """Return the bytes of one command."""
         return super().pack(*map(as_text, words))
 
 

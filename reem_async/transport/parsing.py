@@ -74,7 +74,6 @@ class SmallReader:
         self.gets = self._parser.gets
 
     def target(self) -> memoryview:
-        """Return where to put received bytes."""
         return self._view
 
     def received(self, count: int) -> None:
@@ -142,7 +141,6 @@ class LargeReader:
         self._filled = 0
 
     def target(self) -> memoryview:
-        """Return where to put received bytes."""
         if self._large is not None and self._filled < self._size:
             # It grows as bytes arrive, doubling, so that a length that is only claimed costs no memory.
             if self._filled == len(self._large):

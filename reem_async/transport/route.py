@@ -118,7 +118,6 @@ def refusal(replies: Sequence[Reply]) -> redis.exceptions.RedisError | None:
 
 
 def is_moved(reply: object) -> bool:
-    """Return whether a reply says that another node has the slot."""
     return isinstance(reply, Moved)
 
 
@@ -339,7 +338,6 @@ def _looked_only(error: ConnectionLost) -> NotConnected:
 
 
 def places_refused(answers: Sequence[Reply]) -> list[int]:
-    """Return the places of what was not applied."""
     return [place for place, reply in enumerate(answers) if refusal((reply,)) is not None]
 
 

@@ -345,7 +345,6 @@ class _Lookout:
                     self.tell()
 
     def tell(self) -> None:
-        """Say that it is another one."""
         if (owner := self._owner()) is not None:
             owner.on_moved()
 

@@ -65,7 +65,6 @@ class Text:
         return shortcut(commands, self.known)
 
     def finished(self, commands: Sequence[Command], replies: list[Reply]) -> list[Reply]:
-        """Return the answers to commands for which there was a shortcut."""
         return finished(commands, replies, self.known, error_of)
 
     async def roundtrip(self, send: Send, lending: Any, commands: Sequence[Command], bulk: bool) -> list[Reply]:

@@ -146,12 +146,10 @@ class Wire(asyncio.BufferedProtocol):
 
     @property
     def alive(self) -> bool:
-        """Whether commands can be sent."""
         return self._reason is None and self._transport is not None and not self._transport.is_closing()
 
     @property
     def busy(self) -> bool:
-        """Whether replies are due."""
         return bool(self._due) and self.alive
 
     @property
@@ -265,7 +263,6 @@ class Wire(asyncio.BufferedProtocol):
             self._loop.call_soon_threadsafe(self.abort, reason)
 
     async def close(self) -> None:
-        """Close the connection and wait until it is."""
         await close_all([self])
 
     def hang_up(self) -> asyncio.Future[None]:
@@ -287,11 +284,9 @@ class Wire(asyncio.BufferedProtocol):
     # What asyncio calls.
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """Return where to put received bytes."""
         return self._reader.target()
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Parse what was received and hand it out."""
         before, self._read_before, self._last_byte = self._read_before, self._last_byte, self._loop.time()
         try:
             self._reader.received(nbytes)
@@ -316,7 +311,6 @@ class Wire(asyncio.BufferedProtocol):
         """Close: the server will not answer any more."""
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Fail the waiting calls."""
         self._fail(
             ConnectionLost(
                 f"the connection broke before the reply came ({exc or 'closed by the server'}); "
