@@ -5,7 +5,6 @@ from __future__ import annotations
 import builtins
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 from reem_async.concurrency.queues import Policy
@@ -260,15 +259,13 @@ class Accessor(Handle):
         self._edits.setdefault(threading.get_ident(), []).append(edit)
         return value
 
-    def __exit__(
-        self, kind: builtins.type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: Any) -> None:
         mine = self._edits[threading.get_ident()]
         # The innermost block of this thread.
         edit = mine.pop()
         if not mine:
             self._edits.pop(threading.get_ident(), None)
-        edit.__exit__(kind, error, trace)
+        edit.__exit__(*error)
 
     def __reduce__(self) -> tuple[Any, ...]:
         # The facade and the core's part of it, which says whether it publishes.
@@ -317,7 +314,5 @@ class Edit:
     def __enter__(self) -> Any:
         return self._interface._run(self._core.__aenter__())
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._interface._run(self._core.__aexit__(kind, error, trace))
+    def __exit__(self, *error: Any) -> None:
+        self._interface._run(self._core.__aexit__(*error))

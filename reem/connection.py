@@ -10,7 +10,6 @@ import weakref
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from importlib import import_module
 from threading import current_thread, main_thread
-from types import TracebackType
 from typing import Any, Literal, Self, TypeVar
 
 import reem_async
@@ -304,9 +303,7 @@ class RedisInterface:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __reduce__(self) -> tuple[Any, ...]:

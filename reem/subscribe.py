@@ -6,7 +6,6 @@ import contextlib
 import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 from reem_async.concurrency.locks import ProcessLock
@@ -35,9 +34,7 @@ class Following:
         self.listen()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -116,18 +113,7 @@ class PatternWatch(Watch):
 
 @documented_by(core.SilentSubscriber)
 class SilentSubscriber(Following):
-    """A local variable that follows what is published at a path.
-
-    `value()` and `subscriber["number"].read()` answer from memory, without a trip to the server.
-    It starts with the value that is already there. It can also be iterated: `for update in
-    subscriber`.
-
-    Args:
-        channel: The path to follow, such as "foo" or "foo.bar".
-        interface: The server: a RedisInterface, or what it takes as host.
-        policy: What an iteration keeps for a loop that is slower than the updates.
-        stored: Follow plain writes too, by any client.
-    """
+    """A local variable that follows what is published at a path."""
 
     def __init__(
         self, channel: str, interface: Any = None, policy: Policy | None = None, *, stored: bool = False

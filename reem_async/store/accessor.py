@@ -5,7 +5,6 @@ from __future__ import annotations
 import builtins
 import operator
 from collections.abc import Iterable, Mapping
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
@@ -474,9 +473,7 @@ class Edit:
             )
         return self._value
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, kind: object, *_: object) -> None:
         # Compared with what was read, byte by byte, under WATCH: a change by another client since then is a Conflict.
         if kind is None and self._before is not None:
             await self._writer.exchange(self._path, self._value, self._before)

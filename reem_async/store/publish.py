@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from types import TracebackType
 from typing import Any, NoReturn, Self
 
 from ..errors import ConnectionLost, Contended, NotConnected, WriteOnly
@@ -47,14 +46,12 @@ class PublishTurn(Turn):
         await self._order.__aenter__()
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if isinstance(error, Contended):
+    async def __aexit__(self, *error: Any) -> None:
+        if isinstance(error[1], Contended):
             self.not_applied(len(self._announcements))
         # Before the next call's turn begins, which continues with the next number.
         self.release()
-        await self._order.__aexit__(kind, error, trace)
+        await self._order.__aexit__(*error)
 
     def reserve(
         self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
