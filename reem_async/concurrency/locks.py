@@ -1,4 +1,4 @@
-"""A lock for each key, without keeping one for every key that was ever used; and locks for plain threads."""
+"""A lock for each key, without keeping one for every key that was ever used; locks for plain threads; forks."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import contextlib
 import os
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, TypeVar
 
+Item = TypeVar("Item")
 Lock = TypeVar("Lock", bound=Any)
 
 # Keys whose locks are kept though they are not in use; making one costs a microsecond.
@@ -52,6 +53,22 @@ class Locks(Generic[Lock]):
         """Forget them: they belong to another event loop."""
         self._recent.clear()
         self._older.clear()
+
+
+class Inherited(Generic[Item]):
+    """The living objects of a class; a forked child calls `action` for each that it has of its parent."""
+
+    def __init__(self, action: Callable[[Item], object]) -> None:
+        # No WeakSet: leaving one takes steps that Ctrl-C may divide, and other threads go through this.
+        self._references: list[weakref.ref[Item]] = []
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
+
+    def add(self, item: Item) -> None:
+        self._references.append(weakref.ref(item, self._references.remove))
+
+    def __iter__(self) -> Iterator[Item]:
+        return iter([item for reference in tuple(self._references) if (item := reference()) is not None])
 
 
 class ProcessLock:

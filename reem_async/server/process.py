@@ -10,11 +10,11 @@ import subprocess
 import sys
 import tempfile
 import time
-import weakref
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from reem_async.concurrency.locks import Inherited
 from reem_async.errors import ServerFailed
 
 HOST = "127.0.0.1"
@@ -127,7 +127,6 @@ class ServerProcess:
     def order_to_end(self) -> None:
         """Have the server end, and do not wait for it."""
         if self._watchdog is not None and os.getpid() == self._owner:
-            _running.discard(self)
             _close_pipes(self._watchdog)  # this is the order
 
     def stop(self) -> None:
@@ -208,7 +207,7 @@ class ServerProcess:
                 umask=0o077,
                 start_new_session=True,
             )
-        _running.add(self)
+        _begun.add(self)
         order = {
             "program": program.path,
             "config": config,
@@ -266,17 +265,7 @@ class ServerProcess:
 
 
 # A fork inherits the pipe to the watchdog. Left open there, it would keep the server alive after its owner.
-_running: weakref.WeakSet[ServerProcess] = weakref.WeakSet()
-
-
-def _forget_all() -> None:
-    for process in list(_running):
-        process.forget()
-    _running.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_all)
+_begun = Inherited(ServerProcess.forget)
 
 
 def _close_pipes(process: subprocess.Popen[bytes]) -> None:

@@ -14,12 +14,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import time
-import weakref
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, NamedTuple
 
+from ..concurrency.locks import Inherited
 from ..errors import (
     BadValue,
     ConnectionLost,
@@ -335,16 +334,7 @@ class Outage:
             logger.warning("closed in an outage: %d kept updates were not sent", count)
 
 
-_every: weakref.WeakSet[Outage] = weakref.WeakSet()
-
-
-def _forget_all() -> None:
-    for each in list(_every):
-        each.forget()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_forget_all)
+_every = Inherited(Outage.forget)
 
 
 def _copied(it: EncodedAttachment) -> EncodedAttachment:

@@ -7,7 +7,6 @@ the core over this transport is run to its end by a single step.
 from __future__ import annotations
 
 import collections
-import os
 import select
 import socket
 import time
@@ -20,7 +19,7 @@ from typing import Any
 
 import redis.exceptions
 
-from ..concurrency.locks import Locks, ThreadLock
+from ..concurrency.locks import Inherited, Locks, ThreadLock
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
@@ -239,8 +238,7 @@ def keep_open_at_exit() -> None:
     Python finalizes all modules and their objects as one heap of garbage, in any order: it would close a connection
     before it calls the `__del__` that sends the last command over it. The context of the main thread outlives that.
     """
-    transports = [transport for reference in list(_all) if (transport := reference()) is not None]
-    _kept.set([line.kept_open() for transport in transports for line in list(transport._idle)])
+    _kept.set([line.kept_open() for transport in _all for line in list(transport._idle)])
 
 
 class BlockingTransport:
@@ -254,7 +252,7 @@ class BlockingTransport:
         self._keeps = True  # connections, for the next call
         self._text = Text(options.timeout)
         self._begin()
-        _all.append(weakref.ref(self, _all.remove))
+        _all.add(self)
         self.states = States()
         self.at_end: Callable[[], Awaitable[None]] = self.release
 
@@ -417,15 +415,5 @@ class _BorrowedConnection:
             self._line.close()
 
 
-_all: list[weakref.ref[BlockingTransport]] = []
-
-
-def _begin_all() -> None:
-    # redis-py closes only the child's descriptors of the parent's connections, without a word to the server.
-    for reference in tuple(_all):
-        if (transport := reference()) is not None:
-            transport._begin()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_begin_all)
+# redis-py closes only the child's descriptors of the parent's connections, without a word to the server.
+_all = Inherited(BlockingTransport._begin)

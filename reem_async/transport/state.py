@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import logging
-import os
 import threading
 import time
 import weakref
@@ -12,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from ..concurrency.locks import Inherited
 from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed
@@ -85,7 +85,7 @@ class States:
         self._untold: collections.deque[StateChange] = collections.deque()  # to the callbacks
         self._turn: Callable[[], _Turn | None] = _nobody
         self._servers: dict[str, str] = {}
-        _all.append(weakref.ref(self, _all.remove))
+        _all.add(self)
 
     def changes(self) -> StateChanges:
         """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
@@ -190,14 +190,4 @@ class States:
         self._lock, self._turn = threading.RLock(), _nobody
 
 
-_all: list[weakref.ref[States]] = []
-
-
-def _forked_all() -> None:
-    for reference in tuple(_all):
-        if (states := reference()) is not None:
-            states._forked()
-
-
-if hasattr(os, "register_at_fork"):  # before that of `wire`, which notes a loss
-    os.register_at_fork(after_in_child=_forked_all)
+_all = Inherited(States._forked)  # before that of `wire`, which notes a loss

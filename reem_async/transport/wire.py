@@ -10,15 +10,14 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import os
 import socket
 import sys
-import weakref
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import hiredis
 
+from ..concurrency.locks import Inherited
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, confirmed, moved_last, server_timeout, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
@@ -44,7 +43,6 @@ _FAREWELL = 1.0
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
 
-_open: weakref.WeakSet[Wire] = weakref.WeakSet()
 _inherited: list[Any] = []
 """A parent's connections in a forked child, kept from being finalized: closing one would take it out of the parent's
 event loop, since both share one epoll."""
@@ -475,11 +473,4 @@ def _is_loopback(sock: Any) -> bool:
         return False
 
 
-def _disown_all() -> None:
-    for wire in list(_open):
-        wire.disown()
-    _open.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_disown_all)
+_open = Inherited(Wire.disown)
