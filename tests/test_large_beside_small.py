@@ -132,7 +132,7 @@ def test_calls_that_failed_are_not_under_way(server, by_tcp, naps):
 
 
 def _under_way(interface):
-    lines = [reference() for reference in interface._direct.session.transport._lines]
+    lines = list(interface._direct.session.transport._lines)
     return [line for line in lines if line is not None and line.waiting]
 
 

@@ -55,20 +55,29 @@ class Locks(Generic[Lock]):
         self._older.clear()
 
 
-class Inherited(Generic[Item]):
-    """The living objects of a class; a forked child calls `action` for each that it has of its parent."""
+class WeakList(Generic[Item]):
+    """Those of some objects that still live. Threads may share it.
 
-    def __init__(self, action: Callable[[Item], object]) -> None:
-        # No WeakSet: leaving one takes steps that Ctrl-C may divide, and other threads go through this.
+    No WeakSet: leaving one takes steps that Ctrl-C may divide, and another thread may be going through it.
+    """
+
+    def __init__(self) -> None:
         self._references: list[weakref.ref[Item]] = []
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
 
     def add(self, item: Item) -> None:
         self._references.append(weakref.ref(item, self._references.remove))
 
     def __iter__(self) -> Iterator[Item]:
         return iter([item for reference in tuple(self._references) if (item := reference()) is not None])
+
+
+class Inherited(WeakList[Item]):
+    """The living objects of a class; a forked child calls `action` for each that it has of its parent."""
+
+    def __init__(self, action: Callable[[Item], object]) -> None:
+        super().__init__()
+        if hasattr(os, "register_at_fork"):
+            os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
 
 
 class ProcessLock:

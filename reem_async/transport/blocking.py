@@ -10,7 +10,6 @@ import collections
 import select
 import socket
 import time
-import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from contextvars import ContextVar
@@ -19,7 +18,7 @@ from typing import Any
 
 import redis.exceptions
 
-from ..concurrency.locks import Inherited, Locks, ThreadLock
+from ..concurrency.locks import Inherited, Locks, ThreadLock, WeakList
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
@@ -49,7 +48,7 @@ class _Line:
         waiting: A call is under way that has nothing large to send.
     """
 
-    def __init__(self, options: Options, states: States, lines: list[weakref.ref[_Line]]) -> None:
+    def __init__(self, options: Options, states: States, lines: WeakList[_Line]) -> None:
         self._states, self._lines = states, lines
         self._is_kept = False
         self._connection = options.blocking_connection()
@@ -85,7 +84,7 @@ class _Line:
             raise options.unanswered(error) from error
         self.plain = bool(probed) and is_plain(probed[0])
         self._states.opened(options.address, server_run_id([self.introduction]))
-        lines.append(weakref.ref(self, lines.remove))
+        lines.add(self)
 
     def _set_limit(self, limit: float) -> None:
         """Have Python watch the time: the kernel's own limits restart after each signal."""
@@ -177,7 +176,7 @@ class _Line:
 
     def _others_wait(self) -> bool:
         """Return whether small calls of other threads are under way."""
-        return any(line.waiting for each in tuple(self._lines) if (line := each()) is not None)
+        return any(line.waiting for line in self._lines)
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""
@@ -263,7 +262,7 @@ class BlockingTransport:
     def _begin(self) -> None:
         """Begin without connections and locks; in a forked child too, since those it has are its parent's."""
         self._idle: collections.deque[_Line] = collections.deque()
-        self._lines: list[weakref.ref[_Line]] = []  # all there are, also those in use; leaving a list is one step
+        self._lines: WeakList[_Line] = WeakList()  # all there are, also those in use
         self._orders = Locks(ThreadLock)
 
     def _take(self) -> _Line:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import redis.exceptions
 
+from ..concurrency.locks import WeakList
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Held, Transport
@@ -223,9 +224,8 @@ class SentinelTransport(CompositeTransport):
         self._states = self._root.states
         # Ways to primaries of before on which calls still wait for replies.
         self._demoted: list[ToOneServer] = []
-        # Subscription connections: a primary of before sends nothing any more, and would not be missed. No WeakSet:
-        # another thread goes through them.
-        self._listening: list[weakref.ref[Wire]] = []
+        # Subscription connections: a primary of before sends nothing any more, and would not be missed.
+        self._listening: WeakList[Wire] = WeakList()
         self._lookout: _Lookout | None = None
         self._moved = False
 
@@ -254,14 +254,13 @@ class SentinelTransport(CompositeTransport):
         """Take note that the sentinels name another primary. Runs on a thread of its own."""
         self._moved = True
         reason = ConnectionLost(f"the sentinels name another primary for {self._options.service!r}")
-        for reference in tuple(self._listening):
-            if (wire := reference()) is not None:
-                wire.abort_soon(reason)
+        for wire in self._listening:
+            wire.abort_soon(reason)
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         self._root.check()
         wire = await cast("AsyncTransport", self._current()).listen(on_push, on_lost)
-        self._listening.append(weakref.ref(wire, self._listening.remove))
+        self._listening.add(wire)
         return wire
 
     def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from ..concurrency.locks import Inherited
+from ..concurrency.locks import Inherited, WeakList
 from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed
@@ -80,7 +80,7 @@ class States:
         self.unreadable = 0
         self.last = StateChange("idle", "", time.time())
         self._lock = threading.RLock()
-        self._queues: list[weakref.ref[BoundedQueue]] = []  # leaving a WeakSet takes steps that a signal may divide
+        self._queues: WeakList[BoundedQueue] = WeakList()
         self._callbacks: list[Callable[[StateChange], object]] = []
         self._untold: collections.deque[StateChange] = collections.deque()  # to the callbacks
         self._turn: Callable[[], _Turn | None] = _nobody
@@ -94,7 +94,7 @@ class States:
             changes.queue.put(self.last)
             if self.last.state == "closed":
                 changes.queue.close()
-            self._queues.append(weakref.ref(changes.queue, self._queues.remove))
+            self._queues.add(changes.queue)
         return changes
 
     def call(self, callback: Callable[[StateChange], object]) -> None:
@@ -143,7 +143,7 @@ class States:
         with self._lock:
             if self.last.state != "closed":
                 self._change("closed", "")
-            for queue in self._listening():
+            for queue in self._queues:
                 queue.close()
         self.tell()
 
@@ -175,12 +175,9 @@ class States:
             self._turn = weakref.ref(turn)
             return self._untold[0]
 
-    def _listening(self) -> list[BoundedQueue]:
-        return [queue for reference in tuple(self._queues) if (queue := reference()) is not None]
-
     def _change(self, state: State, reason: str, restarted: bool = False) -> None:
         self.last = StateChange(state, reason, time.time(), restarted)
-        for queue in self._listening():
+        for queue in self._queues:
             queue.put(self.last)
         if self._callbacks:
             self._untold.append(self.last)
