@@ -25,7 +25,7 @@ from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
 from .transport import Transport, drive, scanned
 from .transport.composite import NewTransport
-from .transport.endpoints import make_transport
+from .transport.options import Options, look_nearby
 from .transport.packing import CommandRecorder
 
 _FRESH = 3.0
@@ -128,7 +128,7 @@ class Session:
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
-        self.options, self.transport = make_transport(host, timeout, options, new_transport)
+        self.options, self.transport = _transport_to(host, timeout, options, new_transport)
         self.local = local or LocalPath()
         self.interface: Any = None
         self._numbers = _Numbers()
@@ -214,3 +214,25 @@ class Session:
             steps.push_async_callback(self.transport.close)
             if self.subscriptions is not None:
                 steps.push_async_callback(self.subscriptions.close)
+
+
+def _transport_to(
+    host: Any, timeout: float, options: dict[str, Any], new_transport: NewTransport
+) -> tuple[Options, Transport]:
+    """Return how to reach what `host` names, and the transport to it. Nothing is connected yet."""
+    url = host if isinstance(host, str) else getattr(host, "url", "")
+    # Imported only where an address asks for it: a program for one server starts without it.
+    if url.startswith(("redis+cluster://", "rediss+cluster://")):
+        from .transport.cluster import ClusterOptions, ClusterTransport
+
+        nodes = ClusterOptions(url, timeout, options)
+        return nodes, ClusterTransport(nodes, new_transport)
+    if url.startswith(("redis+sentinel://", "rediss+sentinel://")):
+        from .transport.sentinel import SentinelOptions, SentinelTransport
+
+        watched = SentinelOptions(url, timeout, options)
+        return watched, SentinelTransport(watched, new_transport)
+    one = Options(host, timeout, options)
+    if one.settings.get("host", "localhost") == "localhost":  # a number means TCP
+        look_nearby(one)
+    return one, new_transport(one)
