@@ -3,7 +3,7 @@
 Plain reads and writes never come here: they run on the caller's thread. The loop serves what has to
 wait for others: subscriptions, and ships with `async def` methods.
 
-A caller may be interrupted between any two steps, by a handler of signals that raises or that calls REEM itself.
+Ctrl-C may interrupt a caller between any two steps.
 So there is no lock between callers and the loop: a call is noted, then handed over, and its caller waits for a
 token that the loop gives back once. Whatever is still noted when the loop has ended is ended with it.
 """
@@ -67,7 +67,7 @@ class _Call(Generic[Result]):
         self._error: BaseException | None = None
         self._result: Any = None
         self._token = _thread.allocate_lock()
-        # Not an Event: its lock could be left taken by a handler of signals that raises.
+        # Not an Event: Ctrl-C could leave its lock taken.
         self._token.acquire()
         self.over = False
 
@@ -110,10 +110,9 @@ class _Call(Generic[Result]):
         if coroutine is not None:
             coroutine.close()
 
-    def wait(self, timeout: float | None) -> Result:
-        """Return the coroutine's result, or raise what it raised; TimeoutError after `timeout` seconds."""
-        if not self._token.acquire(timeout=-1 if timeout is None else timeout):
-            raise TimeoutError
+    def wait(self) -> Result:
+        """Return the coroutine's result, or raise what it raised."""
+        self._token.acquire()
         error, self._error = self._error, None
         if error is None:
             return self._result  # type: ignore[no-any-return]
@@ -179,7 +178,7 @@ class Portal:
         """Whether the caller is on the loop's own thread."""
         return _thread.get_ident() == self._ident
 
-    def call(self, coroutine: Coroutine[Any, Any, Result], timeout: float | None = None) -> Result:
+    def call(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run `coroutine` on the loop and wait for its result. Ctrl-C cancels it."""
         if self.inside:
             coroutine.close()
@@ -190,7 +189,7 @@ class Portal:
         try:
             self._calls.add(call)  # before it is handed over: see `_serve`
             self._hand_over(call.begin)
-            return call.wait(timeout)
+            return call.wait()
         except BaseException:
             if not call.over:
                 self._give_up(call)
@@ -240,9 +239,7 @@ class _LastLoop(asyncio.SelectorEventLoop):
 class LastPortal:
     """What takes the place of a Portal while the interpreter exits, when no thread can start any more."""
 
-    inside = False
-
-    def call(self, coroutine: Coroutine[Any, Any, Result], timeout: float | None = None) -> Result:
+    def call(self, coroutine: Coroutine[Any, Any, Result]) -> Result:
         """Run `coroutine` on an event loop of this call."""
         with asyncio.Runner(loop_factory=_LastLoop) as runner:
             return runner.run(coroutine)

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
-from reem_async.concurrency.locks import ProcessLock
 from reem_async.concurrency.queues import EMPTY, Ended, Policy
 from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.errors import BadType, InterfaceClosed
@@ -203,7 +202,7 @@ class CallbackSubscriber(SilentSubscriber):
         # What answers `value()` is what calls are made of, so a callback never sees a copy older than its update.
         self._core = self._calls
         self._thread: threading.Thread | None = None
-        self._starting = ProcessLock()
+        self._starting = threading.RLock()
         if inspect.iscoroutinefunction(callback_function):
             raise BadType("callback_function is a coroutine function, which a thread cannot call; use reem_async")
 
@@ -213,7 +212,7 @@ class CallbackSubscriber(SilentSubscriber):
         self._start()
 
     def _start(self) -> None:
-        with self._starting.here():
+        with self._starting:
             # Again after a fork, which leaves the child without it.
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)

@@ -80,26 +80,11 @@ class Inherited(WeakList[Item]):
             os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
 
 
-class ProcessLock:
-    """A lock of threads that is free in a forked child, where a thread that holds it may not exist.
-
-    A signal handler may take it again on the same thread.
-    """
-
-    def __init__(self) -> None:
-        self._locks: dict[int, threading.RLock] = {}
-
-    def here(self) -> threading.RLock:
-        """Return this process's lock; `with` takes it in one step, which Ctrl-C cannot divide."""
-        pid = os.getpid()
-        return self._locks.get(pid) or self._locks.setdefault(pid, threading.RLock())
-
-
 class ThreadLock:
     """A thread lock with the face of an asynchronous one; waiting for it blocks the thread.
 
     Ctrl-C may come between any two steps, also just after it was taken, or before it is given back: `let_go` is for
-    that. And a thread that has it, in a handler of signals for example, does not wait for itself.
+    that. And a thread that has it, in a `__del__` for example, does not wait for itself.
     """
 
     __slots__ = ("__weakref__", "_lock")
@@ -113,7 +98,7 @@ class ThreadLock:
     async def __aexit__(self, *_: Any) -> None:
         try:
             self._lock.release()
-        except RuntimeError:  # a call in a handler of signals has let go of all
+        except RuntimeError:  # a call in a `__del__` has let go of all
             return
 
     def let_go(self) -> None:
