@@ -95,7 +95,7 @@ class Transport(Held, Protocol):
 
 
 class Contention:
-    """The attempts of one call, for `limit` seconds, that another client's writes to its top-level key have ended."""
+    """The attempts of one call that were given up, since others wrote to its key; it goes on for `limit` seconds."""
 
     def __init__(self, limit: float) -> None:
         self._limit = limit
