@@ -104,6 +104,9 @@ ClusterReply = (
 class ReemError(Exception):
     """Base of all errors of REEM."""
 
+    def __str__(self) -> str:  # KeyError would show the message in quotes
+        return str(self.args[0]) if self.args else ""
+
     def __repr__(self) -> str:  # redis-py's errors leave the message out
         return Exception.__repr__(self)
 
@@ -159,9 +162,6 @@ class ReadOnly(Misuse, NotImplementedError, TypeError):
 class MissingKey(ReemError, KeyError, redis.exceptions.ResponseError):
     """Nothing is stored at the path."""
 
-    def __str__(self) -> str:  # KeyError would show the message in quotes
-        return str(self.args[0]) if self.args else ""
-
 
 class MissingDocument(MissingKey):
     """Even the top-level key is missing: `read` returns None; other calls raise this as MissingKey."""
@@ -169,9 +169,6 @@ class MissingDocument(MissingKey):
 
 class PathRefused(ReemError, KeyError, redis.exceptions.ResponseError):
     """The parent of a written path is missing, or is a scalar, or the index is out of range."""
-
-    def __str__(self) -> str:
-        return str(self.args[0]) if self.args else ""
 
 
 class MissingTop(PathRefused):
