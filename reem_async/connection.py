@@ -10,15 +10,10 @@ from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport.aio import AsyncTransport
-from .transport.composite import NewTransport, ToOneServer
-from .transport.options import Options
+from .transport.composite import NewTransport
 from .transport.state import State, StateChange, StateChanges
 
 __all__ = ["RedisInterface"]
-
-
-def _on_event_loop(options: Options) -> ToOneServer:
-    return AsyncTransport(options)
 
 
 class RedisInterface:
@@ -56,7 +51,7 @@ class RedisInterface:
         BadType, BadValue: An option or URL that means nothing.
     """
 
-    _new_transport: NewTransport = staticmethod(_on_event_loop)
+    _new_transport: NewTransport = AsyncTransport
 
     def __init__(
         self,
@@ -78,15 +73,8 @@ class RedisInterface:
         settings = {"namespace": namespace, "timeout": timeout}
         settings |= {"local": local, "local_memory": local_memory}
         self._given = (getattr(host, "url", host), ships, {**settings, **options})
-        self.session = Session(
-            host,
-            ships,
-            namespace,
-            timeout,
-            options,
-            self._new_transport,
-            local=LocalPath(local, local_memory),
-        )
+        shared = LocalPath(local, local_memory)
+        self.session = Session(host, ships, namespace, timeout, options, self._new_transport, shared)
         self.session.interface = self
         self._client: Any = None
         # An event loop that ends without `close` (asyncio.run of a script) takes its connections and tasks with it.

@@ -120,8 +120,7 @@ class Session:
         timeout: float,
         options: dict[str, Any],
         new_transport: NewTransport,
-        *,
-        local: LocalPath | None = None,
+        local: LocalPath,
     ) -> None:
         self.namespace = check_namespace(namespace)
         # A key on the server has at most 512 bytes, the namespace included.
@@ -129,7 +128,7 @@ class Session:
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
         self.options, self.transport = _transport_to(host, timeout, options, new_transport)
-        self.local = local or LocalPath()
+        self.local = local
         self.interface: Any = None
         self._numbers = _Numbers()
         self.subscriptions: Any = None
