@@ -5,6 +5,7 @@ All of it is a guess: every use is checked against a reply of the same round tri
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 from .paths import Path
@@ -17,6 +18,7 @@ _MOST_PLACES = 1000
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 
+@dataclass(slots=True)
 class Shape:
     """Guesses about one document. Threads may share it: entries are only ever replaced.
 
@@ -28,13 +30,13 @@ class Shape:
         is_new_below: the same, where only places below the root were looked at.
     """
 
-    __slots__ = ("_layouts", "_numbers", "interrupted", "is_new", "is_new_below", "may_look", "members")
-
-    def __init__(self) -> None:
-        self.members = _NO_MEMBERS
-        self.interrupted = self.may_look = self.is_new = self.is_new_below = False
-        self._layouts: dict[Path, tuple[Placeholder, ...]] = {}
-        self._numbers: dict[Path, float] = {}
+    members: frozenset[bytes] = _NO_MEMBERS
+    interrupted: bool = False
+    may_look: bool = False
+    is_new: bool = False
+    is_new_below: bool = False
+    _layouts: dict[Path, tuple[Placeholder, ...]] = field(default_factory=dict)
+    _numbers: dict[Path, float] = field(default_factory=dict)
 
     def sure_members(self) -> frozenset[bytes]:
         """Return the suffixes of attachments that exist; none if a change was interrupted."""
