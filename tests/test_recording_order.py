@@ -53,7 +53,7 @@ async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(ke
             await apspace[key()]["box"][0].delete()
             await apspace[key()]["score"].write(number / 2)
             await recorder.fence()
-            await recorder._settled(PATIENCE)
+            await recorder._keys.settled(PATIENCE)
         whole = await akvs[key()].read()
     with open_log(file) as log:
         updates = [update for update in log.updates() if update.kind == "pub"]
@@ -86,7 +86,7 @@ async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, a
     await apspace[key()].write({"x": 1})
     async with Recorder(binterface, [key()], file, keyframe=0.1) as recorder:
         await akvs[key()].delete()
-        await aeventually(lambda: recorder._key_recorder(key()).absent)
+        await aeventually(lambda: recorder._keys.of(key()).absent)
         await apspace[key()].write({"x": 2})
         await apspace[key()].delete()
         await asyncio.sleep(0.3)
@@ -193,7 +193,7 @@ async def test_any_clock_of_a_publisher_can_be_recorded(key, akvs, binterface, f
     await akvs[key()].write(1)
     async with Recorder(binterface, [key()], file) as recorder:
         event = Event((key(),), 1, deleted=False, size=10, time=clock, received=time.time(), publisher="p", sequence=1)
-        recorder._key_recorder(key()).on_event(event)
+        recorder._keys.of(key()).on_event(event)
     with open_log(file) as log:
         (update,) = [update for update in log.updates() if update.kind == "pub"]
         assert (update.value, update.published) == (1, published(clock) / 1e9)

@@ -88,7 +88,7 @@ async def test_what_is_published_and_dropped_before_it_is_taken_is_no_stored_cha
     await akvs[key()].write({"x": 0, "y": 0, "z": 0})
     async with reem_async.RedisInterface(server_url) as another, recording(binterface, [key()], file) as recorder:
         await aeventually(lambda: is_followed(recorder, key()))
-        reading, monitor = recorder._key_recorder(key()), recorder._monitor
+        reading, monitor = recorder._keys.of(key()), recorder._monitor
         waits = reading._reader._limit = asyncio.Semaphore(0)
         recorder._tasks[0].cancel()  # nothing takes updates out but a look that has to know of all
         recorder._catch_up = lambda: None  # and nobody sees that one was dropped

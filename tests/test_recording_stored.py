@@ -44,7 +44,7 @@ async def recording(interface, patterns, file, **options):
 
 def is_followed(recorder, name):
     """Whether a key was read, and the server tells of the next change."""
-    reading = recorder._key_recorder(name)
+    reading = recorder._keys.of(name)
     return reading._reader.feed.tracked and not reading.busy
 
 
@@ -88,7 +88,7 @@ async def test_what_others_store_and_several_changes_in_a_moment_are_seen(key, a
     """A bare command, and as one recorded change what cannot be told apart any more."""
     await akvs[key()].write({"n": 0})
     async with recording(binterface, [key()], file) as recorder:
-        reading = recorder._key_recorder(key())
+        reading = recorder._keys.of(key())
         waits = reading._reader._limit = asyncio.Semaphore(0)
         for number in range(1, 50):
             await akvs[key()]["n"].write(number)
@@ -152,7 +152,7 @@ async def test_only_arrays_that_were_changed_are_fetched_again(key, apspace, akv
         assert FRAME.nbytes < sent() - before < 1.5 * FRAME.nbytes
         await apspace[key()]["image"].write(FRAME + np.uint8(2))
         await recorder.fence()
-        await aeventually(lambda: not recorder._key_recorder(key()).busy)
+        await aeventually(lambda: not recorder._keys.of(key()).busy)
         await akvs[key()]["n"].write(6)
         await recorder.written(key())
     assert [(path, kind) for path, kind, _ in news(file)][6:] == [
@@ -178,7 +178,7 @@ async def test_what_is_changed_right_behind_the_touch_is_not_in_what_is_read(key
     connect = reem_async.RedisInterface(server_url, client_name=key("recorder"))
     async with connect as other, recording(other, [key()], file) as recorder:
         await aeventually(lambda: is_followed(recorder, key()))
-        reader, looks = recorder._key_recorder(key())._reader, recorder._key_recorder(key()).looks
+        reader, looks = recorder._keys.of(key())._reader, recorder._keys.of(key()).looks
         looks._pace = looks._pace._replace(notice_delay=60.0)
         touching = asyncio.create_task(reader._touch(reader.feed.arm(reader._plan((), {}))))
         await asyncio.sleep(0)
@@ -312,8 +312,8 @@ async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_n
     async with server_without_right("client|tracking") as (kvs, url), reem_async.RedisInterface(url) as other:
         await kvs["a"].write({"n": 1, "large": large})
         async with recording(other, ["*"], file) as recorder:
-            await aeventually(lambda: not recorder._key_recorder("a").busy)
-            assert recorder._key_recorder("a")._reader.feed.attachments._raw is None
+            await aeventually(lambda: not recorder._keys.of("a").busy)
+            assert recorder._keys.of("a")._reader.feed.attachments._raw is None
             await kvs["a"]["n"].write(2)
     with open_log(file) as log:
         assert_same(log["a"].at(log.end), {"n": 2, "large": large})

@@ -29,6 +29,7 @@ from .mcap_reader import (
     HEAD,
     MAGIC,
     MALFORMED,
+    MESSAGE,
     ChunkInfo,
     Contents,
     Footer,
@@ -51,8 +52,6 @@ _SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
 """Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
-# Head of the record, channel, sequence, log time, publish time; the data follow.
-_MESSAGE = struct.Struct("<BQHIQQ")
 # Head of the record, checksum of all before it.
 _DATA_END = struct.Struct("<BQI")
 # What other records of these kinds would hide: all that follows.
@@ -102,7 +101,7 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
             if end > len(content):
                 return None
             if opcode == Opcode.MESSAGE:
-                _, _, channel_id, _, log_time, _ = _MESSAGE.unpack_from(content, position)
+                _, _, channel_id, _, log_time, _ = MESSAGE.unpack_from(content, position)
                 channels.append(channel_id)
                 times.append(log_time)
                 offsets.append(position)
@@ -123,18 +122,12 @@ def _take_records(content: bytes, contents: Contents) -> Index | None:
 
 
 class _Scan:
-    """Reads a file from record to record, as far as it is whole.
-
-    Attributes:
-        contents: What was found.
-        messages: How many messages there are.
-        damaged: How many records are damaged or cut off.
-    """
+    """Reads a file from record to record, as far as it is whole."""
 
     def __init__(self, source: Source) -> None:
         self.contents = Contents()
         self.messages = 0
-        self.damaged = 0
+        self.damaged = 0  # records that are damaged or cut off
         self._source = source
         self._size = source.size
 
@@ -219,32 +212,15 @@ class _Scan:
 
 
 class Container:
-    """An MCAP file.
+    """An MCAP file. Any thread may use it.
 
-    Any thread may use it.
-
-    Args:
-        path: The file.
-        progress: Called with the bytes read and all of them, if the file is read from record to record.
-
-    Attributes:
-        every_chunk: All chunks, in order of their first log times, by number.
-        lost: The numbers of those found to be damaged.
-        channels: By number, as the channel records of the file describe them.
-        schemas: By number.
-        metadata: The metadata records, in the order of the file.
-        indexed: The file was closed properly.
-        damaged: How many records were found to be damaged, cut off or missing.
-
-    Raises:
-        DamagedRecording: Not an MCAP file.
-        OSError: It cannot be read.
+    `progress` is called if the file is read from record to record. Raises DamagedRecording if it is none, and OSError.
     """
 
     def __init__(self, path: FilePath, progress: Progress | None = None) -> None:
         self.path = path
-        self.damaged = 0
-        self.lost: set[int] = set()
+        self.damaged = 0  # records that were found to be damaged, cut off or missing
+        self.lost: set[int] = set()  # the numbers of damaged chunks
         self._lock = threading.RLock()
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._cached = 0
@@ -317,10 +293,7 @@ class Container:
             self.lost.add(info.number)
 
     def index(self, info: ChunkInfo) -> Index:
-        """Return when the messages of a chunk were received and where they are in it, by channel.
-
-        If the chunk turns out to be damaged, it has no messages.
-        """
+        """Return the index of a chunk; without messages, if the chunk turns out to be damaged."""
         with self._lock:
             if info.number in self._indexes:
                 self._indexes.move_to_end(info.number)
@@ -351,11 +324,11 @@ class Container:
         content = self.content(info)
         if content is None:
             return None
-        if offset + _MESSAGE.size <= len(content):
-            opcode, length, found, sequence, time, published = _MESSAGE.unpack_from(content, offset)
+        if offset + MESSAGE.size <= len(content):
+            opcode, length, found, sequence, time, published = MESSAGE.unpack_from(content, offset)
             end = offset + HEAD.size + length
             if opcode == Opcode.MESSAGE and (found, time) == (channel, log_time) and end <= len(content):
-                return Message(found, time, published, sequence, content[offset + _MESSAGE.size : end])
+                return Message(found, time, published, sequence, content[offset + MESSAGE.size : end])
         self._discard(info)
         return None
 
@@ -410,14 +383,10 @@ index of the whole file, and take seconds to make."""
 
 
 class Ref(NamedTuple):
-    """Where a message is.
+    """Where a message is, and its log time in ns.
 
-    Attributes:
-        time: Its log time in ns.
-        chunk: The chunk.
-        offset: Its place in the chunk.
-        channel: Its channel. The last field: of one instant, messages come in the order of the file, whatever numbers
-            another tool has given to the channels.
+    The channel is last: of one instant, messages come in the order of the file, whatever numbers another tool has
+    given to the channels.
     """
 
     time: int
@@ -436,11 +405,7 @@ class Totals(NamedTuple):
 
 
 class Timeline:
-    """The messages of a file by channel and time, in whatever order the file has them.
-
-    Args:
-        container: The file.
-    """
+    """The messages of a file by channel and time, in whatever order the file has them."""
 
     def __init__(self, container: Container) -> None:
         self._container = container
@@ -528,12 +493,10 @@ class Timeline:
         return set(np.flatnonzero(found).tolist())
 
     def exactly(self, channel: int, time: int) -> Ref | None:
-        """Return the message of a channel with this very log time, or None."""
         found = self.latest(channel, time)
         return found if found is not None and found.time == time else None
 
     def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
-        """Return what each channel has, by the indexes of all chunks."""
         messages, sizes, lasts = np.zeros((3, _CHANNELS), np.int64)
         firsts = np.full(_CHANNELS, _END)
         for info in self._chunks:

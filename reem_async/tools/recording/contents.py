@@ -15,9 +15,6 @@ from typing import Any
 
 from ...concurrency.scheduling import give_way
 
-# Long work in slices. The thread yields after each, so that recorded programs are not slowed down.
-
-
 # 64 KiB: about 50 us of compression, so that other threads wait for the processor no longer.
 _SLICE = 1 << 16
 
@@ -46,7 +43,6 @@ def slices(pieces: Iterable[Any]) -> Iterator[Any]:
 
 
 def digest(head: bytes, body: Any = b"") -> bytes:
-    """Return 16 bytes that tell what `head` and `body` are from anything else."""
     total = hashlib.blake2b(digest_size=16, salt=hashlib.blake2b(head, digest_size=16).digest())
     for part in slices([body]):
         total.update(part)
@@ -60,14 +56,7 @@ _MOST_KEPT = 64 << 20
 
 
 class Content:
-    """The bytes of one value, later only a digest of them.
-
-    Args:
-        head, body: The bytes; they must not change.
-
-    Attributes:
-        size: How many bytes of memory are kept for it.
-    """
+    """The bytes of one value, which must not change; later only a digest of them."""
 
     __slots__ = ("__weakref__", "_digest", "_pieces", "size")
 

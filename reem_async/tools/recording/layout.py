@@ -45,15 +45,10 @@ _DTYPE = re.compile(r"[<>|=][biuf]\d{1,2}")
 
 
 class JsonMessage(NamedTuple):
-    """A tree ready to be written.
+    """A tree ready to be written."""
 
-    Attributes:
-        tree: What is written, notes included: plain JSON values.
-        wrapped: The tree proper is under "value".
-    """
-
-    tree: dict[str, Any]
-    wrapped: bool
+    tree: dict[str, Any]  # plain JSON values, notes included
+    wrapped: bool  # the tree proper is under "value"
 
     @property
     def text(self) -> bytes:
@@ -139,11 +134,7 @@ def _flat(place: _Place) -> list[str | int]:
 
 
 def from_json(text: bytes, *, wrapped: bool) -> Any:
-    """Return the tree of a message, long arrays as `Reference`.
-
-    Raises:
-        DamagedRecording: Not what `to_json` writes.
-    """
+    """Return the tree of a message, long arrays as `Reference`; raises DamagedRecording."""
     try:
         root = orjson.loads(text)
         if type(root) is not dict:
@@ -221,17 +212,11 @@ _NUMPY = NumpyShip()
 
 
 class EncodedMessage(NamedTuple):
-    """One value as a message.
-
-    Attributes:
-        schema: The name of its schema: "foxglove.RawImage", ...
-        channels: For a picture, the last axis of its shape, or "" if it has only two axes; else "".
-        pieces: The message, in pieces that belong one behind the other: a large value is not copied.
-    """
+    """One value as a message."""
 
     schema: str
-    channels: str
-    pieces: list[Any]
+    channels: str  # of a picture with three axes, the size of the last one; else ""
+    pieces: list[Any]  # that belong one behind the other: a large value is not copied
 
 
 # Fields with their numbers. Those of Foxglove are its published schemas; a test compares them. They are made here
@@ -304,11 +289,7 @@ def schema_bytes(schema: str) -> bytes:
 def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
     """Return an array, or the bytes of any other ship, as a message.
 
-    Args:
-        label: The ship's label, or "list" for an array that stands for a list.
-        value: The array, or the bytes.
-        frame: The path, which viewers show as the frame of a picture.
-        time: When it was published, in ns since 1970.
+    The label is the ship's, or "list"; viewers show `frame`, the path, with a picture; the time is in ns since 1970.
     """
     if isinstance(value, np.ndarray):
         return _picture(value, frame, time) if _is_picture(label, value) else _array_message(value, time)

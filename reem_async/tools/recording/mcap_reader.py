@@ -27,6 +27,8 @@ Numbers = np.ndarray[Any, Any]
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 """The head of each record: opcode, length of what follows."""
+MESSAGE = struct.Struct("<BQHIQQ")
+"""The head of a message record: opcode, length, channel, sequence, log time, publish time; the data follow."""
 MALFORMED = (McapError, ValueError, struct.error, EOFError, OverflowError, MemoryError)
 """What the library raises over bytes that are no record."""
 # Where the summary and its offsets begin (8 bytes each), and a CRC-32.
@@ -50,16 +52,7 @@ class Source:
     """A file, read by position. Any thread may use it, while another program cuts it short or writes over it.
 
     It is not mapped into memory: the system kills a process that touches a mapped page which the file no longer has.
-
-    Args:
-        path: The file.
-
-    Attributes:
-        path: The file.
-        size: Its bytes when it was opened; what is added later is not read.
-
-    Raises:
-        OSError: It cannot be read.
+    What is added to it later is not read.
     """
 
     def __init__(self, path: FilePath) -> None:
@@ -98,19 +91,12 @@ class Source:
 
 
 class Index(NamedTuple):
-    """Where the messages of a chunk are, one channel after the other.
+    """Where the messages of a chunk are, one channel after the other."""
 
-    Attributes:
-        channels: The channels, uint16.
-        bounds: Where the messages of each channel begin in the arrays below, and where the last ends.
-        times: The log times in ns, uint64; of each channel in order.
-        offsets: The places in the chunk, uint64.
-    """
-
-    channels: Numbers
-    bounds: Numbers
-    times: Numbers
-    offsets: Numbers
+    channels: Numbers  # uint16
+    bounds: Numbers  # where the messages of each channel begin in the arrays below, and where the last ends
+    times: Numbers  # log times in ns, uint64; of each channel in order
+    offsets: Numbers  # places in the chunk, uint64
 
     def of(self, channel: int) -> tuple[Numbers, Numbers]:
         """Return the log times and places of a channel's messages."""
@@ -134,50 +120,31 @@ class Index(NamedTuple):
 
 @dataclass(frozen=True, slots=True, order=True)
 class ChunkInfo:
-    """Where a chunk is and when it is from.
+    """Where a chunk is and when it is from."""
 
-    Attributes:
-        number: Its place among the chunks of the file, in order of their first log times.
-        start: The first log time in it, in ns.
-        end: The last.
-        offset: Where its record begins in the file.
-        length: The length of its record.
-        index: Where the index of its messages begins.
-        index_length: The length of the index, 0 if there is none.
-        channels: The channels that have messages in it, uint16.
-        map: Where the summary lists the places of the index's records; 0 if it does not.
-        bare: It is no chunk record: messages that the file has outside of chunks.
-    """
-
-    number: int
-    start: int
+    number: int  # among the chunks of the file, in order of their first log times
+    start: int  # the first and the last log time in it, in ns
     end: int
-    offset: int
+    offset: int  # of its record in the file
     length: int
-    index: int
-    index_length: int
-    channels: Numbers = field(compare=False)
-    map: int = 0
-    bare: bool = False
+    index: int  # where the index of its messages begins
+    index_length: int  # 0 if there is none
+    channels: Numbers = field(compare=False)  # that have messages in it, uint16
+    map: int = 0  # where the summary lists the places of the index's records; 0 if it does not
+    bare: bool = False  # it is no chunk record: messages that the file has outside of chunks
 
 
 @dataclass(slots=True)
 class Contents:
-    """What a file has: channels and schemas by number, chunks, metadata by place.
-
-    Attributes:
-        messages: How many there are by the statistics of the summary; None if there are none.
-        ends: Where each metadata record ends that the summary lists.
-        damaged: How many records outside of chunks cannot be read, although the summary lists what follows them.
-    """
+    """What a file has: channels and schemas by number, chunks, metadata by place."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: list[ChunkInfo] = field(default_factory=list)
     metadata: dict[int, Metadata] = field(default_factory=dict)
-    messages: int | None = None
-    ends: dict[int, int] = field(default_factory=dict)
-    damaged: int = 0
+    messages: int | None = None  # by the statistics of the summary
+    ends: dict[int, int] = field(default_factory=dict)  # of the metadata records that the summary lists
+    damaged: int = 0  # records outside of chunks that cannot be read, although the summary lists what follows them
 
     def unknown(self) -> int:
         """Return how many channels with messages, or their schemas, the file does not describe."""
@@ -191,15 +158,10 @@ class Contents:
 
 
 class Footer(NamedTuple):
-    """The end of a file that was closed properly.
+    """The end of a file that was closed properly."""
 
-    Attributes:
-        data_end: Where the data section ends.
-        text: The summary; None if it is damaged, empty if there is none.
-    """
-
-    data_end: int
-    text: bytes | None
+    data_end: int  # of the data section
+    text: bytes | None  # the summary; None if it is damaged, empty if there is none
 
 
 def read_footer(source: Source) -> Footer | None:

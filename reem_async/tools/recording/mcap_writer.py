@@ -35,19 +35,17 @@ from mcap.records import (
 )
 
 from .contents import slices
+from .mcap_reader import HEAD, MAGIC, MESSAGE
 from .output import Output
 
-_MAGIC = b"\x89MCAP0\r\n"
 # Bytes after which a chunk is closed: large enough to compress well, small enough to be unpacked for one message.
 _CHUNK_BYTES = 1 << 20
 _INDEX_BYTES = 1 << 20
 """Bytes of the index of chunks that are kept in memory; the rest of it waits in a file without a name."""
-# Opcode, length, channel, sequence, log time, publish time; the data follow.
-_MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_FIELDS = _MESSAGE.size - 9
+_MESSAGE_FIELDS = MESSAGE.size - HEAD.size
 # Opcode, length, first and last log time, size and CRC-32 of the content; compression and content follow.
 _CHUNK = struct.Struct("<BQQQQI")
-_CHUNK_FIELDS = _CHUNK.size - 9
+_CHUNK_FIELDS = _CHUNK.size - HEAD.size
 _NEVER = 2**64 - 1
 _PIECE = 1 << 18
 """Bytes of the index that are read back at once."""
@@ -81,19 +79,12 @@ COMPRESSIONS: dict[str, tuple[str, Callable[[int], _Stream]]] = {
 
 
 class _Chunk:
-    """The messages since the last chunk was closed.
-
-    Attributes:
-        pieces: Their records, and those of the schemas and channels that are new.
-        size: Bytes of these.
-        index: Of each channel, the log time and the place of each message.
-        first, last: The least and the greatest log time.
-    """
+    """The messages since the last chunk was closed, behind the schemas and channels that are new."""
 
     def __init__(self) -> None:
         self.pieces: list[Any] = []
         self.size = 0
-        self.index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)
+        self.index: defaultdict[int, list[tuple[int, int]]] = defaultdict(list)  # log time and place of each message
         self.first = self.last = 0
 
     def put(self, *pieces: Any) -> None:
@@ -110,13 +101,7 @@ class _Chunk:
 
 
 class McapWriter:
-    """Writes one file. Belongs to one thread.
-
-    Args:
-        output: The file, empty.
-        compression: One of COMPRESSIONS.
-        library: What the header says wrote it.
-    """
+    """Writes one file, which is empty. Belongs to one thread."""
 
     def __init__(self, output: Output, compression: str, library: str) -> None:
         self._output = output
@@ -131,7 +116,7 @@ class McapWriter:
         self._metadata: list[MetadataIndex] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._chunk = _Chunk()
-        output.write(_MAGIC + _record(Header("", library)))
+        output.write(MAGIC + _record(Header("", library)))
 
     def register_schema(self, name: str, encoding: str, data: bytes) -> int:
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
@@ -153,7 +138,7 @@ class McapWriter:
         Pieces are bytes, or views of bytes that do not change.
         """
         size = sum(map(len, pieces))
-        head = _MESSAGE.pack(
+        head = MESSAGE.pack(
             Opcode.MESSAGE, _MESSAGE_FIELDS + size, channel, number & 0xFFFFFFFF, log_time, publish_time
         )
         self._chunk.put_message(channel, log_time, head, *pieces)
@@ -197,7 +182,7 @@ class McapWriter:
         footer = _record(Footer(start, offsets_start, 0))
         # The checksum covers the summary, and the footer up to the checksum itself.
         checked = zlib.crc32(footer[:-4], zlib.crc32(text, checked))
-        self._output.write(footer[:-4] + struct.pack("<I", checked) + _MAGIC)
+        self._output.write(footer[:-4] + struct.pack("<I", checked) + MAGIC)
         self._output.flush()
 
     def _summary(self) -> Iterator[tuple[Opcode, Iterable[bytes]]]:

@@ -23,14 +23,9 @@ class Output:
 
     What is written has been handed to the operating system: it survives the end of the program, however
     it ends, but not a power cut in the next half minute. As long as it is open it is locked, so that no other
-    recorder takes it.
+    recorder takes it. A file that it is to replace stays until `appear`.
 
-    Args:
-        path: The file.
-        overwrite: Replace a file of that name; it stays until `appear`.
-
-    Raises:
-        BadValue: The file is there already, is being recorded, or cannot be made.
+    Raises BadValue if the file is there already, is being recorded, or cannot be made.
     """
 
     def __init__(self, path: FilePath, *, overwrite: bool) -> None:
@@ -80,8 +75,7 @@ class Output:
     def appear(self) -> None:
         """Take the place of the file that is to be replaced. Programs that read that one go on with it.
 
-        Raises:
-            BadValue: It is being recorded by now, or the directory cannot be written.
+        Raises BadValue if it is being recorded by now, or the directory cannot be written.
         """
         if self._part is not None:
             self._refuse_recorded()
@@ -105,11 +99,7 @@ class Output:
         return self._written + self._waiting
 
     def flush(self) -> None:
-        """Write all pieces; if that fails, the file ends where it did before, and OSError is raised.
-
-        Raises:
-            FileGone: It is not the file any more that was written until now.
-        """
+        """Write all pieces; if that fails, the file ends where it did before, and OSError is raised."""
         self._check()
         pieces, self._pieces, self._waiting = self._pieces, [], 0
         done = 0

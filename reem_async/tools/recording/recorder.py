@@ -23,13 +23,12 @@ from ...concurrency.streams import arrived
 from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
-from ...plan.paths import Path, parse_patterns
+from ...plan.paths import parse_patterns
 from ...pubsub.finder import find_regularly
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...session import Session
 from .format import RecordingFailed, Role
-from .key_recorder import KeyRecorder
 from .output import FileGone
 from .recorded_keys import RecordedKeys
 from .sample import Sample, Sampler, samples_of
@@ -145,10 +144,12 @@ class Recorder:
         tops = self._keys.tops
         self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
         if self._monitor is not None:
-            self._monitor.invalidated = lambda name: self._key_recorder(name).lost(None)
+            self._monitor.invalidated = lambda name: self._keys.of(name).lost(None)
             self._monitor.resynchronised = self._keys.lost
             self._monitor.changed = self._keys.changed
-        self._sampler = Sampler(self.session, self._samples, self._sampled)
+        self._sampler = Sampler(
+            self.session, self._samples, lambda path, *read: self._keys.of(str(path[0])).sampled(path, *read)
+        )
         self._tasks: list[asyncio.Task[None]] = []
         self._begun = self._ended = 0.0
         self._dropped = 0
@@ -175,11 +176,11 @@ class Recorder:
                 await self._monitor.watch_changes()
                 self._begin(self._listen)
                 for name in await self._keys.present():
-                    self._key_recorder(name).read()
-                await self._settled(_PATIENCE)
+                    self._keys.of(name).read()
+                await self._keys.settled(_PATIENCE)
+                self._begin(lambda: find_regularly(self._search))
             self._sampler.start()
             self._begin(self._tick)
-            self._begin(lambda: find_regularly(self._search))
             await self._appear()
         except BaseException:
             await self._end()
@@ -216,7 +217,7 @@ class Recorder:
             with contextlib.suppress(RedisError, OSError):  # no connection: what has arrived is all there is
                 await self.fence()
             self._pump()
-            await self._settled(_PATIENCE)
+            await self._keys.settled(_PATIENCE)
             await self._look_once_more()
             await self._complete(time.monotonic() + _PATIENCE)
             self._keyframe_of_all()
@@ -293,20 +294,14 @@ class Recorder:
     async def _listen(self) -> None:
         assert self._monitor is not None
         async for event in self._monitor:
-            self._key_recorder(event.name).on_event(event)
+            self._keys.of(event.name).on_event(event)
             if self._monitor.batches_messages:
                 give_way()
 
     def _pump(self) -> None:
         """Take the updates that have arrived already."""
         for event in arrived(self._monitor) if self._monitor is not None else ():
-            self._key_recorder(event.name).on_event(event)
-
-    def _key_recorder(self, name: str) -> KeyRecorder:
-        return self._keys.of(name)
-
-    def _sampled(self, path: Path, value: Any, size: int) -> None:
-        self._key_recorder(str(path[0])).sampled(path, value, size)
+            self._keys.of(event.name).on_event(event)
 
     async def fence(self) -> None:
         """Wait until everything published before now has been handed to the key recorders."""
@@ -333,14 +328,11 @@ class Recorder:
     def _connected(self) -> bool:
         return self._monitor is not None and self._monitor.connected
 
-    async def _settled(self, patience: float) -> None:
-        await self._keys.settled(patience)
-
     async def _complete(self, deadline: float) -> None:
         """Read again what was dropped at the last moment: the file is to end with what is there."""
         writer = self.writer_thread
         while self._connected and writer.failure is None and time.monotonic() < deadline:
-            await self._settled(deadline - time.monotonic())  # also what `_tick` has begun
+            await self._keys.settled(deadline - time.monotonic())  # also what `_tick` has begun
             # What could not be written is known when all was taken from the queue, and not earlier.
             if not writer.waiting and not writer.behind:
                 return
@@ -360,7 +352,7 @@ class Recorder:
             self._catch_up()
             if time.monotonic() >= due:
                 due += self._keyframe_seconds * max(1, (time.monotonic() - due) // self._keyframe_seconds + 1)
-                if not self.hears_of_changes:
+                if self._monitor is not None and not self.hears_of_changes:
                     with contextlib.suppress(RedisError, OSError):
                         await self._look()
                 self._keyframe_of_all()
@@ -369,12 +361,8 @@ class Recorder:
         """Follow new keys, if the server reports changes: else keys are read at each keyframe."""
         with contextlib.suppress(RedisError, OSError):  # no connection now: it is made again
             if self.hears_of_changes:
-                await self._find()
+                self._keys.follow(await self._keys.present())
         return True
-
-    async def _find(self) -> None:
-        if self._monitor is not None:
-            self._keys.follow(await self._keys.present())
 
     def _catch_up(self) -> None:
         """Read the keys again of which something is missing, if there is room for it."""
@@ -383,7 +371,7 @@ class Recorder:
             for name in list(self.writer_thread.behind):
                 self.writer_thread.behind.discard(name)
                 if self._keys.concerns(name):
-                    self._key_recorder(name).read()
+                    self._keys.of(name).read()
 
     def look_for_losses(self) -> None:
         """Note updates that were dropped before they were taken: they may be of any key."""
@@ -398,19 +386,17 @@ class Recorder:
         if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
                 if self.hears_of_changes:
-                    await self._find()
+                    self._keys.follow(await self._keys.present())
                     self._keys.look_at_once()
-                    await self._settled(_PATIENCE)
+                    await self._keys.settled(_PATIENCE)
                 else:
                     self._keys.be_due()
                     await self._look()
 
     async def _look(self) -> None:
         """Read keys of which no server reports whether they were stored since the last keyframe."""
-        if self._monitor is None:
-            return
         self._keys.read_silent(await self._keys.present())
-        await self._settled(_PATIENCE)
+        await self._keys.settled(_PATIENCE)
 
     def _keyframe_of_all(self) -> None:
         self._keyframes += 1

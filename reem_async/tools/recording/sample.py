@@ -37,11 +37,7 @@ def samples_of(given: dict[str, float] | str | FilePath | None) -> list[Sample]:
 
 
 def read_key_file(file: str | FilePath) -> list[Sample]:
-    """Return the samples that a key file asks for: a line `path, seconds` for each; `#` begins a comment.
-
-    Raises:
-        BadValue: The file cannot be read, or a line is not of this form; says which.
-    """
+    """Return the samples that a key file asks for: a line `path, seconds` for each; `#` begins a comment."""
     try:
         # utf-8-sig: spreadsheets put a byte order mark at the beginning.
         text = FilePath(file).read_text(encoding="utf-8-sig")
@@ -85,14 +81,7 @@ def sample(path: str, period: float) -> Sample:
 class Sampler:
     """Reads paths at their periods, counted from one beginning, so that they do not drift.
 
-    Args:
-        session: The server.
-        samples: What to read.
-        take: Called with each path, what was there (MISSING if nothing was) and its bytes.
-
-    Attributes:
-        late: How many readings were left out since the one before took too long.
-        failed: How many failed.
+    `take` gets each path, what was there (MISSING if nothing was) and its bytes.
     """
 
     def __init__(self, session: Session, samples: Iterable[Sample], take: Callable[[Path, object, int], None]) -> None:
@@ -100,7 +89,7 @@ class Sampler:
         self._samples = list(samples)
         self._take = take
         self._tasks: list[asyncio.Task[None]] = []
-        self.late = 0
+        self.late = 0  # readings that were left out since the one before took too long
         self.failed = 0
 
     def start(self) -> None:

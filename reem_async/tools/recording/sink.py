@@ -54,15 +54,7 @@ class FullError(Exception):
 class Sink:
     """Writes messages of a recording. Belongs to one thread.
 
-    Args:
-        path: The file.
-        compression: "zstd", "lz4" or "none".
-        overwrite: Replace a file of that name.
-        metadata: What is said of the recording at its beginning.
-
-    Raises:
-        BadValue: The file is there already or cannot be made; an unknown compression.
-        RecordingFailed: It cannot be written.
+    Raises BadValue if the file is there already or cannot be made, and RecordingFailed if it cannot be written.
     """
 
     def __init__(self, path: FilePath, compression: str, metadata: Mapping[str, str], *, overwrite: bool) -> None:

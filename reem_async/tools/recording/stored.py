@@ -18,7 +18,7 @@ from ...plan.trees import MISSING, changed, difference, get, is_addressable, map
 from .contents import Content
 from .format import Kind, Role
 
-LONGEST_INLINE = 64
+_LONGEST_INLINE = 64
 """Numbers up to which an array or a list stays in the JSON: viewers draw a curve for each of them."""
 
 LOST = "lost"
@@ -27,27 +27,19 @@ LOST = "lost"
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A value in a message of its own.
+    """A value in a message of its own, at a full path and a log time in ns.
 
-    Attributes:
-        label: "numpy", "bytes", "list" (a list of numbers, stored as an array), or a custom ship's label.
-        path: The full path under which it was written.
-        at: The log time of its message, in ns.
-        size: Its bytes.
-        summary: What it is, for people: "uint8[480,640,3]".
-        dtype: The dtype of an array, for people.
-        shape: The shape of an array, None for anything else.
-        content: Its bytes, or a digest of them, to tell whether it has changed; not in the file.
-        numbers: While it is recorded, the numbers of a list: one of them may be updated.
+    While it is recorded, it also has what is not in the file: its content, to tell whether it has changed, and the
+    numbers of a list, one of which may be updated.
     """
 
-    label: str
+    label: str  # "numpy", "bytes", "list" (a list of numbers, stored as an array), or a custom ship's label
     path: Path
     at: int
     size: int
-    summary: str = ""
+    summary: str = ""  # for people: "uint8[480,640,3]"
     dtype: str = ""
-    shape: tuple[int, ...] | None = None
+    shape: tuple[int, ...] | None = None  # of an array
     content: Content | None = field(default=None, compare=False, repr=False)
     numbers: np.ndarray[Any, Any] | None = field(default=None, compare=False, repr=False)
 
@@ -58,25 +50,16 @@ class Reference:
 
 
 class Unchanged:
-    """An attachment that was not read again, since the server says that it was not changed. Stands in what is read.
-
-    Attributes:
-        written: What stands for it in trees; None until the writing thread has met its value.
-    """
+    """An attachment that was not read again, since the server reported no change of it."""
 
     __slots__ = ("written",)
 
     def __init__(self) -> None:
-        self.written: Any = None
+        self.written: Any = None  # what is in trees for it, once the writing thread has written its value
 
 
 class New(NamedTuple):
-    """An attachment that was read. Stands in what is read, for the next reads to know what was written for it.
-
-    Attributes:
-        value: What the ship made of it.
-        later: What stands in its place in later reads.
-    """
+    """An attachment that was read, and what is in its place in later reads."""
 
     value: Any
     later: Unchanged
@@ -106,12 +89,12 @@ Store = Callable[[str, Path, Any], Reference]
 """Writes a value (its label, its full path, itself) as a message and returns what stands for it."""
 
 
-def is_inline(array: np.ndarray[Any, Any], longest: int = LONGEST_INLINE) -> bool:
+def is_inline(array: np.ndarray[Any, Any]) -> bool:
     """Return whether an array is a few plain numbers, which viewers want to plot."""
-    return array.size <= longest and array.dtype.kind in "biuf"
+    return array.size <= _LONGEST_INLINE and array.dtype.kind in "biuf"
 
 
-def extract(value: Any, path: Path, store: Store, longest: int = LONGEST_INLINE) -> Any:
+def extract(value: Any, path: Path, store: Store) -> Any:
     """Return `value`, at the full `path`, with everything that gets a message of its own replaced by `Reference`.
 
     Containers in which nothing was replaced are shared with `value`.
@@ -121,22 +104,22 @@ def extract(value: Any, path: Path, store: Store, longest: int = LONGEST_INLINE)
     """
     kind = type(value)
     if kind is New:
-        value.later.written = extract(value.value, path, store, longest)
+        value.later.written = extract(value.value, path, store)
         return value.later.written
     if kind is Unchanged:
         if value.written is None:
             raise NotWritten
         return value.written
     if kind is dict:
-        items = {key: extract(item, (*path, key), store, longest) for key, item in value.items()}
+        items = {key: extract(item, (*path, key), store) for key, item in value.items()}
         return items if any(items[key] is not item for key, item in value.items()) else value
     if kind is list:
         # A list of numbers goes as an array: as JSON it would take several times the room, and a curve for each number.
-        if len(value) > longest and (array := _numbers(value)) is not None:
+        if len(value) > _LONGEST_INLINE and (array := _numbers(value)) is not None:
             return store("list", path, array)
-        found = [extract(item, (*path, index), store, longest) for index, item in enumerate(value)]
+        found = [extract(item, (*path, index), store) for index, item in enumerate(value)]
         return found if any(new is not old for new, old in zip(found, value, strict=True)) else value
-    if kind in _PLAIN or (kind is np.ndarray and is_inline(value, longest)):
+    if kind in _PLAIN or (kind is np.ndarray and is_inline(value)):
         return value
     label = "numpy" if kind is np.ndarray else "bytes" if kind is bytes else ""
     return store(label, path, value)

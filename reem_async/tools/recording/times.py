@@ -35,11 +35,7 @@ AFTER = 1000
 
 
 def nanoseconds(instant: Any) -> int:
-    """Return an instant in ns since 1970; floats are rounded to microseconds.
-
-    Raises:
-        BadType, BadValue: Not an instant.
-    """
+    """Return an instant in ns since 1970; floats are rounded to microseconds."""
     if isinstance(instant, np.datetime64):
         return int(instant.astype("datetime64[ns]").astype(np.int64))
     if isinstance(instant, bool) or not isinstance(instant, int | float | np.integer | np.floating):
@@ -92,9 +88,6 @@ class Arrivals:
     The least time from a publisher's stamp to receiving is that of an update that did not wait; by as much as
     another took longer, it has waited. Clocks that differ do no harm: the result is never over `patience`
     before the update was taken, and never after.
-
-    Args:
-        patience: Seconds that updates may have waited.
     """
 
     def __init__(self, patience: float) -> None:

@@ -43,20 +43,12 @@ _NUMPY = NumpyShip()
 
 
 class Operation(NamedTuple):
-    """One thing to write.
-
-    Attributes:
-        role: What it says.
-        path: The full path.
-        value: What is there now; for a gap, how many updates were lost, None if unknown.
-        stamp: Log time and publish time in ns, and a number.
-        kind: Where it came from.
-    """
+    """One thing to write."""
 
     role: Role
     path: Path
-    value: Any
-    stamp: tuple[int, int, int]
+    value: Any  # what is there now; for a gap, how many updates were lost, None if unknown
+    stamp: tuple[int, int, int]  # log time and publish time in ns, and a number
     kind: Kind = Kind.PUBLISHED
 
 
@@ -72,47 +64,34 @@ class Counts:
         self.lost = 0
         self.by_path: collections.Counter[str] = collections.Counter()
 
-    def drop(self, path: Path, number: int = 1) -> None:
-        self.dropped += number
-        self._by_path(path, number)
+    def drop(self, path: Path) -> None:
+        self.dropped += 1
+        self._name(path)
 
-    def skip(self, path: Path, number: int = 1) -> None:
-        """Count updates that were announced, and whose values cannot be known any more."""
-        self.skipped += number
-        self._by_path(path, number)
+    def skip(self, path: Path) -> None:
+        """Count an update that was announced, and whose value cannot be known any more."""
+        self.skipped += 1
+        self._name(path)
 
     def lose(self, path: Path) -> None:
         """Count a value that cannot be recorded."""
         self.lost += 1
-        self._by_path(path, 1)
+        self._name(path)
 
-    def _by_path(self, path: Path, number: int) -> None:
+    def _name(self, path: Path) -> None:
         # Named are the first thousand; a program may publish under ever new names.
         if len(self.by_path) < 1000 or show(path) in self.by_path:
-            self.by_path[show(path)] += number
+            self.by_path[show(path)] += 1
 
 
 class WriterThread:
-    """Writes operations to a file on a thread of its own.
-
-    Args:
-        sink: The file.
-        ships: What makes bytes of custom types.
-        limit: Bytes that may wait.
-        patterns: What is recorded of each key, other than samples.
-
-    Attributes:
-        counts: What was written and what was not.
-        failure: Why writing ended, None while it goes on.
-        behind: Keys of which the tree kept here is not what the server has; the recorder reads and removes them.
-        stored: Keys of which something was written that was only stored; the recorder removes them.
-    """
+    """Writes operations to a file on a thread of its own; at most `limit` bytes wait."""
 
     def __init__(self, sink: Sink, ships: Ships, limit: int, patterns: Sequence[Pattern] = ()) -> None:
         self.counts = Counts()
         self.failure: Exception | None = None
-        self.behind: set[str] = set()
-        self.stored: set[str] = set()
+        self.behind: set[str] = set()  # keys to read again: the tree here is not what the server has
+        self.stored: set[str] = set()  # keys of which something was written that was only stored
         self._patterns = patterns
         self._sink = sink
         self._ships = ships
@@ -231,16 +210,28 @@ class WriterThread:
                 self._size -= size
 
     def _write(self, it: Operation) -> None:
-        if it.role == Role.STATISTICS:
-            self._sink.statistics(it.value, it.stamp)
-            return
-        if it.role == Role.FLUSH:
-            self._sink.tick(now=True)
-            self._flushed.set()
-            return
         try:
-            # A method for each role that is written.
-            getattr(self, f"_write_{it.role}")(it)
+            match it.role:
+                case Role.UPDATE:
+                    self._write_update(it)
+                case Role.DELETE:
+                    self._write_delete(it)
+                case Role.STATE:
+                    self._write_state(it)
+                case Role.STORED:
+                    self._write_stored(it)
+                case Role.KEYFRAME:
+                    self._write_keyframe(it)
+                case Role.SKIP:
+                    self._event(it, {"op": "skip", "path": show(it.path)})
+                case Role.GAP:
+                    self.counts.gaps += 1
+                    self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
+                case Role.STATISTICS:
+                    self._sink.statistics(it.value, it.stamp)
+                case Role.FLUSH:
+                    self._sink.tick(now=True)
+                    self._flushed.set()
         except FullError:  # reading it again would not help
             self._lose_for_good(it.path)
         except NotWritten:
@@ -258,7 +249,6 @@ class WriterThread:
             )
 
     def _fall_behind(self, name: str) -> None:
-        """Note that the tree of a key lacks something."""
         self.behind.add(name)
         self._lacking.add(name)
 
@@ -297,13 +287,6 @@ class WriterThread:
             return
         self._keep(name, without(before, rest, it.kind))
         self._event(it, {"op": "delete", "path": show(it.path)})
-
-    def _write_skip(self, it: Operation) -> None:
-        self._event(it, {"op": "skip", "path": show(it.path)})
-
-    def _write_gap(self, it: Operation) -> None:
-        self.counts.gaps += 1
-        self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
 
     def _event(self, it: Operation, text: dict[str, Any]) -> None:
         self._count(self._sink.json(it.path, it.role, it.kind, JsonMessage(text, wrapped=False), it.stamp))
