@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
+from reem_async.connection import RedisInterface
+from reem_async.legacy import convert
+from reem_async.legacy.convert import Migrated, Migration
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
 from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar
 from reem_async.tools.cli.running import FAILED, guarded, run
-
-if TYPE_CHECKING:
-    from reem_async.connection import RedisInterface
-    from reem_async.legacy.convert import Migrated, Migration
 
 
 def migrate(
@@ -45,11 +44,9 @@ def migrate(
         given = named_ships(ships)
 
     async def work(interface: RedisInterface) -> int:
-        from reem_async.legacy.convert import migrate as convert
-
         with progress_bar(after=0.0) as bar:
             tell = None if as_json else bar("convert" if yes else "check")
-            done = await convert(interface, match, dry_run=not yes, progress=tell)
+            done = await convert.migrate(interface, match, dry_run=not yes, progress=tell)
         _show(done, as_json)
         return FAILED if done.problems else 0
 

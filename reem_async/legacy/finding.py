@@ -20,21 +20,13 @@ _SECOND = METADATA.encode()
 
 @dataclass
 class OldKey:
-    """One old top-level key.
+    """One old top-level key."""
 
-    Attributes:
-        name: The key, without namespace.
-        places: The places of ships' values, and the ships' labels; None if there is no second document.
-        rooted: Whether its value is no dict and was stored in one.
-        stale: Redis keys of arrays that old programs have replaced, and left behind.
-        lost: Redis keys of other arrays that are in no document; see `Migrated`.
-    """
-
-    name: str
-    places: dict[str, str] | None = None
-    rooted: bool = False
-    stale: list[str] = field(default_factory=list)
-    lost: list[str] = field(default_factory=list)
+    name: str  # without namespace
+    places: dict[str, str] | None = None  # of ships' values, with labels; None if there is no second document
+    rooted: bool = False  # its value is no dict and was stored in one
+    stale: list[str] = field(default_factory=list)  # Redis keys of arrays that old programs have left behind
+    lost: list[str] = field(default_factory=list)  # Redis keys of other arrays that are in no document, see `Migrated`
 
     @property
     def misread(self) -> bool:
@@ -45,13 +37,7 @@ class OldKey:
 async def find(session: Session, *, stale: bool = True) -> list[OldKey]:
     """Return the old keys of a session's namespace, sorted; two round trips for about 1000 keys of the server.
 
-    Args:
-        session: The server.
-        stale: Find arrays that were left behind too, by another SCAN.
-
-    Raises:
-        ClusterNode: The server is one node of several.
-        NotAllowed: This user may not search for arrays that were left behind.
+    `stale` finds arrays that were left behind, too, by another SCAN.
     """
     found: dict[str, OldKey] = {}
     async for names in _pages(session, DOCUMENT):

@@ -69,9 +69,7 @@ def _description(dtype: str) -> str:
 class Tree:
     """A document into which the values of old ships are put.
 
-    Args:
-        holder: The document in a list of one, an empty list if there is none.
-        kept: Container and key of each value of a new ship, which stays.
+    The holder is a list of the document, empty if there is none. The values of new ships in `kept` stay.
     """
 
     def __init__(self, holder: list[Any], kept: list[tuple[Any, Any]]) -> None:

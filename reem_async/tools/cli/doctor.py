@@ -18,6 +18,7 @@ import typer
 from reem_async._installation import CURE, original_reem
 from reem_async.connection import RedisInterface
 from reem_async.errors import BadKey, NoJsonSupport, RedisError, ReemError
+from reem_async.legacy.finding import find
 from reem_async.local.host import reason_against
 from reem_async.local.segment import Segment
 from reem_async.plan.attachments import orphans, remove_orphans
@@ -230,8 +231,6 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
 
 async def _old_data(interface: RedisInterface) -> Finding:
     """Count the keys of the namespace that are of versions before 1.0, on all servers."""
-    from reem_async.legacy.finding import find
-
     try:
         return checks.old_data([key.name for key in await find(interface.session, stale=False) if key.misread])
     except RedisError as error:

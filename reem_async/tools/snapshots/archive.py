@@ -135,11 +135,7 @@ class ArchiveWriter:
 
 
 def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Read the whole file and compare its digest; `progress` is called with the bytes done and the total.
-
-    Raises:
-        BadData: The file was cut or changed, or is no portable snapshot.
-    """
+    """Read the whole file and compare its digest; raises BadData if it was cut or changed."""
     total = path.stat().st_size
     # All but the digest itself, then zeros in its place: what the writer has counted.
     digest, left = hashlib.sha256(), total - len(_ZEROS)
@@ -159,11 +155,7 @@ def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> No
 
 
 class Archive:
-    """A portable snapshot open for reading; use it in a `with` block.
-
-    Raises:
-        BadData: It is none, or its index is damaged; `verify` checks the rest.
-    """
+    """A portable snapshot open for reading. Raises BadData if its index is damaged; `verify` checks the rest."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -85,12 +85,7 @@ class Snapshot:
 
 
 def sniff(path: Path) -> str:
-    """Return "portable" or "rdb", by what the file begins with.
-
-    Raises:
-        BadData: It is neither.
-        OSError: It cannot be read.
-    """
+    """Return "portable" or "rdb", by what the file begins with; raises BadData."""
     with path.open("rb") as file:
         head = file.read(64)
     # A zip file's first member: its name stands 30 bytes after the signature.

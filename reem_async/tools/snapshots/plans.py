@@ -23,17 +23,11 @@ _WORDS = 1000
 
 
 class Value(NamedTuple):
-    """What a ship holds under a key of its own.
+    """What a ship holds under a key of its own."""
 
-    Attributes:
-        suffix: The key's name after the tag.
-        kind: Its Redis type, as TYPE says it.
-        pieces: Its content as byte strings: one for a string, several for what has parts.
-    """
-
-    suffix: str
-    kind: str
-    pieces: tuple[Any, ...]
+    suffix: str  # of the key's name, after the tag
+    kind: str  # the Redis type
+    pieces: tuple[Any, ...]  # byte strings: one for a string, several for what has parts
 
     @property
     def size(self) -> int:
@@ -41,23 +35,14 @@ class Value(NamedTuple):
 
 
 class KeyContent(NamedTuple):
-    """One top-level key at one instant.
+    """One top-level key at one instant."""
 
-    Attributes:
-        name: The key, without namespace.
-        text: The document's JSON, as the server sent it.
-        registry: The suffixes the registry names, sorted.
-        values: What the ships hold.
-        expires: Milliseconds until the key expires; None if it does not.
-        missing: The suffixes of ships' keys that the document refers to and that are not there.
-    """
-
-    name: str
-    text: bytes
-    registry: tuple[str, ...]
+    name: str  # without namespace
+    text: bytes  # the document's JSON, as the server sent it
+    registry: tuple[str, ...]  # suffixes, sorted
     values: tuple[Value, ...]
-    expires: int | None = None
-    missing: tuple[str, ...] = ()
+    expires: int | None = None  # in milliseconds
+    missing: tuple[str, ...] = ()  # suffixes of ships' keys that the document refers to and that are not there
 
     @property
     def size(self) -> int:
@@ -65,17 +50,11 @@ class KeyContent(NamedTuple):
 
 
 class RedisType(NamedTuple):
-    """How one Redis type is read and made again.
+    """How one Redis type is read and made again."""
 
-    Attributes:
-        read: The words of the command that fetches all of it, without the key, which comes second.
-        pieces: Turns the reply into byte strings.
-        write: Returns the commands that make it under an empty key.
-    """
-
-    read: Command
-    pieces: Callable[[Reply], Sequence[Any]]
-    write: Callable[[str, Sequence[Any]], list[Command]]
+    read: Command  # without the key, which comes second
+    pieces: Callable[[Reply], Sequence[Any]]  # turns the reply into byte strings
+    write: Callable[[str, Sequence[Any]], list[Command]]  # makes it under an empty key
 
 
 def redis_type(name: str, place: str) -> RedisType:
@@ -95,9 +74,6 @@ def settable(text: bytes) -> bytes:
 
     The server reads long decimals with one rounding too many, so its own text given back changes one
     float in ten. Floats that no text carries become the string that REEM's readers take for a float.
-
-    Raises:
-        BadData: Not JSON.
     """
     try:
         tree = orjson.loads(text)
@@ -241,11 +217,6 @@ def dump(keys: Keys) -> Plan:
 
     One round trip for a document without arrays, else two; more if its shape changes in between: a mixture is never
     returned. None: nothing is stored there.
-
-    Raises (in decode):
-        WrongKind: Something other than a document is under the key.
-        BadData: A ship keeps its value in a Redis type that cannot be saved.
-        Conflict: The shape changed 50 times in between.
     """
     return _dump(keys, {}, _TRIES)
 
@@ -318,19 +289,8 @@ def put(
 ) -> Plan:
     """Plan to store a top-level key, with all that belongs to it and the notice, in one transaction.
 
-    Two round trips; more if another client writes to the key between them.
-
-    Args:
-        keys: Where to.
-        content: What.
-        cache: What is known of the server.
-        replace: Whether an existing key may be replaced.
-        notices: Makes the commands that notify subscribers; called once, when the write is certain.
-
-    Raises (in decode):
-        Conflict: A document exists and `replace` is False. Nothing was written.
-        WrongKind: A foreign Redis type exists there. Nothing was written.
-        PartialWrite: The server refused a part.
+    Two round trips; more if another client writes to the key between them. `notices` makes the commands that notify
+    subscribers; it is called once, when the write is certain.
     """
     return _Put(keys, content, cache, replace, notices).plan()
 

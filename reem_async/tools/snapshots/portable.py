@@ -296,20 +296,13 @@ Wanted = Callable[[str], bool]
 
 
 class Survey:
-    """What was found in the namespace of one session.
-
-    Attributes:
-        names: The top-level keys, sorted.
-        seen: All keys that the servers named, foreign ones too.
-        unsaved: The top-level keys, and arrays, that could not be saved, and why.
-        doubt: Why keys may be missing, for people; empty if the servers hold no more keys than they named.
-    """
+    """What was found in the namespace of one session."""
 
     def __init__(self) -> None:
-        self.names: list[str] = []
-        self.seen: set[bytes] = set()
-        self.unsaved: dict[str, str] = {}
-        self.doubt = ""
+        self.names: list[str] = []  # of top-level keys
+        self.seen: set[bytes] = set()  # all keys that the servers named, foreign ones too
+        self.unsaved: dict[str, str] = {}  # top-level keys, and arrays, that could not be saved, and why
+        self.doubt = ""  # why keys may be missing, for people
         self._tagged: dict[str, set[bytes]] = {}  # what carries a key's tag: suffixes by name, until it is known whose
         self._foreign: list[str] = []
 
@@ -357,11 +350,7 @@ class Survey:
 
 
 def matcher(match: str) -> Wanted:
-    """Return what tells whether a top-level key matches; `*` and `?` stand for other characters.
-
-    Raises:
-        BadKey: Not a pattern of a top-level key.
-    """
+    """Return what tells whether a top-level key matches; raises BadKey."""
     pattern = Pattern(check_top_key(match))
     return lambda name: pattern.concerns((name,))
 
