@@ -22,8 +22,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["json_text"]
-
 
 def json_text(value: Any, *, pretty: bool = False) -> str:
     """Return a value as JSON, in one line, or indented if `pretty`; it may contain half of a surrogate pair."""

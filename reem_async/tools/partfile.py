@@ -17,8 +17,6 @@ try:
 except ModuleNotFoundError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
-__all__ = ["Lock", "PartFile", "is_locked", "lock", "there_already"]
-
 _NAME = re.compile(r"\..*\.[0-9a-f]{8}\.reem\.part", re.DOTALL)
 _LONGEST = 200
 """Bytes of a target's name in that of the hidden file: file systems take 255 in all."""
@@ -44,11 +42,8 @@ class Lock(enum.Enum):
 def lock(descriptor: int, *, shared: bool = False) -> Lock:
     """Lock an open file until it is closed, also by the end of the program.
 
-    Other programs may read and write it nevertheless: only those that ask are told.
-
-    Args:
-        descriptor: It, open for writing; for reading if `shared`: NFS refuses other locks of what is open for reading.
-        shared: Together with others that ask so. Whoever only looks whether a writer has it asks so.
+    Other programs may read and write it nevertheless. A `shared` lock, with which one only looks whether a writer has
+    it, is for a file that is open for reading: NFS refuses other locks of such a file.
     """
     if fcntl is None:
         return Lock.NONE
@@ -83,25 +78,14 @@ def there_already(path: Path) -> FileExistsError:
 class PartFile:
     """A file that gets the name `target` when it is whole, or never; until then it is hidden beside it.
 
-    If `target` is a link, it stays one, and the file gets the name that it leads to.
+    If `target` is a link, it stays one, and the file gets the name that it leads to. With `replace` it may take the
+    place of a file of that name, and is readable by nobody who could not read that one.
 
     Making one removes those in the same directory whose program was killed.
-
-    Args:
-        target: The name.
-        replace: Whether it may take the place of a file that has that name by then. It is readable by nobody who
-            could not read that one.
-
-    Attributes:
-        path: The hidden file.
-        descriptor: It, open for reading and writing, and locked; -1 once it is closed.
-
-    Raises:
-        OSError: It cannot be made.
     """
 
     def __init__(self, target: Path, *, replace: bool = False) -> None:
-        self.descriptor = -1
+        self.descriptor = -1  # of the hidden file: open for reading and writing, and locked
         target = Path(os.path.realpath(target))  # unlike `resolve`, it takes a circle of links
         _remove_abandoned(target.parent)
         self._target = self.path = target
@@ -123,9 +107,7 @@ class PartFile:
     def appear(self) -> None:
         """Give the file its name; it stays open and locked.
 
-        Raises:
-            FileExistsError: There is a file of that name by now, and it may not be replaced.
-            OSError: The directory cannot be written.
+        Raises FileExistsError if there is a file of that name by now, and it may not be replaced.
         """
         if self._replace:
             self.path.replace(self._target)

@@ -29,26 +29,16 @@ these names."""
 
 
 class Export:
-    """What became of an export.
-
-    Attributes:
-        rows: Rows written, or instants of all paths together.
-        columns: What was written, by name.
-        left_out: What this format cannot hold, by path, and why.
-        time: The name of the column of instants: "time", unless there is a path of this name.
-        deleted: The name of the column of paths that were deleted, "" if there is none.
-        stored: The name of the column of paths that were only stored, "" if there is none.
-        unreadable: How many updates were left out, since they are damaged or of a type that was not recorded.
-    """
+    """What became of an export."""
 
     def __init__(self) -> None:
-        self.rows = 0
+        self.rows = 0  # or instants of all paths together
         self.columns: list[str] = []
-        self.left_out: dict[str, str] = {}
-        self.time = "time"
+        self.left_out: dict[str, str] = {}  # what this format cannot hold, by path, and why
+        self.time = "time"  # the names of special columns: another name if there is a path of this one
         self.deleted = ""
         self.stored = ""
-        self.unreadable = 0
+        self.unreadable = 0  # updates that were left out, since they are damaged or of a type that was not recorded
 
     def begin(self, columns: Iterable[str]) -> None:
         """Take the names of the columns, with those for what was deleted or only stored; BadValue if there is no other.
@@ -155,16 +145,24 @@ def _name(path: Path) -> str:
     return suffix(path).removeprefix(".")
 
 
-def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
-    """Write rows; the columns must be known first, so it is read twice."""
-    columns: dict[str, None] = {}
+def _columns(log: Log, patterns: Sequence[str], result: Export) -> dict[str, set[type]]:
+    """Take the columns of all rows, which must be known before the first row; return the types in each.
+
+    The rows are read again to be written, with another `Export`: this pass has counted what is left out.
+    """
+    kinds: dict[str, set[type]] = {}
     for _, cells in _rows(log, patterns, result):
-        columns.update(dict.fromkeys(cells))
-    result.unreadable = log.unreadable  # the second time it is counted again
-    result.begin(columns)
+        for name, value in cells.items():
+            kinds.setdefault(name, set()).add(_kind(value))
+    result.unreadable = log.unreadable
+    result.begin(kinds)
+    return kinds | {result.deleted: {str}, result.stored: {str}}
+
+
+def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
+    _columns(log, patterns, result)
     with target.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        # Another Export below: what is left out was counted by the first pass.
         writer.writerow([result.time, *result.columns])
         for time, cells in _rows(log, patterns, Export()):
             result.rows += 1
@@ -178,15 +176,8 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
         parquet: Any = import_module("pyarrow.parquet")
     except ModuleNotFoundError:
         raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
-    kinds: dict[str, set[type]] = {}
-    for _, cells in _rows(log, patterns, result):
-        for name, value in cells.items():
-            kinds.setdefault(name, set()).add(_kind(value))
-    result.unreadable = log.unreadable  # the second time it is counted again
-    result.begin(kinds)
-    kinds |= {result.deleted: {str}, result.stored: {str}}
     # None stands for an empty cell in every type.
-    forms = {name: _form(found - {type(None)}) for name, found in kinds.items()}
+    forms = {name: _form(found - {type(None)}) for name, found in _columns(log, patterns, result).items()}
     arrow = {
         bool: pyarrow.bool_(),
         int: pyarrow.int64(),

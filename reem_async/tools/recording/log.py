@@ -21,7 +21,7 @@ from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
 from ...store.catalog import Outline
 from ...transport.packing import CommandRecorder
-from .container import Container, Ref, Totals
+from .container import Container, Ref
 from .format import Role
 from .log_reader import RecordedPast, RecordedStream
 from .stored import LOST, Reference, pruned, resolve
@@ -266,11 +266,7 @@ class Log:
         except ValueError:  # all of it is damaged
             self._past.unreadable += 1
             return MISSING
-        return self._readable(pruned(tree, (name,), [parse_pattern(text) for text in patterns]))
-
-    def _readable(self, tree: Any) -> Any:
-        """Return a past tree without what cannot be read, which is counted; MISSING if that is all of it."""
-        return resolve(tree, self._whole)
+        return resolve(pruned(tree, (name,), [parse_pattern(text) for text in patterns]), self._whole)
 
     def _whole(self, tree: Any) -> Any:
         """Return a past tree; MISSING, and it is counted, if something in it cannot be read."""
@@ -338,7 +334,9 @@ class Log:
 
         Each was so large that it was only announced, and others replaced or changed it before it could be read.
         """
-        return [(seconds(ref.time), show(it.path), self._past.stamp(ref)[1]) for ref, it in self._past.skips()]
+        return [
+            (seconds(ref.time), show(it.path), self._past.stamp(ref)[1]) for ref, it in self._past.of_role(Role.SKIP)
+        ]
 
     def updates(
         self,
@@ -362,7 +360,7 @@ class Log:
         after = -1 if start is None else nanoseconds(start) - 1
         until = _END if end is None else nanoseconds(end)
         for ref, stream, value in self._news(after, until, patterns):
-            read = self._readable(value) if partial else self._whole(value)
+            read = resolve(value, self._whole) if partial else self._whole(value)
             if value is MISSING:
                 yield self._update(ref, stream, None, deleted=True)
             elif read is not MISSING:
@@ -396,9 +394,8 @@ class Log:
         The indexes of all chunks are read: about a second for half an hour of 1,000 keys. `progress` is called with the
         chunks done and all of them.
         """
-        found, totals = [], self._past.totals(progress)
-        for channel, stream, schema in self._past.channels():
-            messages, size, first, last = totals.get(channel.id, Totals())
+        found = []
+        for channel, stream, schema, (messages, size, first, last) in self._past.channels(progress):
             path, role, kind = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
             times = seconds(first), seconds(last)
             found.append(ChannelSummary(channel.topic, path, role, kind, schema, messages, size, *times))

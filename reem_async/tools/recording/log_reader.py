@@ -28,14 +28,7 @@ from .stored import LOST, Reference, applied, opened
 
 @dataclass(frozen=True, slots=True)
 class RecordedStream:
-    """What was recorded of one path in one role; several channels if its type changed.
-
-    Attributes:
-        path: The full path.
-        role: What its messages say.
-        kind: Where they came from.
-        channels: The channels, by number.
-    """
+    """What was recorded of one path in one role; several channels if its type changed."""
 
     path: Path
     role: Role
@@ -48,26 +41,13 @@ class _FoundDamage(Exception):
 
 
 class RecordedPast(Past[tuple[Ref, RecordedStream]]):
-    """The contents of a recording. Positions of changes are log times, in ns.
-
-    Args:
-        container: The file.
-        ships: What makes values of what is not JSON.
-
-    Attributes:
-        streams: All streams, by no order.
-        names: The streams of each top-level key.
-        unreadable: How many values were left out, since they are damaged or were not recorded.
-
-    Raises:
-        DamagedRecording: Not a recording of REEM.
-    """
+    """The contents of a recording. Positions of changes are log times, in ns."""
 
     def __init__(self, container: Container, ships: Ships) -> None:
         self._container = container
         self._ships = ships
         self._timeline = Timeline(container)
-        self.unreadable = 0
+        self.unreadable = 0  # values that were left out, since they are damaged or were not recorded
         self._has_skipped = False
         by_place: dict[tuple[Path, str, str], RecordedStream] = {}
         self._of_channel: dict[int, RecordedStream] = {}
@@ -254,14 +234,12 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         return {stream.path for stream in streams if stream.role in NEWS}
 
     def news_times(self, path: Path) -> Numbers:
-        """Return the log times of all news on what is at, above or below a path, sorted; uint64."""
         return self._timeline.times(self._news_channels(path))
 
     def news_count(self, path: Path, after: int, until: int) -> int:
         return sum(1 for _ in self._timeline.between(self._news_channels(path), after, until))
 
     def last_news(self, path: Path, until: int) -> int | None:
-        """Return the log time of the last news on a path until an instant, None if there was none."""
         newest = self._newest(self._concerning(path), until, -1)
         return None if newest is None else newest[0].time
 
@@ -321,16 +299,14 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def gaps(self) -> Iterator[tuple[Ref, RecordedStream, int | None]]:
         """Yield where updates were lost, and how many."""
         # A gap says how many were lost if their publisher's numbers told it.
-        channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.GAP]
-        for ref in self._timeline.between(channels, -1, 2**63 - 1):
+        for ref, stream in self.of_role(Role.GAP):
             message, missed = self._timeline.message(ref), None
             with contextlib.suppress(ValueError, TypeError, KeyError):
                 missed = orjson.loads(message.data)["missed"] if message is not None else None
-            yield ref, self._of_channel[ref.channel], missed if type(missed) is int else None
+            yield ref, stream, missed if type(missed) is int else None
 
-    def skips(self) -> Iterator[tuple[Ref, RecordedStream]]:
-        """Yield the updates whose values could not be had any more."""
-        channels = [channel for channel, stream in self._of_channel.items() if stream.role == Role.SKIP]
+    def of_role(self, role: Role) -> Iterator[tuple[Ref, RecordedStream]]:
+        channels = [channel for channel, stream in self._of_channel.items() if stream.role == role]
         for ref in self._timeline.between(channels, -1, 2**63 - 1):
             yield ref, self._of_channel[ref.channel]
 
@@ -339,15 +315,17 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         message = self._timeline.message(ref)
         return (message.publish_time, message.sequence) if message is not None else (0, 0)
 
-    def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
-        """Return how much each channel has; see `Timeline.totals`."""
-        return self._timeline.totals(progress)
-
-    def channels(self) -> Iterator[tuple[Channel, RecordedStream | None, str]]:
-        """Yield the channels, what they are for (None for none of REEM's), and the names of their schemas."""
+    def channels(self, progress: Progress | None) -> Iterator[tuple[Channel, RecordedStream | None, str, Totals]]:
+        """Yield the channels, what they are for (None for none of REEM's), their schemas' names, and what they have."""
+        totals = self._timeline.totals(progress)
         for channel in list(self._container.channels.values()):  # reading an index may find more of them
             schema = self._container.schemas.get(channel.schema_id)
-            yield channel, self._of_channel.get(channel.id), schema.name if schema else ""
+            yield (
+                channel,
+                self._of_channel.get(channel.id),
+                schema.name if schema else "",
+                totals.get(channel.id, Totals()),
+            )
 
 
 def _listed(metadata: Iterable[Metadata], names: set[str | int]) -> Iterator[str]:
