@@ -19,10 +19,10 @@ import numpy as np
 from ...concurrency.scheduling import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING, CannotApply, get, replaced, same
+from ...plan.trees import MISSING, CannotApply, get, replaced, same, walk
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .contents import Content, Recent
+from .contents import Content
 from .format import Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
 from .sink import FullError, Sink
@@ -110,7 +110,6 @@ class WriterThread:
         # that are gone are not in it.
         self._trees: dict[str, Any] = {}
         self._full = False  # there is no channel any more, which was said
-        self._recent = Recent()
         self._thread = threading.Thread(target=self._run, name="reem recorder", daemon=True)
 
     def start(self) -> None:
@@ -173,7 +172,6 @@ class WriterThread:
             # at once.
             while not self._take():
                 self._sink.tick()
-                self._recent.tick()
             self._sink.finish({**self._metadata, **self._summary()})
         except Exception as error:
             with self._changed:
@@ -329,6 +327,10 @@ class WriterThread:
         if tree is not MISSING:
             self._trees[str(it.path[0])] = tree
             self._keyframe(it, tree)
+            # Bytes that have stayed for so long will stay longer: from now on only a digest of them is kept.
+            for _, leaf in walk(tree, ()):
+                if type(leaf) is Reference and leaf.content is not None and leaf.numbers is None:
+                    leaf.content.digest()
 
     def _settled(self, it: Operation, tree: Any) -> Any:
         """Return a tree with the long lists in it, of which items were updated, as messages of their own again."""
@@ -361,8 +363,6 @@ class WriterThread:
             stored = _described(label, path, it.stamp[0], data, content)
             if type(old) is Reference and _is_same(stored, old):
                 return old
-            if stored.numbers is None:
-                self._recent.add(content)
             # A part belongs to an update or a state; an array that was published by itself is an update.
             role = Role.UPDATE if path == it.path and it.role == Role.UPDATE else Role.PART
             encoded = encode(label, data, show(path), it.stamp[1] or it.stamp[0])
