@@ -30,7 +30,6 @@ from reem_async.tools.cli.output import (
     size_text,
     styled,
 )
-from reem_async.tools.cli.record import tools
 from reem_async.tools.cli.running import USAGE, CommandFailed, run, run_local
 
 if TYPE_CHECKING:
@@ -80,9 +79,11 @@ def play(
     """
 
     async def work(interface: RedisInterface) -> int:
+        from reem_async.tools.recording import Replayer, open_log
+
         names = dict(_pair(text) for text in remap or ())
-        with tools("open_log")(file) as log:
-            replayer = tools("Replayer")(
+        with open_log(file) as log:
+            replayer = Replayer(
                 interface,
                 log,
                 rate=rate,
@@ -197,9 +198,11 @@ def info(
     """
 
     def work() -> int:
+        from reem_async.tools.recording import open_log
+
         with ExitStack() as stack:
             with progress_bar() as bar:
-                log = stack.enter_context(tools("open_log")(file, progress=bar("opening")))
+                log = stack.enter_context(open_log(file, progress=bar("opening")))
                 if verify:
                     log.verify(bar("checking"))
                 channels = log.channels(bar("counting"))
@@ -317,7 +320,7 @@ def export(
     """
 
     def work() -> int:
-        open_log = tools("open_log")
+        from reem_async.tools.recording import open_log
         from reem_async.tools.recording.export import export as write
 
         kind, to_stdout = _format(to, output), output == _STDOUT

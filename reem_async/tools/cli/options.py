@@ -151,7 +151,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace the file if it is 
 def existing(ctx: typer.Context, file: Path | None) -> Path | None:
     """End with exit code 3 if a file that is to be read is not there: a callback of options."""
     if file is not None and not file.exists():
-        raise typer.Exit(complain(ctx.info_name or "", f"{file}: No such file or directory", NOTHING))
+        raise typer.Exit(complain(ctx.command_path.partition(" ")[2], f"{file}: No such file or directory", NOTHING))
     return file
 
 

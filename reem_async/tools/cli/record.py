@@ -83,6 +83,8 @@ def record(
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
 
     async def work(interface: RedisInterface) -> int:
+        from reem_async.tools.recording import Recorder
+
         # Before the recorder is made: threads that it starts inherit the scheduling.
         try:
             if background:
@@ -97,7 +99,7 @@ def record(
         if output == Path("-"):
             raise BadValue("a recording is not text and is not written to the standard output; name a file with -o")
         # Refused here if the file is there already: nothing was sent for it yet.
-        recorder: Recorder = tools("Recorder")(
+        recorder = Recorder(
             interface, wanted, output, sample=sample, keyframe=keyframe, compression=compression, overwrite=force
         )
         # Whether there is a recording: Ctrl-C before that ends with 130 and leaves no file.
@@ -122,17 +124,6 @@ def record(
     with guarded("record"):
         own = named_ships(ships)
     run("record", work, url, namespace, ships=own)
-
-
-def tools(name: str) -> Any:
-    """Return a name of `reem_async.recording`; CommandFailed if what that needs is not installed."""
-    try:
-        from reem_async.tools import recording
-    except ModuleNotFoundError as error:
-        if "reem-async[tools]" not in str(error):
-            raise
-        raise CommandFailed(str(error)) from None
-    return getattr(recording, name)
 
 
 def _progress(recorder: Recorder, as_json: bool) -> AbstractAsyncContextManager[None]:

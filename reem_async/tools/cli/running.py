@@ -88,7 +88,7 @@ def guarded(name: str, *, live: bool = False) -> Iterator[None]:
         code = complain(name, for_users(error), NOTHING)
     except (BadInput, FileExistsError) as error:
         code = complain(name, for_users(error), USAGE)
-    except (ReemError, RedisError, OSError) as error:
+    except (ReemError, RedisError, OSError, ModuleNotFoundError) as error:  # what an extra brings is not installed
         code = complain(name, for_users(error), FAILED)
     raise typer.Exit(code)
 

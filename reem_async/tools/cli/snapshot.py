@@ -18,7 +18,7 @@ from reem_async.connection import RedisInterface
 from reem_async.errors import BadData, RedisError, ReemError
 from reem_async.tools import snapshots
 from reem_async.tools.cli.commands import help_text
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url, existing
 from reem_async.tools.cli.output import (
     clean,
     columns,
@@ -31,7 +31,7 @@ from reem_async.tools.cli.output import (
     size_text,
     styled,
 )
-from reem_async.tools.cli.running import FAILED, NOTHING, CommandFailed, for_users, guarded, run, run_local
+from reem_async.tools.cli.running import FAILED, for_users, run, run_local
 from reem_async.tools.snapshots import Progress, RdbUnavailable, Snapshot, described
 from reem_async.tools.snapshots.files import SUFFIXES, Pruned, dated, new_name, prune, sniff
 
@@ -106,7 +106,12 @@ def save(
       reem snapshot save -d /var/backups --every 10m --keep 24
       reem snapshot save --rdb -d /var/backups
     """
-    _check_options(file, directory, match, rdb=rdb, periodic=every is not None or keep is not None)
+    if file is not None and (directory is not None or every is not None or keep is not None):
+        raise typer.BadParameter(
+            "FILE cannot be combined with --directory, --every or --keep, which name files by time"
+        )
+    if rdb and match != "*":
+        raise typer.BadParameter("--rdb saves all of the server: leave out --match")
     # A file that is named by time has a name that is free.
     overwrite = force and file is not None
     saver = _Saver(file, directory or Path(), match, rdb, keep, overwrite, as_json)
@@ -115,15 +120,6 @@ def save(
         return await (saver.once(interface) if every is None else saver.by_period(interface, every))
 
     run("snapshot save", work, url, namespace, live=every is not None)
-
-
-def _check_options(file: Path | None, directory: Path | None, match: str, *, rdb: bool, periodic: bool) -> None:
-    if file is not None and (directory is not None or periodic):
-        raise typer.BadParameter(
-            "FILE cannot be combined with --directory, --every or --keep, which name files by time"
-        )
-    if rdb and match != "*":
-        raise typer.BadParameter("--rdb saves all of the server: leave out --match")
 
 
 @dataclass
@@ -236,7 +232,10 @@ class _Saver:
 
 def list_(
     path: Annotated[
-        Path, typer.Argument(metavar="PATH", show_default="here", help="A directory, or one snapshot to look into.")
+        Path,
+        typer.Argument(
+            metavar="PATH", callback=existing, show_default="here", help="A directory, or one snapshot to look into."
+        ),
     ] = Path(),
     check: Annotated[
         bool, typer.Option("--check", help="Read portable snapshots to their end to find damage; exit code 1 if any.")
@@ -254,7 +253,7 @@ def list_(
 
 
 def restore(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A portable snapshot.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", callback=existing, help="A portable snapshot.")],
     match: Match = "*",
     replace: Annotated[bool, typer.Option("--replace", help="Keys that are there may be replaced.")] = False,
     into: Annotated[str, typer.Option("--into", metavar="PREFIX", help="Goes before the name of each key.")] = "",
@@ -273,8 +272,6 @@ def restore(
       reem snapshot restore --replace --match 'arm*' before.zip
       reem snapshot restore --into old_ before.zip
     """
-    with guarded("snapshot restore"):
-        check_there(file)
 
     async def work(interface: RedisInterface) -> None:
         with _progress(shown=not as_json) as progress:
@@ -300,15 +297,8 @@ for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
     app.command(_name, help=help_text(_command.__doc__ or ""))(_command)
 
 
-def check_there(path: Path) -> None:
-    """Refuse a path at which nothing is."""
-    if not path.exists():
-        raise CommandFailed(f"{path}: there is no such file", NOTHING)
-
-
 def listed(path: Path, check: bool, as_json: bool) -> int:
     """Print the snapshots in a directory, or the keys in a file; returns the exit code."""
-    check_there(path)
     if path.is_file():
         _show_keys(described(path, check=check), as_json)
         return 0
