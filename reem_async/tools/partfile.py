@@ -5,17 +5,13 @@ from __future__ import annotations
 import contextlib
 import enum
 import errno
+import fcntl
 import os
 import re
 import secrets
 import stat
 import time
 from pathlib import Path
-
-try:
-    import fcntl
-except ModuleNotFoundError:  # Windows
-    fcntl = None  # type: ignore[assignment]
 
 _NAME = re.compile(r"\..*\.[0-9a-f]{8}\.reem\.part", re.DOTALL)
 _LONGEST = 200
@@ -24,9 +20,8 @@ _ABANDONED_SECONDS = 3600.0
 """Where there are no locks: a file that was not written to for so long is nobody's."""
 _AT_WORK_SECONDS = 10.0
 """Where there are no locks: a file that was written to since then has a writer. A recording has a keyframe each 5 s."""
-_FLAGS = getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 # Anybody may put a FIFO or a link into a shared directory: neither waits here, nor leads elsewhere.
-_OTHERS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | _FLAGS
+_OTHERS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 class Lock(enum.Enum):
@@ -36,7 +31,7 @@ class Lock(enum.Enum):
     TAKEN = enum.auto()
     """By another program, or elsewhere in this one."""
     NONE = enum.auto()
-    """There are no locks: Windows, and some file systems."""
+    """The file system has no locks."""
 
 
 def lock(descriptor: int, *, shared: bool = False) -> Lock:
@@ -45,8 +40,6 @@ def lock(descriptor: int, *, shared: bool = False) -> Lock:
     Other programs may read and write it nevertheless. A `shared` lock, with which one only looks whether a writer has
     it, is for a file that is open for reading: NFS refuses other locks of such a file.
     """
-    if fcntl is None:
-        return Lock.NONE
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except OSError as error:  # CIFS says EACCES of what is locked
@@ -62,8 +55,7 @@ def is_locked(path: Path) -> bool:
         return False
     try:
         found = lock(descriptor, shared=True)
-        # Windows has no locks either, but refuses itself to replace a file that is open.
-        return found is Lock.TAKEN or (found is Lock.NONE and fcntl is not None and _age(descriptor) < _AT_WORK_SECONDS)
+        return found is Lock.TAKEN or (found is Lock.NONE and _age(descriptor) < _AT_WORK_SECONDS)
     finally:
         os.close(descriptor)
 
@@ -95,7 +87,7 @@ class PartFile:
         name = os.fsencode(target.name)[:_LONGEST].decode(errors="ignore")
         while self.descriptor < 0:
             self.path = target.with_name(f".{name}.{secrets.token_hex(4)}.reem.part")
-            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | _FLAGS, 0o600 if old else 0o666)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600 if old else 0o666)
             # Before it was locked, another program may have taken it for abandoned.
             if lock(descriptor) is not Lock.TAKEN and os.fstat(descriptor).st_nlink:
                 self.descriptor = descriptor
@@ -120,9 +112,6 @@ class PartFile:
 
     def finish(self) -> None:
         """Give the file its name, and close it; raises as `appear` does."""
-        if fcntl is None:  # Windows renames no open file
-            os.close(self.descriptor)
-            self.descriptor = -1
         self.appear()
         self.close()
 
@@ -153,8 +142,6 @@ def _to_replace(target: Path) -> os.stat_result | None:
 
 def _make_as_private(descriptor: int, old: os.stat_result) -> None:
     """Let those read and write a new file, which only its owner may, who may do so with the old one."""
-    if fcntl is None:  # Windows
-        return
     mode = stat.S_IMODE(old.st_mode) & 0o777 | 0o600  # its owner is about to write it
     with contextlib.suppress(OSError):
         os.fchown(descriptor, -1, old.st_gid)
@@ -166,9 +153,6 @@ def _make_as_private(descriptor: int, old: os.stat_result) -> None:
 
 def _rename(part: Path, target: Path) -> None:
     """Give a file another name; FileExistsError if there is a file of that name."""
-    if fcntl is None:  # Windows refuses by itself
-        part.rename(target)
-        return
     try:
         target.hardlink_to(part)  # a rename would replace what came to be meanwhile
     except FileExistsError:
@@ -197,7 +181,7 @@ def _remove_abandoned(directory: Path) -> None:
 
 
 def _remove_if_abandoned(part: Path) -> None:
-    descriptor = os.open(part, _OTHERS | getattr(os, "O_NOFOLLOW", 0))
+    descriptor = os.open(part, _OTHERS | os.O_NOFOLLOW)
     try:
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
             found = lock(descriptor, shared=True)

@@ -137,7 +137,7 @@ async def _line() -> bool:
     loop, ready = asyncio.get_running_loop(), asyncio.Event()
     try:
         loop.add_reader(sys.stdin.fileno(), ready.set)
-    except (PermissionError, NotImplementedError):  # a file is always ready; Windows cannot wait so
+    except PermissionError:  # a file is always ready
         return bool(sys.stdin.readline())
     try:
         await ready.wait()

@@ -108,8 +108,7 @@ async def _connected(
 
 def _hangup() -> list[signal.Signals]:
     """Return the signal of a terminal that closes, unless the command is to outlive it (nohup)."""
-    hangup = getattr(signal, "SIGHUP", None)
-    return [] if hangup is None or signal.getsignal(hangup) is signal.SIG_IGN else [hangup]
+    return [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
 
 
 def _cancel_on(signals: Sequence[signal.Signals]) -> None:
@@ -128,9 +127,8 @@ def _cancel_on(signals: Sequence[signal.Signals]) -> None:
         if task is not None:
             task.cancel()
 
-    with suppress(NotImplementedError):  # Windows
-        for number in signals:
-            loop.add_signal_handler(number, cancel, number)
+    for number in signals:
+        loop.add_signal_handler(number, cancel, number)
 
 
 def interface_to(

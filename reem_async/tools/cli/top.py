@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+import termios
 import textwrap
 import time
+import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -309,12 +311,9 @@ def _drawing(board: Board, waiting: str) -> Iterator[Callable[[Ending | None], N
 @contextmanager
 def _ended_by_q() -> Iterator[None]:
     """Cancel this task when `q` is typed, if this program may read from the terminal."""
-    if not sys.stdin.isatty() or sys.platform == "win32" or os.tcgetpgrp(fd := sys.stdin.fileno()) != os.getpgrp():
+    if not sys.stdin.isatty() or os.tcgetpgrp(fd := sys.stdin.fileno()) != os.getpgrp():
         yield
         return
-    import termios
-    import tty
-
     task, loop, before = asyncio.current_task(), asyncio.get_running_loop(), termios.tcgetattr(fd)
 
     def on_key() -> None:

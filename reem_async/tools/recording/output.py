@@ -43,7 +43,7 @@ class Output:
                 # O_EXCL gives the name to one of two recorders that begin at once; the lock is for those that
                 # come later.
                 flags = os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL)
-                self._file = os.open(path, flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0), 0o666)
+                self._file = os.open(path, flags | os.O_CLOEXEC, 0o666)
                 regular = stat.S_ISREG(os.fstat(self._file).st_mode)
                 if regular and lock(self._file) is Lock.TAKEN:  # both have just begun
                     os.close(self._file)
