@@ -10,7 +10,7 @@ from reem_async.connection import RedisInterface
 from reem_async.legacy import convert
 from reem_async.legacy.convert import Migrated, Migration
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
-from reem_async.tools.cli.output import clean, columns, emit, emit_json, note, progress_bar
+from reem_async.tools.cli.output import clean, columns, counted, emit, emit_json, named, note, progress_bar
 from reem_async.tools.cli.running import FAILED, guarded, run
 
 
@@ -59,13 +59,13 @@ def _show(done: Migration, as_json: bool) -> None:
             emit_json({**key._asdict(), "dry_run": done.dry_run})
         return
     good = [key for key in done.keys if not key.problem]
-    columns([[clean(key.name), clean(_what(key)), _count(len(key.removed))] for key in good], ["cyan", "", "dim"])
+    columns([[clean(key.name), clean(_what(key)), _removed(key)] for key in good], ["cyan", "", "dim"])
     for key in good:
         if key.lost:
             note(f"{', '.join(key.lost)}: kept, but not in the document; REEM 0.1 may have forgotten it by mistake")
     for key in done.problems:
         note(f"{key.name} is left as it is: {key.problem}")
-    keys = f"{len(good)} key{'' if len(good) == 1 else 's'}"
+    keys = counted(len(good), "key")
     if not done.keys:
         emit("Nothing to do: no key was written by REEM 0.1 or older.")
     elif done.dry_run:
@@ -79,11 +79,9 @@ def _what(key: Migrated) -> str:
         return "document of a server without JSON"
     whole = "value taken out of a dict" if key.rooted else ""
     inner = [place for place in key.places if "%%%%" not in place and place != "."]
-    shipped = ", ".join(inner[:3]) + (f" and {len(inner) - 3} more" if len(inner) > 3 else "")
-    if not inner and key.places:
-        shipped = "the whole value"
+    shipped = "the whole value" if key.places and not inner else named(inner)
     return "; ".join(filter(None, [shipped, whole])) or "leftovers only"
 
 
-def _count(removed: int) -> str:
-    return f"{removed} old Redis key{'' if removed == 1 else 's'} removed" if removed else ""
+def _removed(key: Migrated) -> str:
+    return f"{counted(len(key.removed), 'old Redis key')} removed" if key.removed else ""

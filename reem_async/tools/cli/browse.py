@@ -132,12 +132,8 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
 def open_page(address: str) -> None:
     """Open a page in the web browser, if there is a screen to show it on."""
     # Without one, webbrowser would start a text browser in this very terminal.
-    if _has_screen():
+    if sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(address)
-
-
-def _has_screen() -> bool:
-    return sys.platform == "darwin" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _address(host: str, port: int, token: str | None) -> str:

@@ -9,7 +9,7 @@ from enum import StrEnum
 from statistics import median
 from typing import NamedTuple
 
-from reem_async.tools.cli.output import size_text
+from reem_async.tools.cli.output import named, size_text
 
 
 class CheckStatus(StrEnum):
@@ -29,8 +29,6 @@ _SLOW_ARRAY = 0.1
 _CLOCK_APART = 0.01
 # Part of the memory.
 _NEARLY_FULL = 0.9
-# Keys that are named before the rest is counted.
-_NAMED = 3
 _SMALL_BUFFER = 8_000_000
 """Bytes a subscriber should be able to owe: an image of notices while it is busy for a moment."""
 
@@ -201,25 +199,21 @@ def old_data(names: Sequence[str]) -> Finding:
         return Finding("old data", OK, "no key was written by REEM 0.1 or older")
     keys = "1 key was" if len(names) == 1 else f"{len(names)} keys were"
     remedy = "`reem migrate` shows what it would convert, `reem migrate --yes` converts it in place"
-    return Finding("old data", FAIL, f"{keys} written by REEM 0.1 or older and cannot be read: {_some(names)}", remedy)
+    return Finding("old data", FAIL, f"{keys} written by REEM 0.1 or older and cannot be read: {named(names)}", remedy)
 
 
 def orphans(counts: Mapping[str, int], unknown: Mapping[str, str], *, removed: bool) -> Finding:
     """How many arrays no document refers to, by top-level key, and the keys of which that is not known."""
     total = sum(counts.values())
-    text = f"{total} that no document refers to, of {_some(list(counts))}" if total else ""
+    text = f"{total} that no document refers to, of {named(list(counts))}" if total else ""
     text = f"removed {text}" if total and removed else text
     if unknown:
-        why = f"not known of {_some(list(unknown))}: {next(iter(unknown.values()))}"
+        why = f"not known of {named(list(unknown))}: {next(iter(unknown.values()))}"
         return Finding("arrays", UNKNOWN, f"{text}; {why}" if text else why)
     if not total or removed:
         return Finding("arrays", OK, text or "each belongs to a document")
     remedy = "`reem doctor --clean` removes them; they are of keys that expired, or were deleted or renamed by others"
     return Finding("arrays", WARN, text, remedy)
-
-
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 def persistence(facts: Facts) -> Finding:

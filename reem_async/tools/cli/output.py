@@ -107,6 +107,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def named(names: Sequence[str], most: int = 3) -> str:
+    """Return the first names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def typed(path: Sequence[str | int]) -> str:
     """Return a full path as a user can type it, also where the top-level key has a dot: `["a.b"].c`."""
     return clean("".join(map(_element, path)).removeprefix("."))

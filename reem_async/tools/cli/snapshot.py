@@ -153,7 +153,9 @@ class _Saver:
         deleted = f", deleted {', '.join(path.name for path in gone)}" if gone else ""
         emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {seconds:.2f} s{clean(deleted)}")
         sys.stdout.flush()
-        self._note_foreign(it)
+        if it.foreign:
+            more = f" and {it.foreign - _NAMED} more" if it.foreign > _NAMED else ""
+            self._note_once(f"Left out, not REEM's: {', '.join(it.foreign_names[:_NAMED])}{more}")
         for place, why in it.unsaved.items():
             self._note_once(f"Not saved: {place}: {why}")
         if it.doubt:
@@ -217,12 +219,6 @@ class _Saver:
         done = prune(self.made, self.keep)
         del self.made[: -self.keep]
         return done
-
-    def _note_foreign(self, it: Snapshot) -> None:
-        if it.foreign:
-            more = f" and {it.foreign - _NAMED} more" if it.foreign > _NAMED else ""
-            names = ", ".join(it.foreign_names[:_NAMED])
-            self._note_once(f"Left out, not REEM's: {names}{more}")
 
     def _note_once(self, text: str) -> None:
         if text not in self.noted:
@@ -361,7 +357,7 @@ def _show_keys(it: Snapshot, as_json: bool) -> None:
 
 
 def _arrays(count: int) -> str:
-    return f"{count} array{'s' * (count > 1)} or other values of ships" if count else ""
+    return f"{counted(count, 'array')} or other values of ships" if count else ""
 
 
 def facts(it: Snapshot) -> dict[str, Any]:

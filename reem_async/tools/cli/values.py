@@ -28,7 +28,18 @@ from reem_async.store.reader import DocumentReader
 from reem_async.store.store import KeyValueStore
 from reem_async.tools.cli.listing import as_data, below_arrays, describe
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
-from reem_async.tools.cli.output import clean, emit, is_terminal, json_text, note, size_text, typed, width, write_over
+from reem_async.tools.cli.output import (
+    clean,
+    counted,
+    emit,
+    is_terminal,
+    json_text,
+    note,
+    size_text,
+    typed,
+    width,
+    write_over,
+)
 from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
 
@@ -426,7 +437,7 @@ def _write_npz(value: Any, file: IO[bytes], where: str) -> str:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
     left = f"; {others} other values left out" if others else ""
-    return f"{len(arrays)} array{'' if len(arrays) == 1 else 's'}{left}"
+    return f"{counted(len(arrays), 'array')}{left}"
 
 
 def _write_json(value: Any, file: IO[bytes], where: str) -> str:

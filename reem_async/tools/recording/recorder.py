@@ -181,20 +181,16 @@ class Recorder:
                 self._begin(lambda: find_regularly(self._search))
             self._sampler.start()
             self._begin(self._tick)
-            await self._appear()
+            if self._sink.output.replaces:  # as soon as this recording is worth more than nothing
+                await asyncio.to_thread(self.writer_thread.flush)
+                failure = self.writer_thread.failure
+                if failure is not None:
+                    raise RecordingFailed(f"{self.path} cannot be replaced: {failure}; it is as it was") from failure
+                self._sink.output.appear()
         except BaseException:
             await self._end()
             self._sink.output.discard()
             raise
-
-    async def _appear(self) -> None:
-        """Take the place of the recording that is to be replaced, as soon as this one is worth more than nothing."""
-        if self._sink.output.replaces:
-            await asyncio.to_thread(self.writer_thread.flush)
-            failure = self.writer_thread.failure
-            if failure is not None:
-                raise RecordingFailed(f"{self.path} cannot be replaced: {failure}; it is as it was") from failure
-            self._sink.output.appear()
 
     def _begin(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Start a task; if it fails, the recording ends."""

@@ -45,14 +45,12 @@ def read_key_file(file: str | FilePath) -> list[Sample]:
         why = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise BadValue(f"the key file {file} cannot be read: {why}") from None
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.split("#")[0].strip()]
-    samples = [_sample(file, number, line) for number, line in lines if not _is_title(line)]
+    samples = [
+        _sample(file, number, line) for number, line in lines if line.partition(",")[0].strip().lower() != "path"
+    ]
     if not samples:
         raise BadValue(f"the key file {file} names no path; write a line like: foo.bar, 0.1")
     return samples
-
-
-def _is_title(line: str) -> bool:
-    return [word.strip().lower() for word in line.split(",")[:1]] == ["path"]
 
 
 def _sample(file: str | FilePath, number: int, line: str) -> Sample:
