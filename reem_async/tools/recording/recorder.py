@@ -20,6 +20,7 @@ from ... import __version__
 from ...concurrency.queues import Last
 from ...concurrency.scheduling import give_way
 from ...concurrency.streams import arrived
+from ...concurrency.tasks import Tasks
 from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
@@ -150,7 +151,7 @@ class Recorder:
         self._sampler = Sampler(
             self.session, self._samples, lambda path, *read: self._keys.of(str(path[0])).sampled(path, *read)
         )
-        self._tasks: list[asyncio.Task[None]] = []
+        self._tasks = Tasks()
         self._begun = self._ended = 0.0
         self._dropped = 0
         self._failure: Exception | None = None
@@ -201,7 +202,7 @@ class Recorder:
             except Exception as error:
                 self.failed(error)
 
-        self._tasks.append(asyncio.create_task(watched()))
+        self._tasks.start(watched(), f"reem record {self.path}")
 
     async def stop(self) -> None:
         """End the recording: take what was published until now, write the index, close the file. Idempotent.
@@ -224,9 +225,7 @@ class Recorder:
         self._ended = self._ended or time.monotonic()
         self._done.set()
         await self._sampler.stop()
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
         self._keys.cancel()
         with contextlib.suppress(InterfaceClosed):
             if self._monitor is not None:

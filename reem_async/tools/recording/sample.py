@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
+from ...concurrency.tasks import Tasks
 from ...errors import BadInput, BadValue, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import Path, check_top_key, counts_from_end, parse, show
@@ -86,18 +87,17 @@ class Sampler:
         self._session = session
         self._samples = list(samples)
         self._take = take
-        self._tasks: list[asyncio.Task[None]] = []
+        self._tasks = Tasks()
         self.late = 0  # readings that were left out since the one before took too long
         self.failed = 0
 
     def start(self) -> None:
         begin = asyncio.get_running_loop().time()
-        self._tasks = [asyncio.create_task(self._follow(each, begin)) for each in self._samples]
+        for each in self._samples:
+            self._tasks.start(self._follow(each, begin), f"reem sample {show(each.path)}")
 
     async def stop(self) -> None:
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._tasks.end()
 
     async def _follow(self, each: Sample, begin: float) -> None:
         loop, count = asyncio.get_running_loop(), 0
