@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 import typer
 
-from reem_async.connection import RedisInterface
 from reem_async.errors import BadType, BadValue, ReemError
 from reem_async.plan.paths import parse, shorten
 from reem_async.ships.base import SpecialDatatypeShip
@@ -37,31 +36,21 @@ def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
 
 async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
     async with interface_to(url, namespace, _SECONDS) as interface:
-        outer = _begun(incomplete)
-        found = await (_below(interface, outer, incomplete) if outer else _top(interface, incomplete))
-        if len(found) != 1 or not await _goes_on(interface, found[0]):
-            return sorted(found)
+        store, outer = KeyValueStore(interface), _begun(incomplete)
+        if outer:  # nothing of the dict is fetched but its keys
+            keys = await store.at(typed(outer)).keys()
+        else:
+            # The server leaves out the others: it may have a million keys.
+            glob = "*" if incomplete.startswith("[") else f"{incomplete}*"
+            keys = [name async for name in names(interface, glob)]
+        shown = [typed((*outer, key)) for key in keys]
+        found = [each for each in shown if each.startswith(incomplete)][:_MOST]
+        goes_on = False
+        if len(found) == 1:
+            with suppress(ReemError):  # a list, an array, a number
+                goes_on = bool(await store.at(found[0]).keys())
         # A shell puts a blank behind the only choice. With two it waits for more to be typed, such as the next dot.
-        return [found[0], f"{found[0]}."]
-
-
-async def _top(interface: RedisInterface, incomplete: str) -> list[str]:
-    """Return the top-level keys that go on as typed."""
-    found: list[str] = []
-    async for name in names(interface, "*"):
-        shown = typed((name,))
-        if shown.startswith(incomplete):
-            found.append(shown)
-        # The rest of the keys is not asked for either: this may be a server with a million.
-        if len(found) >= _MOST:
-            break
-    return found
-
-
-async def _goes_on(interface: RedisInterface, path: str) -> bool:
-    with suppress(ReemError):  # a list, an array, a number
-        return bool(await KeyValueStore(interface).at(path).keys())
-    return False
+        return [found[0], f"{found[0]}."] if goes_on else sorted(found)
 
 
 def _begun(incomplete: str) -> tuple[str | int, ...]:
@@ -73,15 +62,6 @@ def _begun(incomplete: str) -> tuple[str | int, ...]:
             with suppress(ValueError):  # within a quoted key
                 return parse(incomplete[: end - 1])
     return ()
-
-
-async def _below(interface: RedisInterface, outer: tuple[str | int, ...], incomplete: str) -> list[str]:
-    """Return the keys of the dict at `outer` that go on as typed; nothing of it is fetched."""
-    place = KeyValueStore(interface)[str(outer[0])]
-    for element in outer[1:]:
-        place = place[element]
-    shown = [typed((*outer, key)) for key in await place.keys()]
-    return [each for each in shown if each.startswith(incomplete)][:_MOST]
 
 
 # localhost and not 127.0.0.1: it stands for the server's Unix socket, which is quicker.
