@@ -20,8 +20,6 @@ _SECOND = METADATA.encode()
 
 @dataclass
 class OldKey:
-    """One old top-level key."""
-
     name: str  # without namespace
     places: dict[str, str] | None = None  # of ships' values, with labels; None if there is no second document
     rooted: bool = False  # its value is no dict and was stored in one

@@ -93,7 +93,6 @@ class Tree:
         return True
 
     def holds(self, place: str) -> bool:
-        """Return whether a value of a new ship is at an old place."""
         for path in candidates(place):
             found = self._find(path)
             if found is not None and (id(found[0]), found[1]) in self._kept:

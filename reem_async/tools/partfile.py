@@ -168,7 +168,6 @@ def _rename(part: Path, target: Path) -> None:
 
 
 def _age(descriptor: int) -> float:
-    """Return the seconds since a file was written to."""
     return time.time() - os.fstat(descriptor).st_mtime
 
 

@@ -60,7 +60,6 @@ def not_allowed(check: str, command: str) -> Finding:
 
 
 def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
-    """Which server it is; `sharded` if all nodes of a cluster are asked, and not this one alone."""
     if facts.info is None:
         return Finding("server", OK, f"answers at {address}; this user may not ask for its version")
     name = facts.info.get("server_name", "redis")
@@ -75,7 +74,6 @@ def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
 
 
 def json_support(facts: Facts, *, plain: bool) -> Finding:
-    """Whether there is RedisJSON, and which; a `plain` server has none."""
     if plain:
         return Finding(
             "json", OK, "none: documents are kept as text, and a change below their top takes two round trips"
@@ -92,7 +90,6 @@ def json_support(facts: Facts, *, plain: bool) -> Finding:
 def who(
     user: str | None, *, address: str, loopback: bool, by_socket: bool, tls: bool, password: bool
 ) -> Iterator[Finding]:
-    """As whom, which way, and how safely, this program is connected."""
     name = f"as user {user}" if user else "as a user whose name it may not ask"
     secrets = f"{'with' if password else 'without'} password, {'with' if tls else 'without'} TLS"
     text = f"connected {name}, {secrets}"
@@ -110,7 +107,6 @@ def who(
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether a host name means this machine."""
     try:
         found = {entry[4][0] for entry in socket.getaddrinfo(host, None)}
     except OSError:
@@ -169,7 +165,6 @@ def eviction(facts: Facts) -> Finding:
 
 
 def subscribers(facts: Facts) -> Finding:
-    """How far a subscriber may fall behind before the server hangs up."""
     if facts.config is None:
         return not_allowed("subscribers", "CONFIG GET")
     # All classes in one line: normal 0 0 0 replica 268435456 67108864 60 pubsub 33554432 8388608 60.
@@ -194,7 +189,6 @@ _LARGER = "CONFIG SET client-output-buffer-limit 'pubsub 33554432 8388608 60' or
 
 
 def old_data(names: Sequence[str]) -> Finding:
-    """Which keys are of versions before 1.0, and would be read wrong."""
     if not names:
         return Finding("old data", OK, "no key was written by REEM 0.1 or older")
     keys = "1 key was" if len(names) == 1 else f"{len(names)} keys were"
@@ -203,7 +197,6 @@ def old_data(names: Sequence[str]) -> Finding:
 
 
 def orphans(counts: Mapping[str, int], unknown: Mapping[str, str], *, removed: bool) -> Finding:
-    """How many arrays no document refers to, by top-level key, and the keys of which that is not known."""
     total = sum(counts.values())
     text = f"{total} that no document refers to, of {named(list(counts))}" if total else ""
     text = f"removed {text}" if total and removed else text

@@ -83,7 +83,6 @@ def group_of(entries: Sequence[Entry]) -> type[TyperGroup]:
 
 
 def command_of(entry: Entry) -> Any:
-    """Import a command; return what parses and runs it."""
     thing = getattr(import_module(entry.full_module), entry.attribute)
     holder = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode="rich")
     if isinstance(thing, typer.Typer):

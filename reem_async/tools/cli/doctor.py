@@ -230,7 +230,6 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
 
 
 async def _old_data(interface: RedisInterface) -> Finding:
-    """Count the keys of the namespace that are of versions before 1.0, on all servers."""
     try:
         return checks.old_data([key.name for key in await find(interface.session, stale=False) if key.misread])
     except RedisError as error:
@@ -397,7 +396,6 @@ async def _sharing(interface: RedisInterface) -> Finding:
 
 
 def shared_memory(reason: str, refusal: str = "", *, contained: bool = False) -> Finding:
-    """Return what to say, given why memory cannot be shared, or why the server refuses the channel for it."""
     otherwise = "large values go through the server"
     if reason:
         # Elsewhere than on Linux there is nothing that anybody could mend.

@@ -197,7 +197,6 @@ def _moment(time: float) -> str:
 
 
 def _one_line(value: Any) -> str:
-    """Return a value in one line; arrays as their type and first and last numbers."""
     if isinstance(value, np.ndarray):
         body = np.array2string(value, threshold=12, edgeitems=3, max_line_width=10_000, separator=" ")
         return clean(f"{value.dtype}[{','.join(map(str, value.shape))}] {' '.join(body.split())}")
@@ -205,12 +204,10 @@ def _one_line(value: Any) -> str:
 
 
 def _unfetched_as_text(leaf: Any) -> Any:
-    """Return a text in place of what was left at the server."""
     return f"<{leaf.summary or leaf.label}, {size_text(leaf.size)}>" if isinstance(leaf, Unfetched) else leaf
 
 
 def _summarised(leaf: Any) -> Any:
-    """Return a text in place of an array, of bytes, or of what was left at the server."""
     if isinstance(leaf, bytes):
         return f"<bytes, {size_text(len(leaf))}>"
     return _one_line(leaf) if hasattr(leaf, "dtype") else _unfetched_as_text(leaf)

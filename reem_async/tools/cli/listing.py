@@ -145,7 +145,6 @@ def _drawn(node: Outline, name: str, lead: str, below: str, depth: int | None, m
 
 
 def _key(node: Outline) -> str:
-    """Return the last element of a path as a user would type it."""
     key = node.path[-1]
     return f"[{key}]" if isinstance(key, int) else typed((key,))
 
@@ -221,7 +220,6 @@ def as_data(node: Outline) -> Any:
 
 
 def outline_json(node: Outline, depth: int | None) -> dict[str, Any]:
-    """Return an outline for programs, children down to `depth` levels below."""
     entry: dict[str, Any] = {"path": typed(node.path), "type": node.kind, "size": node.size}
     if node.plain:
         entry["value"] = node.value

@@ -286,7 +286,6 @@ def _missing(log: Log) -> str:
 
 
 def _when(instant: float) -> str:
-    """Return an instant in local time, with the name of the zone."""
     return f"{datetime.datetime.fromtimestamp(instant).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
 

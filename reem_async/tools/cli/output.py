@@ -26,7 +26,6 @@ _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
 def is_terminal() -> bool:
-    """Return whether people read the standard output."""
     return sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 

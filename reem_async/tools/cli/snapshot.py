@@ -294,7 +294,6 @@ for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
 
 
 def listed(path: Path, check: bool, as_json: bool) -> int:
-    """Print the snapshots in a directory, or the keys in a file; returns the exit code."""
     if path.is_file():
         _show_keys(described(path, check=check), as_json)
         return 0
@@ -361,7 +360,6 @@ def _arrays(count: int) -> str:
 
 
 def facts(it: Snapshot) -> dict[str, Any]:
-    """Return what `--json` says of a snapshot."""
     names = ("kind", "time", "size", "count", "server", "namespace", "foreign", "foreign_names")
     return {"path": str(it.path), **{name: getattr(it, name) for name in names}, "unsaved": dict(it.unsaved)}
 

@@ -81,7 +81,6 @@ class Window:
 
     @property
     def age(self) -> float:
-        """Seconds since the last update was received."""
         return max(time.time() - self.received[-1], 0.0) if self.received else 0.0
 
     @property
@@ -94,12 +93,10 @@ class Window:
         return (len(self.received) - 1) / self._duration if self._duration > 0 else None
 
     def bandwidth(self) -> float | None:
-        """Bytes a second; None of fewer than two updates."""
         # The bytes of the first update came at the beginning of the span, all others within it.
         return (sum(self.sizes) - self.sizes[0]) / self._duration if self._duration > 0 else None
 
     def intervals(self) -> list[float]:
-        """Seconds between updates."""
         return [later - earlier for earlier, later in pairwise(self.received)]
 
 
@@ -111,7 +108,6 @@ class Spread(NamedTuple):
 
 
 def spread(values: Sequence[float]) -> Spread | None:
-    """Return how `values` are spread; None if there is none."""
     return Spread(fmean(values), min(values), max(values), pstdev(values)) if values else None
 
 

@@ -405,8 +405,6 @@ class Totals(NamedTuple):
 
 
 class Timeline:
-    """The messages of a file by channel and time, in whatever order the file has them."""
-
     def __init__(self, container: Container) -> None:
         self._container = container
         self._chunks = container.every_chunk
@@ -481,7 +479,6 @@ class Timeline:
         return np.sort(np.concatenate(found))
 
     def channels_between(self, after: int, until: int) -> set[int]:
-        """Return the channels that have a message later than `after` and not later than `until`."""
         found = np.zeros(_CHANNELS, bool)
         for info in self._with(~found, after, until):
             # A chunk that lies wholly inside: its list of channels says it all, and its index is not read.

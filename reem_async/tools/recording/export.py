@@ -63,7 +63,6 @@ class Export:
         return name
 
     def named(self, cells: dict[str, Any]) -> dict[str, Any]:
-        """Return a row by the names of its columns."""
         return cells | {self.deleted: cells.get(_DELETED), self.stored: cells.get(_STORED)}
 
 

@@ -45,8 +45,6 @@ _DTYPE = re.compile(r"[<>|=][biuf]\d{1,2}")
 
 
 class JsonMessage(NamedTuple):
-    """A tree ready to be written."""
-
     tree: dict[str, Any]  # plain JSON values, notes included
     wrapped: bool  # the tree proper is under "value"
 
@@ -212,8 +210,6 @@ _NUMPY = NumpyShip()
 
 
 class EncodedMessage(NamedTuple):
-    """One value as a message."""
-
     schema: str
     channels: str  # of a picture with three axes, the size of the last one; else ""
     pieces: list[Any]  # that belong one behind the other: a large value is not copied

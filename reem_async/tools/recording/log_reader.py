@@ -167,7 +167,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         return best
 
     def _between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
-        """Yield the messages between two instants in order."""
         for refs in self._instants(channels, after, until):
             yield from refs
 
@@ -265,7 +264,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
 
     @property
     def is_damaged(self) -> bool:
-        """Whether anything that was read until now turned out to be damaged."""
         return bool(self._container.damaged) or self._has_skipped
 
     def following(self, path: Path, after: int, until: int) -> Iterator[tuple[int, bool, Any]]:
@@ -297,7 +295,6 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 yield refs[0].time, repeats, value
 
     def gaps(self) -> Iterator[tuple[Ref, RecordedStream, int | None]]:
-        """Yield where updates were lost, and how many."""
         # A gap says how many were lost if their publisher's numbers told it.
         for ref, stream in self.of_role(Role.GAP):
             message, missed = self._timeline.message(ref), None

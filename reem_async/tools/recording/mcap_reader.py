@@ -120,8 +120,6 @@ class Index(NamedTuple):
 
 @dataclass(frozen=True, slots=True, order=True)
 class ChunkInfo:
-    """Where a chunk is and when it is from."""
-
     number: int  # among the chunks of the file, in order of their first log times
     start: int  # the first and the last log time in it, in ns
     end: int
@@ -136,8 +134,6 @@ class ChunkInfo:
 
 @dataclass(slots=True)
 class Contents:
-    """What a file has: channels and schemas by number, chunks, metadata by place."""
-
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: list[ChunkInfo] = field(default_factory=list)

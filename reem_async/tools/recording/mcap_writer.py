@@ -160,7 +160,6 @@ class McapWriter:
         self._output.flush()
 
     def finish(self) -> None:
-        """Close the last chunk, and write the index and the statistics."""
         self._close_chunk()
         # 0: no checksum of the data section, which would be of hours of data; each chunk has its own.
         self._output.write(_record(DataEnd(0)))

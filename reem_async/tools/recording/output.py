@@ -95,7 +95,6 @@ class Output:
         self._waiting += len(data)
 
     def tell(self) -> int:
-        """Return where the next piece will be."""
         return self._written + self._waiting
 
     def flush(self) -> None:

@@ -18,8 +18,6 @@ from .key_reader import fetch
 
 
 class Sample(NamedTuple):
-    """A path that is read every so many seconds."""
-
     path: Path
     seconds: float
 
@@ -28,7 +26,6 @@ class Sample(NamedTuple):
 
 
 def samples_of(given: dict[str, float] | str | FilePath | None) -> list[Sample]:
-    """Return the samples that a dict of periods or a key file asks for."""
     if given is None:
         return []
     if isinstance(given, dict):

@@ -106,7 +106,6 @@ class Sink:
     def part(
         self, path: Path, role: Role, kind: Kind, label: str, encoded: EncodedMessage, stamp: tuple[int, int, int]
     ) -> int:
-        """Write a protobuf message; returns its bytes."""
         key = path, role, kind, label, encoded.schema, encoded.channels
         channel = self._channels.get(key)
         if channel is None:
@@ -229,7 +228,6 @@ def fits(found: Signature, known: Signature) -> bool:
 
 
 def schema_text(title: str, known: Signature) -> bytes:
-    """Return the JSON Schema of messages with these types."""
     return orjson.dumps({"$schema": _DRAFT, "title": title, **_schema(known)})
 
 

@@ -45,7 +45,6 @@ class Reference:
 
     @property
     def shown(self) -> str:
-        """The path as people write it."""
         return show(self.path)
 
 

@@ -78,7 +78,6 @@ class Clock:
         return self._last
 
     def since(self, stamp: int) -> float:
-        """Return the seconds that have passed since a log time."""
         return (time.monotonic_ns() + self._offset - stamp) / 1e9
 
 

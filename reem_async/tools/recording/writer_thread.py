@@ -43,8 +43,6 @@ _NUMPY = NumpyShip()
 
 
 class Operation(NamedTuple):
-    """One thing to write."""
-
     role: Role
     path: Path
     value: Any  # what is there now; for a gap, how many updates were lost, None if unknown
@@ -53,8 +51,6 @@ class Operation(NamedTuple):
 
 
 class Counts:
-    """What was written, and what was not."""
-
     def __init__(self) -> None:
         self.messages = 0
         self.bytes = 0
@@ -74,7 +70,6 @@ class Counts:
         self._name(path)
 
     def lose(self, path: Path) -> None:
-        """Count a value that cannot be recorded."""
         self.lost += 1
         self._name(path)
 

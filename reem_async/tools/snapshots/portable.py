@@ -356,7 +356,6 @@ def matcher(match: str) -> Wanted:
 
 
 def _name(key: bytes) -> str | None:
-    """Return the top-level key of these bytes, None if it cannot be one."""
     with suppress(UnicodeDecodeError, BadKey):
         return check_top_key(key.decode())
     return None
