@@ -160,10 +160,6 @@ def ship_named(text: str) -> SpecialDatatypeShip:
     """Return the ship `MODULE:NAME`, a class that is made without arguments or a ship; imports the module.
 
     Modules in the current directory are found, as they are by `python -m`.
-
-    Raises:
-        BadValue: There is none.
-        BadType: It is no ship.
     """
     module, colon, name = text.partition(":")
     if not (module and colon and name):

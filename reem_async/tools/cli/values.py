@@ -314,11 +314,7 @@ async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, s
 
 
 def parse_value(text: str, *, is_text: bool) -> Any:
-    """Return the value that VALUE stands for: JSON, `@file.json`, `@file.npy`, `-` for the standard input.
-
-    Raises:
-        CommandFailed: It is none of these; exit code 2.
-    """
+    """Return the value that VALUE means: JSON, `@file.json`, `@file.npy`, `-` for the standard input."""
     # Unknown options arrive here as arguments (`takes_minus`), so that -1.5 can be a value: they are refused by hand.
     if text.startswith("-") and text != "-" and not text[1:2].isdigit():
         raise CommandFailed(
@@ -396,12 +392,7 @@ def _range(array: Any) -> str:
 
 
 def save(value: Any, path: Path, where: str, *, replace: bool = False) -> str:
-    """Write what was read at `where` to a file, whole or not at all; return what to say of it.
-
-    Raises:
-        CommandFailed: A file of this kind cannot hold it, or it cannot be written.
-        FileExistsError: There is a file of that name, and `replace` is False.
-    """
+    """Write what was read at `where` to a file, whole or not at all; return what to say of it."""
     write = FILES[path.suffix]
     try:
         part = PartFile(path, replace=replace)

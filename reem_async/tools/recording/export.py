@@ -71,22 +71,13 @@ def export(
 ) -> Export:
     """Write what was recorded into a file that other programs read.
 
-    Args:
-        log: The recording.
-        kind: "csv" or "parquet": a row for each update, a column for each number or text, empty where it
-            was not updated; an empty dict or list is the text "{}" or "[]". What was deleted is in the column
-            "deleted" of a row of its own; the column "stored" has the path where a row is not of an update that was
-            published but of a change of what is stored. Both are there only if something is in them. Arrays of more
-            than 64 numbers are left out and named in the result; an update of nothing else has no row. "npz": for
-            each path an array of all its values, time
-            first, and `path.time`; deletions and empty dicts are left out and named.
-        target: The file. It appears once it is complete.
-        patterns: Which paths.
-        overwrite: Replace the file if it exists.
+    "csv" and "parquet" have a row for each update, and a column for each number or text, empty where it was not
+    updated; an empty dict or list is the text "{}" or "[]". A deletion is in the column "deleted" of a row of its own.
+    The column "stored" has the path where a row is of a plain write. Both are there only if something is in them.
+    Arrays of more than 64 numbers are left out and named in the result; an update of nothing else has no row.
 
-    Raises:
-        BadValue: Another kind, the file exists, or there is nothing to write.
-        OSError: It cannot be written.
+    "npz" has for each path an array of all its values, time first, and `path.time`. Deletions and empty dicts are left
+    out and named. The file appears once it is complete.
     """
     check_format(kind)
     target = FilePath(target)

@@ -360,12 +360,7 @@ def _compressed(data: bytes) -> str:
 
 
 def decode(schema: str, channels: str, label: str, data: bytes, ships: Ships) -> Any:
-    """Return the value of a message; arrays are read-only.
-
-    Raises:
-        DamagedRecording: Not a message of this schema, or not one that REEM writes.
-        BadData: Written by a ship that is not among `ships`.
-    """
+    """Return the value of a message; arrays are read-only. Raises DamagedRecording, or BadData without its ship."""
     if schema not in _CLASSES:
         raise DamagedRecording(f"messages of the schema {schema!r} are not REEM's")
     try:

@@ -98,9 +98,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def _value(self, change: tuple[Ref, RecordedStream]) -> Any:
         """Return the value of a message; a `Reference` for one that cannot be read, so that the rest can be.
 
-        Raises:
-            _FoundDamage: It turned out to be damaged, so it has to be left out.
-            BadData: It is unreadable and had parts of its own.
+        Raises _FoundDamage if it turned out to be damaged, and BadData if it is unreadable and had parts of its own.
         """
         ref, stream = change
         try:

@@ -183,10 +183,8 @@ def read_summary(source: Source, footer: Footer) -> tuple[Contents, bool]:
     """Return what the summary says, and whether it leaves out nothing that the file has.
 
     MCAP leaves most of a summary to the program that writes it. So the data section is compared with it, without being
-    read: from record to record, the known chunks and metadata are all that it may have.
-
-    Raises:
-        ValueError, and others: The summary is damaged, or lists what the file does not have.
+    read: from record to record, the known chunks and metadata are all that it may have. Raises one of MALFORMED if the
+    summary is damaged, or lists what the file does not have.
     """
     if footer.text is None:
         raise ValueError("the summary does not have the checksum that the footer names")

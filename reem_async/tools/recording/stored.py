@@ -96,10 +96,7 @@ def is_inline(array: np.ndarray[Any, Any]) -> bool:
 def extract(value: Any, path: Path, store: Store) -> Any:
     """Return `value`, at the full `path`, with everything that gets a message of its own replaced by `Reference`.
 
-    Containers in which nothing was replaced are shared with `value`.
-
-    Raises:
-        NotWritten: There is an `Unchanged` of which nothing was written.
+    Containers in which nothing was replaced are shared with `value`. Raises NotWritten.
     """
     kind = type(value)
     if kind is New:
