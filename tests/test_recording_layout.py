@@ -21,8 +21,7 @@ from reem_async.errors import BadData, BadInput, BadValue
 from reem_async.plan.paths import parse_pattern
 from reem_async.plan.trees import MISSING
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.tools.recording import contents
-from reem_async.tools.recording.contents import Content, Recent
+from reem_async.tools.recording.contents import Content
 from reem_async.tools.recording.layout import decode, encode, from_json, schema_bytes, to_json
 from reem_async.tools.recording.log import stacked
 from reem_async.tools.recording.sample import read_key_file
@@ -359,25 +358,12 @@ def test_a_key_file_that_cannot_be(tmp_path, line):
         read_key_file(tmp_path / "none.csv")
 
 
-def test_of_the_values_written_the_newest_bytes_are_kept_for_a_moment_and_then_their_digests(monkeypatch):
+def test_of_a_value_written_only_the_digest_is_kept_once_there_is_one():
     """By these the recorder tells later whether a value has changed."""
-    same = Content(b"<f8[2]", np.array([1.0, 2.0]).tobytes())
-    assert Content(b"<f8[2]", memoryview(np.array([1.0, 2.0])).cast("B")).digest() == same.digest()
+    body = np.array([1.0, 2.0])
+    same, gone = Content(b"<f8[2]", memoryview(body).cast("B")), weakref.ref(body)
+    del body
+    assert Content(b"<f8[2]", np.array([1.0, 2.0]).tobytes()).digest() == same.digest()
     for head, items in ((b"<f8[2]", [1.0, -2.0]), (b"<i8[2]", [1.0, 2.0])):
         assert Content(head, np.array(items).tobytes()).digest() != same.digest()
-    assert same.size == 0
-    recent, kept = Recent(), Content(b"", bytes(1000))
-    recent.add(kept)
-    recent.tick()
-    assert kept.size == 1000
-    monkeypatch.setattr(contents, "_MOMENT", 0.0)
-    recent.tick()
-    assert kept.size == 0
-    monkeypatch.setattr(contents, "_MOST_KEPT", 2500)
-    three = [Content(b"", bytes(1000)) for _ in range(3)]
-    for each in three:
-        recent.add(each)
-    assert [each.size for each in three] == [0, 1000, 1000]
-    gone = weakref.ref(three.pop())
-    del each
-    assert gone() is None, "what was replaced is not kept"
+    assert gone() is None

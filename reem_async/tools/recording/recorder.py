@@ -20,7 +20,6 @@ from ... import __version__
 from ...concurrency.queues import Last
 from ...concurrency.scheduling import give_way
 from ...concurrency.streams import arrived
-from ...concurrency.tasks import Tasks
 from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
@@ -151,7 +150,7 @@ class Recorder:
         self._sampler = Sampler(
             self.session, self._samples, lambda path, *read: self._keys.of(str(path[0])).sampled(path, *read)
         )
-        self._tasks = Tasks()
+        self._tasks: list[asyncio.Task[None]] = []
         self._begun = self._ended = 0.0
         self._dropped = 0
         self._failure: Exception | None = None
@@ -202,7 +201,7 @@ class Recorder:
             except Exception as error:
                 self.failed(error)
 
-        self._tasks.start(watched(), f"reem record {self.path}")
+        self._tasks.append(asyncio.create_task(watched()))
 
     async def stop(self) -> None:
         """End the recording: take what was published until now, write the index, close the file. Idempotent.
@@ -225,7 +224,9 @@ class Recorder:
         self._ended = self._ended or time.monotonic()
         self._done.set()
         await self._sampler.stop()
-        await self._tasks.end()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
         self._keys.cancel()
         with contextlib.suppress(InterfaceClosed):
             if self._monitor is not None:
