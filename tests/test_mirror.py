@@ -8,7 +8,7 @@ import threading
 
 import numpy as np
 import pytest
-from conftest import FRONTS, aeventually, assert_same, eventually, nothing_sent
+from conftest import FRONTS, aeventually, assert_same, eventually, nothing_sent, server_without_right
 from test_ships import Pose, PoseShip
 
 import reem
@@ -153,6 +153,14 @@ def test_large_arrays_stay_at_the_server_if_asked_for(mirrored, raw, kvs, key):
     kvs[top]["image"] = IMAGE
     it.until(lambda value: not isinstance(value["image"], np.ndarray))
     assert_same(kvs[top]["image"].read(), IMAGE)
+
+
+async def test_a_large_array_needs_no_right_to_type():
+    """It was an Unreadable: only what is reported of its changes needs that right."""
+    async with server_without_right("type") as (kvs, url), reem_async.RedisInterface(url) as interface:
+        await kvs["a"].write({"n": 1, "image": IMAGE})
+        async with reem_async.KeyValueStore(interface)["a"].mirror(largest=1000) as mirror:
+            assert mirror["image"].read().summary == "uint8[480,640,3]"
 
 
 @pytest.mark.alone

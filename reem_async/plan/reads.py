@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
 
-from ..errors import BadData, Conflict, MissingDocument, MissingKey, NotAllowed, WrongKind, WrongType
+from ..errors import BadData, Conflict, MissingDocument, MissingKey, NotAllowed, WrongKind, WrongType, is_of_command
 from ..legacy.olddata import first_read as first_read
 from ..legacy.olddata import look_first as look_first
 from ..ships.registry import Registered, Ships
@@ -186,6 +186,7 @@ class _Fetch:
     held: HeldValues
     largest: float
     tolerant: bool
+    touches: bool = True
     tries: int = 0
     refused: dict[tuple[str, str], Exception] = field(default_factory=dict)  # attachments that the user may not read
 
@@ -201,16 +202,16 @@ class _Fetch:
         left = {(each.label, each.suffix) for each in lacking if each.size > self.largest}
         reads = [ship.read_command(self.keys.tag + suffix) for (_, suffix), ship in asked.items()]
         # Enough for CLIENT TRACKING: the server reports changes of keys that any command has read.
-        touches = [("TYPE", self.keys.tag + suffix) for _, suffix in left]
+        touches = [("TYPE", self.keys.tag + suffix) for _, suffix in left if self.touches]
         commands = (get_command(self.keys, self.path), *reads, *touches, *self.also)
         # By the sizes at the last read; if they are wrong, the other connection is used.
         bulk = sum(each.size for each in fetched) >= LARGE
         return Plan(
             commands,
-            lambda replies: self._decode(asked, left, commands, replies),
+            lambda replies: self._decode(asked, left, 1 + len(reads) + len(touches), commands, replies),
             atomic=True,
             bulk=bulk,
-            without_refused=partial(self._without_refused, [*asked, *left]) if self.tolerant else None,
+            without_refused=partial(self._without_refused, [*asked], [*left]) if self.tolerant else None,
         )
 
     def _unobtainable(self, it: Placeholder) -> Exception | None:
@@ -221,22 +222,28 @@ class _Fetch:
             return self.ships.lacks(it.label, "it")
         return self.refused.get((it.label, it.suffix))
 
-    def _without_refused(self, places: list[tuple[str, str]], replies: Sequence[Reply]) -> Plan | None:
+    def _without_refused(
+        self, asked: list[tuple[str, str]], left: list[tuple[str, str]], replies: Sequence[Reply]
+    ) -> Plan | None:
         """Plan to read the attachments that the user may read; None if the document itself was refused."""
+        places = [*asked, *left]
         refused = {place: it for place, it in zip(places, replies[1:], strict=False) if isinstance(it, NotAllowed)}
         if not refused or isinstance(replies[0], Exception):
             return None
-        self.refused |= refused
+        if any(place in left and is_of_command(it) for place, it in refused.items()):  # TYPE: it is not needed to read
+            self.touches = False
+        else:
+            self.refused |= refused
         return self.plan()
 
     def _decode(
         self,
         asked: dict[tuple[str, str], Registered],
         left: set[tuple[str, str]],
+        end: int,
         commands: tuple[Command, ...],
         replies: Sequence[Reply],
     ) -> Any:
-        end = 1 + len(asked) + len(left)
         text = _found(replies[0], self.keys, self.path, bool(self.also))
         if text is None:
             return RawRead([MISSING], self.keys.name, [], commands, (None,), tuple(replies[end:]))
