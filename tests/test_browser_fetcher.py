@@ -2,38 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
 
 import numpy as np
-from conftest import aeventually
+import pytest
 
 from reem_async.errors import ConnectionLost
 from reem_async.pubsub.monitor import Monitor
-from reem_async.tools.browser.fetcher import Allowance, Fetcher, Readings
+from reem_async.tools.browser.follower import Follower
 from reem_async.tools.browser.history import History
 
 LARGE = np.zeros((300, 300))
 
 
-async def touch(path, tree):
-    """Nobody tells of what is only stored."""
-
-
-def fetcher_of(interface, name, fence, last_note=""):
+def followed(interface, name, fence):
+    """A key of the page that hears only what the test hands on."""
     history = History(1000.0, 1 << 24)
     history.begin(name, b"{}")
-    readings = Readings()
-    readings.notes[name] = last_note
-    fetcher = Fetcher(interface.session, history, Allowance(1e9, 1e9), readings, fence, touch)
-    return fetcher, history, readings
-
-
-async def fetched(fetcher, name):
-    fetcher.want((name,), time.time())
-    task = asyncio.create_task(fetcher.run())
-    await aeventually(lambda: not fetcher.behind)
-    task.cancel()
+    follower = Follower(interface, history)
+    follower.fence = fence
+    return follower.key(name), history
 
 
 async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(key, apspace, binterface):
@@ -46,10 +34,10 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
     async def fence():
         await apspace[key()]["l"][0].delete()
         for _ in range(3):
-            readings.hear(await anext(monitor))
+            page.hear(await anext(monitor))
 
-    fetcher, history, readings = fetcher_of(binterface, key(), fence)
-    await fetched(fetcher, key())
+    page, history = followed(binterface, key(), fence)
+    await page.read()
     assert history.tree((key(),), time.time())["l"] == [2, 3]
     await monitor.close()
 
@@ -57,17 +45,13 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
 async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, binterface):
     """The connection of the notices breaks: it stays unknown until it is looked at again."""
     await apspace[key()].write({"n": 1, "image": LARGE})
-    asked = asyncio.Event()
 
     async def fence():
-        asked.set()
         raise ConnectionLost("gone")
 
-    fetcher, history, _ = fetcher_of(binterface, key(), fence)
-    fetcher.want((key(),), time.time())
-    task = asyncio.create_task(fetcher.run())
-    await asyncio.wait_for(asked.wait(), 10)
-    await asyncio.sleep(0)
-    task.cancel()
-    assert fetcher.behind == {key()}
-    assert history.kept((key(), "n"), time.time()).late > 0
+    page, history = followed(binterface, key(), fence)
+    page.announced.add((key(),))
+    with pytest.raises(ConnectionLost):
+        await page.read()
+    assert page.announced == {(key(),)}
+    assert history.tree((key(),), time.time()) == {}

@@ -11,13 +11,14 @@ from browserkit import client_of, served
 from picturekit import look_back, running_robot
 
 from reem_async import RedisInterface
+from reem_async.plan.placeholders import Unfetched
 from reem_async.plan.trees import MISSING
 from reem_async.tools.browser import LiveSource
-from reem_async.tools.browser.fetcher import Allowance, Fetcher, Readings
+from reem_async.tools.browser.follower import Follower
 from reem_async.tools.browser.history import Frames, History
 from reem_async.tools.browser.pictures import paint, preview_of
 from reem_async.tools.browser.timeline import PENDING
-from reem_async.tools.browser.trees import Frame, Leaf, framed, leaf_of
+from reem_async.tools.browser.trees import Frame, described, framed
 
 DEFAULT_BUDGET, DEFAULT_SECONDS = 128 << 20, 60
 
@@ -51,17 +52,17 @@ def test_the_slider_of_a_robot_with_two_cameras_has_a_picture_for_each_instant(s
         assert ask.json("activity", bins=10, path="nothing")["pictures"] == []
 
 
-def test_a_fetcher_ends_though_news_come_as_it_is_cancelled():
+def test_reading_arrays_ends_though_news_come_as_it_is_cancelled(server_url):
     """`reem browse` went on for ever after SIGTERM now and then: the cancellation was lost."""
 
     async def work():
-        allowance = Allowance(1.0, 1e6)
-        assert allowance.take(1_000_000)
-        fetcher = Fetcher(None, History(1.0, 1000), allowance, Readings(), None, None)
-        fetcher._owed[("camera",)] = 500_000
-        task = asyncio.create_task(fetcher.run())
+        follower = Follower(RedisInterface(server_url), History(1.0, 2_000_000))
+        assert follower.arrays.take(1_000_000)
+        follower.key("camera").owed["numpy", ".image"] = Unfetched("numpy", 500_000, "")
+        follower._owing["camera"] = None
+        task = asyncio.create_task(follower._read_arrays())
         await asyncio.sleep(0.02)
-        fetcher._news.set()
+        follower._owes.set()
         task.cancel()
         done, _ = await asyncio.wait([task], timeout=5)
         assert done
@@ -103,7 +104,7 @@ def test_the_last_frame_is_shown_with_its_age_where_the_newest_is_not_kept():
     first, small = np.zeros((4, 4), np.uint8), np.full((4, 4), 7, np.uint8)
     history.add_read(("cam", "image"), framed(first), 5.0)
     history.add(("cam", "image"), PENDING, 0, 6.0)
-    history.add_read(("cam", "image"), leaf_of(first), 6.1, answer=True)
+    history.add_read(("cam", "image"), described(first), 6.1, answer=True)
     kept = history.kept(("cam", "image"), 8.0)
     assert kept.value.whole is first
     assert (kept.late, kept.value.time) == (pytest.approx(1.1), 5.0)
@@ -122,7 +123,7 @@ def test_the_items_of_a_list_that_moved_do_not_get_each_others_pictures():
     history.add(("l", 0), MISSING, 0, 2.0)
     assert history.kept(("l", 0), 1.5).value.whole is images[0]
     found = history.kept(("l", 0), 2.5).value
-    assert isinstance(found, Leaf) or found.whole is images[1]
+    assert isinstance(found, Unfetched) or found.whole is images[1]
 
 
 def test_frames_that_nobody_can_see_are_let_go_of():

@@ -35,13 +35,13 @@ async def past_of(url, *names, **options):
 
 async def told(source, *names):
     """Wait until the server tells of the next change of these keys and their arrays, and none is about to be read."""
-    stored = source._follower._stored
+    follower = source._follower
     await aeventually(
         lambda: (
-            all(stored.is_new(name) and source.history.knows(name) and stored.is_told(name) for name in names)
-            and all(stored._document(name) in stored._told for name in names)
-            and not stored._due
-            and not any(looks.due for looks in stored._looks.values())
+            all(name not in follower.unread and source.history.knows(name) for name in names)
+            and all(follower.is_settled(name) for name in names)
+            and not follower._due
+            and not any(key.looks.due or key.busy for key in follower._keys.values())
         )
     )
 
@@ -270,20 +270,16 @@ async def test_what_is_stored_while_the_connection_is_broken_is_seen(server_url,
 
 async def test_nothing_is_kept_of_keys_that_are_gone(server_url, key, akvs):
     async with past_of(server_url) as source:
-        stored = source._follower._stored
+        follower = source._follower
         names = [key(f"gone{number}") for number in range(100)]
         for name in names:
             await akvs[name].write({"image": np.zeros(9)})
-        await aeventually(lambda: all(stored.is_told(name) and source.history.knows(name) for name in names))
+        await aeventually(lambda: all(follower.is_settled(name) and source.history.knows(name) for name in names))
         for name in names:
             await akvs[name].delete()
         await aeventually(lambda: all(content(source, name) is MISSING for name in names))
 
-        def kept():
-            found = [*stored._looks, *stored._arrays, *stored._told, *stored._changed]
-            return [each for each in found if any(name in each for name in names)]
-
-        await aeventually(lambda: not kept())
+        await aeventually(lambda: not any(name in follower._keys for name in names))
         await akvs[names[0]].write({"n": 1})
         await seen(source, {"n": 1}, names[0])
 

@@ -13,7 +13,7 @@ from reem_async.errors import BadKey, ReemError
 from reem_async.plan.paths import check_element, to_jsonpath
 from reem_async.server import EmbeddedServer
 from reem_async.store.catalog import outline
-from reem_async.tools.browser.partial_reads import keys_at, noted_texts, peek
+from reem_async.tools.browser.partial_reads import keys_at, peek
 from reem_async.tools.recording.key_reader import fetch
 
 # U+4E00, U+AC00, U+0100, U+1F600, U+10000: at code points that end in 00 the RedisJSON module has died.
@@ -43,7 +43,6 @@ async def test_no_path_of_a_page_or_a_notice_ends_the_server(server):
     asks = (
         lambda session, path: peek(session, [path]),
         keys_at,
-        lambda session, path: noted_texts(session, [path]),
         lambda session, path: fetch(session, session.keys(path[0]), path[1:]),
         lambda session, path: outline(session.interface, path),
     )

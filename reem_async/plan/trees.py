@@ -170,7 +170,7 @@ def is_addressable(key: str | int) -> bool:
     return True
 
 
-def difference(old: Any, new: Any) -> Path | None:
+def difference(old: Any, new: Any, same: Callable[[Any, Any], bool] = same) -> Path | None:
     """Return the path of the deepest place that holds all differences between two trees; None if they are equal.
 
     It may be an entry of a dict that only one tree has. It is not inside of a list of another length, since the items

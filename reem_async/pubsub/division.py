@@ -28,7 +28,7 @@ to be written (`tools/recording/order.py`), the browser a history.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from enum import Enum, auto
 from typing import Generic, NamedTuple, TypeVar
 
@@ -58,33 +58,21 @@ _ASIDE = Phase.ASIDE, Phase.FENCING
 
 
 class Heard(NamedTuple, Generic[U]):
-    """What was heard.
+    """What was heard."""
 
-    Attributes:
-        update: The update; None if something was published, or lost, of which nothing else is known.
-        missed: How many updates were lost before it, None if unknown.
-        follows: Its number is not lower than what was heard of its publisher before.
-    """
-
-    update: U | None
-    missed: int | None
-    follows: bool = True
+    update: U | None  # the update; None if something was published, or lost, of which nothing else is known
+    missed: int | None  # how many updates were lost before it, None if unknown
+    follows: bool = True  # its number is not lower than what was heard of its publisher before
 
 
 class Division(Generic[U]):
-    """The updates of one top-level key, divided by what is read of it.
-
-    Attributes:
-        gaps: Which updates were heard of; its owner counts there what it hears.
-        phase: Where the read is.
-        begins: Nothing was heard of or read yet: an update that was never heard of is one from before.
-        covered: What is in what is being read, oldest first. What is to be covered by the next read may be added.
-    """
+    """The updates of one top-level key, divided by what is read of it."""
 
     def __init__(self, gaps: GapDetector | None = None) -> None:
-        self.gaps = gaps or GapDetector()
+        self.gaps = gaps or GapDetector()  # which updates were heard of; its owner counts there what it hears
         self.phase = Phase.IDLE
-        self.begins = True
+        self.begins = True  # nothing was heard of or read yet: an update that was never heard of is one from before
+        # What is in what is being read, oldest first. What is to be covered by the next read may be added.
         self.covered: list[Heard[U]] = []
         self._doubtful: list[Heard[U]] = []  # heard while a read is aside: it has the first of them
         self._later: list[Heard[U]] = []  # heard after what was divided
@@ -164,52 +152,30 @@ class Division(Generic[U]):
         return divided
 
 
-async def divided_reads(
-    divisions: Sequence[Division[U]],
-    read: Callable[[], Awaitable[Sequence[tuple[T, Reply] | None]]],
-    fence: Callable[[], Awaitable[None]],
-) -> list[tuple[T, Reply] | None]:
-    """Read several keys at once, with one fence for all if the last update in any of them was not received yet.
-
-    Returns what `read` has returned. It is None where it is not known which updates are in it. Else `take` of the
-    division has them. If this raises or is cancelled, the divisions are as if nothing had been asked for.
-
-    Args:
-        divisions: One for each key; each hears the updates of its key meanwhile.
-        read: Returns for each key a value and the note of the last update, read in one transaction, or None for no
-            answer. It calls `asked` of each division before. It may ask a division itself whether a fence has to
-            pass, and wait for it.
-        fence: Returns when all that was published before has been heard of.
-    """
-    try:
-        found = await read()
-        answers = [(each, it) for each, it in zip(divisions, found, strict=True) if it is not None]
-        waiting = [each for each, it in answers if each.phase is not Phase.FENCING and not each.answered(it[1])]
-        if waiting:
-            await fence()
-        known = {id(each) for each, it in answers if each.divide(it[1])}
-        return [it if id(each) in known else None for each, it in zip(divisions, found, strict=True)]
-    except BaseException:
-        for each in divisions:
-            each.give_up()
-        raise
-
-
 async def divided_read(
     division: Division[U], read: Callable[[], Awaitable[tuple[T, Reply]]], fence: Callable[[], Awaitable[None]]
 ) -> T:
-    """Read one key like `divided_reads`, and again in the rare case that the updates in it are not known.
+    """Read a key, and again in the rare case that it is not known which updates are in what was read.
+
+    `take` of the division has them then. If this raises or is cancelled, the division is as if nothing had been asked.
+
+    Args:
+        division: Hears the updates of the key meanwhile.
+        read: Returns a value and the note of the last update, read in one transaction. It calls `asked` of the division
+            before. It may ask the division itself whether a fence has to pass, and wait for it.
+        fence: Returns when all that was published before has been heard of.
 
     Raises:
         Conflict: A publisher wrote all the time whose notices never arrived.
     """
-
-    async def read_one() -> Sequence[tuple[T, Reply]]:
-        return [await read()]
-
-    for _ in range(_TRIES):
-        (found,) = await divided_reads([division], read_one, fence)
-        if found is not None:
-            return found[0]
-    division.give_up()
-    raise Conflict("updates came all the time that were never heard of")
+    try:
+        for _ in range(_TRIES):
+            found, note = await read()
+            if division.phase is not Phase.FENCING and not division.answered(note):
+                await fence()
+            if division.divide(note):
+                return found
+        raise Conflict("updates came all the time that were never heard of")
+    except BaseException:
+        division.give_up()
+        raise

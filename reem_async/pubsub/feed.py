@@ -36,7 +36,7 @@ U = TypeVar("U", bound=Numbered)
 class Read(NamedTuple):
     """Send the commands of a plan and bring the replies to `answered`.
 
-    Over the connection of the notices, or if the plan is `bulk` over another one.
+    Over the connection of the notices, or if the plan is `bulk` or the feed reads `aside` over another one.
     """
 
     number: int
@@ -67,16 +67,11 @@ Step = Read | Arm | Fence | Open
 
 
 class HeldAttachments:
-    """The attachments of a copy that need not be read again.
-
-    Attributes:
-        values: What ships made of them, by label and suffix.
-        asked: The keys that the last plan reads.
-    """
+    """The attachments of a copy that need not be read again."""
 
     def __init__(self, keys: Keys) -> None:
-        self.values: dict[tuple[str, str], Any] = {}
-        self.asked: frozenset[str] = frozenset()
+        self.values: dict[tuple[str, str], Any] = {}  # what ships made of them, by label and suffix
+        self.asked: frozenset[str] = frozenset()  # the keys that the last plan reads
         self._keys = keys
         self._stale: set[str] = set()  # suffixes of those that were changed since they were asked for
         self._raw: RawRead | None = None
@@ -113,7 +108,6 @@ class HeldAttachments:
         return True
 
     def opening(self, raw_read: RawRead) -> None:
-        """Ships are making values of what was read."""
         self._raw = raw_read
 
     def failed(self) -> None:
@@ -141,19 +135,17 @@ class KeyFeed(Generic[U]):
         division: Which updates are in what is read; a new one if not given.
 
     Attributes:
-        number: Of the last read. Answers to others are too late.
         tracked: The server reports when what is read is changed.
         dirty: Something was changed that no read which was asked for may have.
-        reads_all: The read that is under way has all that is followed of the key.
-        attachments: Those that need not be read again.
     """
 
-    def __init__(self, keys: Keys, division: Division[U] | None = None) -> None:
+    def __init__(self, keys: Keys, division: Division[U] | None = None, *, aside: bool = False) -> None:
+        self._aside = aside
         self.division: Division[U] = division or Division(GapDetector())
-        self.number = 0
-        self.reads_all = True
+        self.number = 0  # Of the last read. Answers to others are too late.
+        self.reads_all = True  # the read that is under way has all that is followed of the key
         self.tracked = self.dirty = False
-        self.attachments = HeldAttachments(keys)
+        self.attachments = HeldAttachments(keys)  # those that need not be read again
         self._plan: Plan | None = None  # on its way
         self._outcome: list[Reply] = []  # of the plan, while its fence is on its way
 
@@ -177,8 +169,9 @@ class KeyFeed(Generic[U]):
         return self._ask(plan)
 
     def _ask(self, plan: Plan) -> Read | Arm:
-        arms = plan.bulk and self.tracked
-        self.division.asked(in_order=arms or not plan.bulk)
+        aside = plan.bulk or self._aside
+        arms = aside and self.tracked
+        self.division.asked(in_order=arms or not aside)
         self._plan = plan
         if self.tracked:
             self._arm(plan)
@@ -249,6 +242,5 @@ class KeyFeed(Generic[U]):
 
 
 def last_note(replies: list[Reply]) -> Reply:
-    """Return the note that comes last in a transaction."""
     last = replies[-1] if replies else None
     return last[-1] if isinstance(last, list) and last else None

@@ -9,6 +9,7 @@ import secrets
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any
 
+import numpy as np
 import orjson
 from starlette.datastructures import Headers
 from starlette.requests import Request
@@ -31,7 +32,7 @@ from ...errors import (
     WrongKind,
 )
 from ...plan.paths import Path, show
-from .source import Node, NotKept, Series, Source, address, path_of, visible
+from .source import Node, NotKept, Series, Source, address, path_of, thinned, visible
 
 # Requests: parameters are checked, and errors become answers with the right status.
 
@@ -55,15 +56,11 @@ _STATUS: tuple[tuple[type[Exception], int], ...] = (
 
 
 class RefusedRequest(Exception):
-    """A request is not answered.
-
-    Attributes:
-        status: The HTTP status.
-    """
+    """A request is not answered."""
 
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
-        self.status = status
+        self.status = status  # the HTTP status
 
 
 def reply(content: Any, status: int = 200) -> Response:
@@ -184,16 +181,13 @@ class Api:
     """Answers about one source.
 
     Args:
-        source: What is shown.
         allow_write: Whether values may be changed.
-
-    Attributes:
-        key: What a request that changes something must carry: pages from elsewhere do not know it.
     """
 
     def __init__(self, source: Source, allow_write: bool) -> None:
         self._source = source
         self.allow_write = allow_write and source.writable
+        # What a request that changes something must carry: pages from elsewhere do not know it
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
@@ -321,18 +315,10 @@ def _marked(node: Node, marks: tuple[set[Path], set[Path]]) -> dict[str, Any]:
 
 
 def _thinned(series: Series) -> Series:
-    """Return a series with as many points as a screen has room for: the extremes of each part of the first line."""
-    count = len(series.times)
-    if count <= _MOST_POINTS:
+    """Return a series with as many points as a screen has room for."""
+    if len(series.times) <= _MOST_POINTS:
         return series
-    # Two points for each part: the least and the greatest, so that no peak is lost.
-    step = -(-count * 2 // _MOST_POINTS)
-    chosen: set[int] = {0, count - 1}
-    first = series.lines[0]
-    for edge in range(0, count, step):
-        part = [(value, index) for index, value in enumerate(first[edge : edge + step], edge) if value is not None]
-        chosen.update((min(part)[1], max(part)[1]) if part else (edge,))
-    places = sorted(chosen)
+    places = thinned(np.array(series.lines, float).T, _MOST_POINTS)  # None becomes NaN
     lines = [[values[index] for index in places] for values in series.lines]
     return Series(series.names, [series.times[index] for index in places], lines)
 
@@ -356,15 +342,11 @@ class Events:
 
     Each event has the paths that changed since the event before, however long ago that was. A slow page gets fewer
     events, and nothing piles up for it.
-
-    Args:
-        source: What is shown.
-        ending: Whether the program ends.
     """
 
     def __init__(self, source: Source, ending: Callable[[], bool]) -> None:
         self._source = source
-        self._ending = ending
+        self._ending = ending  # whether the program ends
         self._clients = 0
 
     def routes(self) -> list[Route]:

@@ -20,11 +20,12 @@ from starlette.routing import Route
 
 from ...errors import BadType, BadValue
 from ...plan.paths import Path, show
+from ...plan.placeholders import Unfetched
 from ..jsontext import json_text
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
 from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
-from .source import NotKept, Sample, Source, address, shown_text
-from .trees import Leaf, leaf_of
+from .source import NotKept, Sample, Source, address, shown_text, thinned
+from .trees import described
 
 # Tables, lines and histograms: as much of an array as a screen has room for.
 
@@ -86,30 +87,15 @@ def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
     columns = plane.reshape(-1, 1) if plane.ndim == 1 else plane
     total = columns.shape[1]
     columns = columns[:, :_MOST_CURVES]
-    places, picked = _thinned(columns)
+    places = thinned(columns, _POINTS)
     names = [""] if plane.ndim == 1 else [f"[{index}]" for index in range(columns.shape[1])]
     return {
         "names": names,
         "times": places,
-        "lines": [[_finite(item) for item in column] for column in picked.T.tolist()],
+        "lines": [[_finite(item) for item in column] for column in columns[places].T.tolist()],
         "more": total - columns.shape[1],
         "magnitude": magnitude,
     }
-
-
-def _thinned(columns: np.ndarray[Any, Any]) -> tuple[list[int], np.ndarray[Any, Any]]:
-    """Return the rows to draw, and which they are: of each part those where a line has its extremes."""
-    count, curves = columns.shape
-    if count <= _POINTS:
-        return list(range(count)), columns
-    step = -(-count * 2 * curves // _POINTS)
-    chosen = {0, count - 1}
-    for edge in range(0, count, step):
-        piece = columns[edge : edge + step].astype(np.float64)
-        for substitute, pick in ((np.inf, np.argmin), (-np.inf, np.argmax)):
-            chosen.update((edge + pick(np.where(np.isnan(piece), substitute, piece), axis=0)).tolist())
-    places = sorted(chosen)
-    return places, columns[places]
 
 
 def histogram(array: np.ndarray[Any, Any], bins: int = 64) -> dict[str, Any]:
@@ -211,7 +197,7 @@ def _check_json(value: Any, path: Path) -> None:
     elif not (value is None or isinstance(value, str | bool | int | float | bytes)):
         if isinstance(value, np.ndarray) and value.size <= _LONGEST_LIST:
             return
-        leaf = leaf_of(value)
+        leaf = described(value)
         raise BadType(f"{show(path)}, {leaf.label} {leaf.summary}, cannot be JSON; choose npy for it, or use Python")
 
 
@@ -274,15 +260,19 @@ def _png(value: Any, path: Path, chosen: str | None) -> bytes:
 def _array(value: Any, path: Path) -> np.ndarray[Any, Any]:
     if isinstance(value, np.ndarray):
         return value
-    if isinstance(value, list):
-        try:
-            array = np.array(value)
-        except ValueError:
-            array = np.array([], object)
-        if array.dtype.kind in "biuf":
-            return array
-    what = "not kept for this instant" if isinstance(value, Leaf) else f"of type {type(value).__name__}"
+    if isinstance(value, list) and (array := _numbers(value)) is not None:
+        return array
+    what = "not kept for this instant" if isinstance(value, Unfetched) else f"of type {type(value).__name__}"
     raise BadType(f"{show(path)} is {what}, not an array; use format=json")
+
+
+def _numbers(value: list[Any]) -> np.ndarray[Any, Any] | None:
+    """Return a list of numbers as an array, None if it holds other things."""
+    try:
+        array = np.array(value)
+    except ValueError:  # lists of different lengths
+        return None
+    return array if array.dtype.kind in "biuf" else None
 
 
 def _part(array: np.ndarray[Any, Any], chosen: str | None, most_free: int) -> np.ndarray[Any, Any]:
@@ -313,11 +303,7 @@ _MAGIC = ((b"\x89PNG\r\n\x1a\n", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), 
 
 
 class Arrays:
-    """Answers about arrays of one source. Large ones are worked on in a thread, one at a time.
-
-    Args:
-        source: What is shown.
-    """
+    """Answers about arrays of one source. Large ones are worked on in a thread, one at a time."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -350,10 +336,10 @@ class Arrays:
         path, at = value_path_in(request), at_of(request)
         sample = await self._source.value(path, at)
         value = sample.value
-        if isinstance(value, Leaf):
+        if isinstance(value, Unfetched):
             raise NotKept(f"the array at {show(path)} is not kept for this instant: there was no room for it")
-        if isinstance(value, list):
-            value = _array_of(value, path)
+        if isinstance(value, list) and (value := _numbers(value)) is None:
+            raise BadType(f"{show(path)} is a list that holds other things than numbers")
         if not isinstance(value, np.ndarray | Preview):
             raise BadType(f"{show(path)} is of type {type(value).__name__}, not an array")
         return sample._replace(value=value)
@@ -405,11 +391,9 @@ class Arrays:
         return Response(picture.png, headers={"x-picture": orjson.dumps(told).decode()}, media_type="image/png")
 
     async def colours(self, request: Request) -> Response:
-        """Return the colours of a map from its low to its high end, for the scale below a picture."""
         return reply(colours_of(request.query_params.get("map", "grey")))
 
     async def table(self, request: Request) -> Response:
-        """Return some rows and columns of a part of an array."""
         array, said = await self._array(request)
         plane = part(array, _slice(request, array, 2))
         row, column = (integer_of(request, name, 0, 2**48) for name in ("row", "column"))
@@ -423,7 +407,6 @@ class Arrays:
         return reply({**await self._do(plane.nbytes, lambda: line(plane)), **said})
 
     async def histogram(self, request: Request) -> Response:
-        """Return how often which numbers are in a part of an array."""
         array, said = await self._array(request)
         some = part(array, _slice(request, array, array.ndim))
         return reply({**await self._do(some.nbytes, lambda: histogram(some)), **said})
@@ -436,7 +419,6 @@ class Arrays:
         return reply({"rows": rows, "bytes": len(value), "picture": picture_type(value) is not None})
 
     async def picture(self, request: Request) -> Response:
-        """Return bytes that are a PNG, JPEG or GIF file as such."""
         value = await self._bytes(request)
         kind = picture_type(value)
         if kind is None:
@@ -446,7 +428,7 @@ class Arrays:
     async def _bytes(self, request: Request) -> Any:
         path = value_path_in(request)
         value = (await self._source.value(path, at_of(request))).value
-        if isinstance(value, Leaf):
+        if isinstance(value, Unfetched):
             raise NotKept(f"the bytes at {show(path)} are not kept for this instant: there was no room for them")
         if not isinstance(value, bytes):
             raise BadType(f"{show(path)} is of type {type(value).__name__}, not bytes")
@@ -458,18 +440,7 @@ def _when(sample: Sample) -> dict[str, float | None]:
 
 
 def picture_type(value: Any) -> str | None:
-    """Return the media type of bytes that are a picture."""
     return next((kind for magic, kind in _MAGIC if value.startswith(magic)), None)
-
-
-def _array_of(value: list[Any], path: Path) -> np.ndarray[Any, Any]:
-    try:
-        array = np.array(value)
-    except ValueError:
-        array = np.array([], object)
-    if array.dtype.kind not in "biuf":
-        raise BadType(f"{show(path)} is a list that holds other things than numbers")
-    return array
 
 
 def _slice(request: Request, array: np.ndarray[Any, Any] | Preview, most_free: int) -> Slice:

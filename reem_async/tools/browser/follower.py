@@ -1,4 +1,11 @@
-"""Filling the rolling buffer: every published update, and what the server says was only stored."""
+"""Filling the rolling buffer: every published update, and what the server says was only stored.
+
+Each key has a feed, as a subscriber's and a recording's. Its document is read, without the arrays, a moment after the
+server has said that it was changed, or an update was only announced. What differs then from the buffer goes into it.
+Arrays that were changed are read in turn, as far as an allowance goes.
+
+What the server does not tell of, since it may not be asked or the connection for it is broken, is read each second.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +13,31 @@ import asyncio
 import math
 import time
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from itertools import islice
 from typing import Any
 
 from ...concurrency.queues import Last
 from ...concurrency.streams import arrived
 from ...connection import RedisInterface
-from ...errors import RedisError, ReemError
-from ...plan.paths import Path
-from ...plan.trees import MISSING
+from ...errors import BadData, Conflict, NotAllowed, RedisError, ReemError, WrongKind
+from ...plan import wire_commands
+from ...plan.paths import Path, below
+from ...plan.placeholders import Unfetched, Unreadable, marked
+from ...plan.reads import RawRead, read
+from ...plan.trees import MISSING, changed, get, walk
+from ...pubsub.division import Division, Heard
+from ...pubsub.feed import Arm, Fence, KeyFeed, Open, Read, Step
 from ...pubsub.finder import find_regularly, present_keys
+from ...pubsub.gaps import GapDetector
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event, Monitor
-from ...pubsub.refresh import BACKGROUND_RATE
-from .fetcher import Allowance, Fetcher, Readings
-from .history import History
-from .stored_changes import StoredChanges
+from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
+from ...store.reader import opened
+from .history import LARGEST_TEXT, History
+from .timeline import PENDING
+from .trees import framed, is_kept, same, weight
 
 _WAITING = 50_000
 """Updates that wait for this program before the oldest are skipped."""
@@ -31,48 +47,265 @@ _MOST_SHARED = 10_000
 _SHARED_SECONDS = 10.0
 """For so long a publisher is said to share memory after it has; as in `reem top`."""
 
+_RECENT = 16
+"""Updates that are known again if they come twice, where there may be thousands of keys."""
+
+# Documents that are asked for at the same time.
+_BATCH = 100
+_REST = 4
+"""How many times as long as reading took none are read: others ask the server, and this program, too."""
+_PAUSE = 0.1
+"""Seconds after a read that failed."""
+_SHARE = 4
+"""A key may take one in so many of the bytes that are read."""
+
+
+Attachment = tuple[str, str]
+"""The label and the suffix of an attachment."""
+
+
+class Allowance:
+    """So many bytes a second (`rate`), saved up to a limit."""
+
+    def __init__(self, rate: float, most: float) -> None:
+        self.most = most  # bytes that can be saved up
+        self._rate, self._saved, self._then = rate, most, time.monotonic()
+
+    def take(self, size: int) -> bool:
+        """Take so many bytes if they are there; else nothing, and return False."""
+        if self.wait(size) > 0:
+            return False
+        self._saved -= size
+        return True
+
+    def wait(self, size: int) -> float:
+        """Return the seconds until so many bytes are there; infinite if there never are so many."""
+        now = time.monotonic()
+        self._saved = min(self._saved + (now - self._then) * self._rate, self.most)
+        self._then = now
+        return math.inf if size > self.most else max((size - self._saved) / self._rate, 0.0)
+
+
+class FollowedKey:
+    """One top-level key: its feed, and what the buffer lacks of it."""
+
+    def __init__(self, follower: Follower, name: str) -> None:
+        self.name = name
+        self._follower = follower
+        self._session = follower.session
+        self._history = follower.history
+        self._keys = self._session.keys(name)
+        self.feed: KeyFeed[Event] = KeyFeed(self._keys, Division(GapDetector(_RECENT)), aside=True)
+        self.looks = RefreshTimer(self, FollowedKey._look, BACKGROUND)
+        self.announced: set[Path] = set()  # where updates were only announced
+        # The arrays that were changed and not read yet, by label and suffix
+        self.owed: dict[Attachment, Unfetched] = {}
+        self._answers: set[Attachment] = set()  # of these, the buffer has already that they were changed
+        self.busy = False
+
+    def _look(self) -> None:
+        self._follower.read_soon([self.name])
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the buffer has all that is known to have changed, and the server reports the next change."""
+        return self.feed.tracked and not (self.feed.dirty or self.owed or self.announced)
+
+    def hear(self, event: Event) -> None:
+        self.looks.heard += 1
+        division = self.feed.division
+        if division.gaps.count(event) is not None:
+            division.hear(Heard(event, None if event.gap else 0))
+        if event.gap:
+            self.doubt()
+        if event.value is ANNOUNCED:
+            self.announced.add(event.path)
+            self.looks.found()
+            self.looks.ask()
+        elif not self.feed.tracked:
+            self.looks.ask()
+
+    def doubt(self) -> None:
+        """Note that any change may be unknown."""
+        self.feed.change(None)
+        self.looks.ask()
+
+    def owing(self, most: float) -> dict[Attachment, Unfetched]:
+        """Return the arrays to be read, the smallest first, as many as have no more than so many bytes."""
+        chosen, size = {}, 0
+        for place, it in sorted(self.owed.items(), key=lambda item: item[1].size):
+            size += it.size
+            if size <= most:
+                chosen[place] = it
+        return chosen
+
+    async def read(self, most: float = -1) -> int:
+        """Read the key, put what differs from the buffer into it, and return how many bytes the document has.
+
+        Args:
+            most: Arrays that are owed are read as long as they have no more than so many bytes; -1 for none.
+        """
+        self.busy = True
+        held = self.feed.attachments.values
+        for place in self.owing(most):
+            held.pop(place, None)
+        try:
+            raw_read = await self._read(most)
+            await opened(raw_read)
+            manager_of(self._session).report(raw_read.unreadable)
+            for slot, _, _ in raw_read.slots:
+                slot.container[slot.key] = await asyncio.to_thread(framed, slot.container[slot.key])
+            self._recognize(raw_read)
+            text = bytes(raw_read.raw[0] or b"")[1:-1] or None
+            found = {slot.placeholder[:2]: slot.container[slot.key] for slot, _, _ in raw_read.slots}
+            self._compare(raw_read.holder[0], text, {**raw_read.left, **found}, self.feed.take()[1])
+        except (WrongKind, NotAllowed):
+            self._compare(MISSING, None, {}, self.feed.give_up()[1])
+            return 0
+        except BadData as error:  # what was there before is not there any more
+            self._compare(Unreadable(self.name, str(error)), None, {}, self.feed.give_up()[1])
+            return 0
+        except BaseException:
+            self.feed.give_up()
+            raise
+        finally:
+            self.busy = False
+        return len(text or b"")
+
+    async def _read(self, most: float) -> RawRead:
+        """Perform the steps of a read."""
+        session, feed, noted = self._session, self.feed, (("GET", self._keys.last),)
+        await session.ships.ready()
+        held = feed.attachments.values
+        feed.tracked = True
+        step: Step | None = feed.read(
+            read(self._keys, (), session.ships, session.cache, noted, held, most, tolerant=True)
+        )
+        while not isinstance(step, Open):
+            if isinstance(step, Arm):
+                feed.tracked = await manager_of(session).touch(self._keys.channel, step.keys, feed.touched)
+                step = feed.armed()
+            elif isinstance(step, Read):
+                replies = await session.transport.roundtrip(wire_commands(step.plan), bulk=step.plan.bulk)
+                step = feed.answered(replies)
+            elif isinstance(step, Fence):
+                await self._follower.fence()
+                step = feed.fenced()
+            else:
+                raise Conflict(f"{self.name}: updates came that were never heard of")
+        return step.raw_read
+
+    def _recognize(self, raw_read: RawRead) -> None:
+        """Put what the buffer has in the place of arrays that are bit by bit the same."""
+        fetched = {id(slot.container[slot.key]): slot for slot, _, _ in raw_read.slots}
+        before = self._history.tree((self.name,), self._history.clock.now()) if fetched else MISSING
+        for path, it in walk(raw_read.holder[0], ()) if fetched else ():
+            if (slot := fetched.get(id(it))) is not None and is_kept(old := get(before, path), it):
+                slot.container[slot.key] = old
+
+    def _compare(
+        self, tree: Any, text: bytes | None, found: Mapping[Attachment, Any], heard: Sequence[Heard[Event]]
+    ) -> None:
+        """Put what was read into the buffer, as far as it differs.
+
+        Args:
+            tree: What is at the key.
+            text: Its document's text, None if there is none.
+            found: What is in the tree for the arrays that were changed: a frame, or that it was not fetched.
+            heard: The updates in the buffer that are not in the tree.
+        """
+        history, name, follower = self._history, self.name, self._follower
+        when, first = history.clock.now(), name in follower.unread
+        if text is not None and not history.knows(name):
+            history.begin(name, text if first else None)
+        later = [each.update for each in heard if each.update is not None]
+        for event in later:
+            if event.value is not ANNOUNCED:
+                tree = changed(tree, event.path[1:], MISSING if event.deleted else event.value)
+        # First the answers to what was announced, then what differs from all that is known.
+        lacking = {event.path for event in later if event.value is ANNOUNCED}
+        noted = list(self.announced - lacking)
+        self.announced &= lacking
+        for path in noted:
+            history.add_read(path, get(tree, path[1:]), when, answer=True)
+        place = history.difference(name, tree, None if later else text, when)
+        if place is not None:
+            noted.append(place)
+            self.looks.found()
+            value = get(tree, place[1:])
+            if (size := weight(value)) <= LARGEST_TEXT or follower.texts.take(size):
+                history.add_read(place, value, when)
+            else:
+                history.add(place, PENDING, 0, when)
+        if found or self.owed or (text is not None and marked(text)):
+            self._compare_arrays(tree, found, noted, when)
+        if not later:
+            history.remember(name, text)
+        follower.unread.discard(name)
+        follower.was_read(self, gone=tree is MISSING)
+
+    def _compare_arrays(self, tree: Any, found: Mapping[Attachment, Any], noted: Sequence[Path], when: float) -> None:
+        """Put the arrays that were read into the buffer, and note which others are to be read.
+
+        Those of a key that was never seen to change are not read: the buffer has what the document says of them.
+        """
+        first, owed, answers = self.name in self._follower.unread, self.owed, self._answers
+        places = {id(it): place for place, it in {**self.feed.attachments.values, **found}.items()}
+        before = self._history.tree((self.name,), when)
+        self.owed = {}
+        for path, it in walk(tree, (self.name,)):
+            place, is_unreadable = places.get(id(it)), type(it) is Unreadable
+            if place is None and not is_unreadable:
+                continue
+            is_noted, old = any(below(path, each) for each in noted), get(before, path[1:])
+            is_news = not same(it, old) if is_unreadable else place in found and it is not old
+            if isinstance(it, Unfetched) and place is not None:
+                if not (is_noted or place in owed or (self.feed.tracked and not first)):
+                    continue  # as far as is known it is as it was
+                if it.size <= self._follower.arrays.most:
+                    self.owed[place], is_news = it, False
+            if is_noted and place is not None:
+                answers.add(place)
+            elif is_news:
+                self._history.add_read(path, it, when, answer=place in answers)
+        answers.intersection_update(self.owed)
+
 
 class Follower:
-    """Keeps a `History` up to date.
-
-    Args:
-        interface: The server.
-        history: Where changes go.
-
-    Attributes:
-        names: The top-level keys, sorted.
-        lost: Why the server cannot be read at the moment; empty if all is well.
-    """
+    """Keeps a `History` up to date."""
 
     def __init__(self, interface: RedisInterface, history: History) -> None:
         self._interface = interface
-        self._history = history
-        allowance = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
-        arrays = Allowance(BACKGROUND_RATE, history.budget / 2)  # four pictures a second each of two cameras
-        session = interface.session
-        self._readings = Readings()
-        self._fetcher = Fetcher(session, history, arrays, self._readings, self._fence, self._touch)
-        self._stored = StoredChanges(
-            session, history, self._fetcher, allowance, self._readings, self._pump, self._fence
-        )
+        self.session = interface.session
+        self.history = history
+        # Bytes of long documents that may be kept
+        self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
+        # Bytes of arrays that may be read: four pictures a second each of two cameras
+        self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
         self._monitor = Monitor(interface, policy=Last(_WAITING))
-        self._fetcher.failed = self._monitor.invalidated = self._stored.doubt
-        self._monitor.broken, self._monitor.changed = self._stored.lost, self._stored.changed
+        self._monitor.invalidated = lambda name: self.key(name).doubt()
+        self._monitor.broken, self._monitor.changed = self._lost, self._changed
         self._tasks: list[asyncio.Task[None]] = []
+        self._keys: dict[str, FollowedKey] = {}
+        self._due: dict[str, None] = {}  # documents to be read
+        self._owing: dict[str, None] = {}  # keys with arrays to be read
+        self._news, self._owes = asyncio.Event(), asyncio.Event()
         self._shared: dict[str, float] = {}  # when the last value of a key came that is in shared memory too
-        self.names: list[str] = []
-        self.lost = ""
+        self.names: list[str] = []  # the top-level keys, sorted
+        # Keys that were there when following began and were not read yet: what they hold is no change
+        self.unread: set[str] = set()
+        self.lost = ""  # why the server cannot be read at the moment; empty if all is well
 
     async def start(self) -> None:
-        """List the keys and begin to follow."""
         if self._tasks:
             return
         await self._interface.initialize()
         await self._monitor.listen()
         await self._monitor.watch_changes()
         self.names = sorted(await self._present())
-        self._stored.begin(self.names)
-        for work in (self._follow(), self._fetcher.run(), self._stored.run(), find_regularly(self._search)):
+        self.unread.update(self.names)
+        self.read_soon(self.names)
+        for work in (self._follow(), self._read_documents(), self._read_arrays(), find_regularly(self._search)):
             self._tasks.append(asyncio.create_task(work))
 
     async def close(self) -> None:
@@ -80,26 +313,31 @@ class Follower:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        self._stored.close()
+        for key in self._keys.values():
+            key.looks.cancel()
         await self._monitor.close()
 
     @property
     def skipped(self) -> int:
-        """How many updates were dropped because they came too fast."""
         return self._monitor.dropped
 
     @property
     def hears_of_changes(self) -> bool:
         """Whether no server has refused to report which keys are changed."""
-        return manager_of(self._interface.session).hears_of_changes
+        return manager_of(self.session).hears_of_changes
 
-    def is_told(self, name: str) -> bool:
-        """Return whether the server reports changes of the arrays of a key."""
-        return self._stored.is_told(name)
+    def is_settled(self, name: str) -> bool:
+        """Return whether the buffer has all changes of a key and its arrays, as far as is known."""
+        return name in self._keys and self._keys[name].is_settled
 
     def is_shared(self, name: str) -> bool:
         """Return whether programs on the publisher's host could of late take what is published from its memory."""
         return time.monotonic() - self._shared.get(name, -math.inf) < _SHARED_SECONDS
+
+    def key(self, name: str) -> FollowedKey:
+        if name not in self._keys:
+            self._keys[name] = FollowedKey(self, name)
+        return self._keys[name]
 
     # --- what is published
 
@@ -107,9 +345,9 @@ class Follower:
         async for event in self._monitor:
             self._take(event)
 
-    async def _fence(self) -> None:
+    async def fence(self) -> None:
         """Take all updates that were published before now."""
-        await manager_of(self._interface.session).fence()
+        await manager_of(self.session).fence()
         self._pump()
 
     def _pump(self) -> None:
@@ -117,39 +355,119 @@ class Follower:
         for event in arrived(self._monitor):
             self._take(event)
 
-    async def _touch(self, path: Path, tree: Any) -> None:
-        await self._stored.touch(path, tree)
-
     def _take(self, event: Event) -> None:
         name = event.name
         if event.local:
             if len(self._shared) > _MOST_SHARED:
                 self._shared.clear()
             self._shared[name] = time.monotonic()
-        self._readings.hear(event)
-        self._stored.heard(event)
         if len(event.path) == 1 and event.deleted:
             self._forget(name)
-        elif len(event.path) == 1 or name not in self._history.names:
+        elif len(event.path) == 1 or name not in self.history.names:
             self._note_name(name)
-        when = self._history.clock.of(event.received)
-        if event.value is ANNOUNCED:
-            self._fetcher.want(event.path, when)
-        else:
-            value = MISSING if event.deleted else event.value
-            self._history.add(event.path, value, event.size, when)
+        when = self.history.clock.of(event.received)
+        value = MISSING if event.deleted else PENDING if event.value is ANNOUNCED else event.value
+        self.history.add(event.path, value, 0 if value is PENDING else event.size, when)
+        self.key(name).hear(event)
 
     def _note_name(self, name: str) -> None:
-        if not self._history.knows(name) and self._stored.is_new(name):
-            self._history.begin(name, None)
-        index = _place(self.names, name)
-        if index == len(self.names) or self.names[index] != name:
+        if not self.history.knows(name) and name not in self.unread:
+            self.history.begin(name, None)
+        index = bisect_left(self.names, name)
+        if self.names[index : index + 1] != [name]:
             self.names = [*self.names[:index], name, *self.names[index:]]
 
     def _forget(self, name: str) -> None:
-        index = _place(self.names, name)
-        if index < len(self.names) and self.names[index] == name:
+        index = bisect_left(self.names, name)
+        if self.names[index : index + 1] == [name]:
             self.names = [*self.names[:index], *self.names[index + 1 :]]
+
+    # --- what the server says was changed
+
+    def _changed(self, server_key: str | None) -> None:
+        self._pump()  # a notice that came before is of an earlier change
+        if server_key is None:
+            self._lost()
+            self.read_soon(self.history.names)
+            return
+        tagged = server_key[1:].partition("}")[0] if server_key.startswith("{") else server_key
+        name = tagged.removeprefix(self.session.namespace)
+        if name in self._keys or server_key == self.session.namespace + name:
+            key = self.key(name)
+            if key.feed.change(server_key):
+                key.looks.ask()
+
+    def _lost(self) -> None:
+        """Note that changes may be unknown: the connection that reports them is lost."""
+        for key in self._keys.values():
+            key.feed.change(None)
+            key.feed.tracked = False
+
+    # --- what is read
+
+    def read_soon(self, names: Iterable[str]) -> None:
+        self._due.update(dict.fromkeys(names))
+        self._news.set()
+
+    def was_read(self, key: FollowedKey, *, gone: bool) -> None:
+        """Note that arrays are to be read; keep nothing of a key that is gone: if it comes again, it is found."""
+        if key.owed:
+            self._owing.setdefault(key.name)
+            self._owes.set()
+        elif gone and not key.looks.due:
+            self._keys.pop(key.name, None)
+
+    async def _read_documents(self) -> None:
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            while batch := list(islice(self._due, _BATCH)):
+                for name in batch:
+                    del self._due[name]
+                began = time.monotonic()
+                sizes = await asyncio.gather(*[self._read(self.key(name)) for name in batch])
+                if None in sizes:
+                    self.read_soon(name for name, size in zip(batch, sizes, strict=True) if size is None)
+                    await asyncio.sleep(_PAUSE)
+                took, size = time.monotonic() - began, sum(filter(None, sizes))
+                # At the beginning the page waits for it; what it asks for goes first.
+                await asyncio.sleep(0.002 if self.unread else max(_REST * took, size / BACKGROUND_RATE))
+
+    async def _read(self, key: FollowedKey) -> int | None:
+        """Read a document; return how many bytes it has, None if that failed."""
+        if key.busy:
+            key.looks.ask()
+            return 0
+        try:
+            size = await key.read()
+        except (RedisError, ReemError, OSError):
+            return None
+        key.looks.earliest = asyncio.get_running_loop().time() + _SHARE * size / BACKGROUND_RATE
+        return size
+
+    async def _read_arrays(self) -> None:
+        """Read the arrays of one key after the other, so that of each there is one now and then."""
+        rested = 0.0
+        while True:
+            self._owes.clear()
+            key = next((self.key(name) for name in self._owing if not self.key(name).busy), None)
+            size = 0 if key is None else sum([it.size for it in key.owing(self.arrays.most).values()])
+            wait = max(self.arrays.wait(size), rested - time.monotonic(), 0.0) if key is not None else None
+            if key is None or wait:
+                with suppress(TimeoutError):
+                    # wait_for of Python 3.11 loses a cancellation that comes with news
+                    async with asyncio.timeout(wait or (_PAUSE if self._owing else None)):
+                        await self._owes.wait()
+                continue
+            del self._owing[key.name]
+            self.arrays.take(size)
+            began = time.monotonic()
+            try:
+                await key.read(self.arrays.most)
+            except (RedisError, ReemError, OSError):
+                key.doubt()
+                await asyncio.sleep(_PAUSE)
+            rested = time.monotonic() + _REST * (time.monotonic() - began)
 
     # --- which keys there are
 
@@ -163,7 +481,7 @@ class Follower:
         return True
 
     async def _present(self) -> set[str]:
-        return await present_keys(self._interface.session, ["*"])
+        return await present_keys(self.session, ["*"])
 
     def _ended(self) -> str:
         """Return why following ended, if it did: what is shown would no longer be news."""
@@ -171,13 +489,11 @@ class Follower:
         return f"following ended: {ended[0].exception()!r}" if ended else ""
 
     async def _find(self) -> None:
+        """List the keys; read those that the server does not report, and those that are gone."""
         before = set(self.names)
         present = await self._present()
         # The list may be older than what was heard meanwhile.
         present.update(set(self.names) - before)
         self.names = sorted(present)
-        self._stored.listed(self.names, before - present)
-
-
-def _place(ordered: Sequence[str], name: str) -> int:
-    return bisect_left(ordered, name)
+        self.read_soon(name for name in self.names if name not in self._keys or not self._keys[name].feed.tracked)
+        self.read_soon(before - present)

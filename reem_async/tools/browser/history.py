@@ -13,10 +13,11 @@ from operator import attrgetter
 from typing import Any
 
 from ...plan.paths import Path, related
-from ...plan.trees import MISSING, walk
+from ...plan.placeholders import Unfetched
+from ...plan.trees import MISSING, difference, walk
 from .source import rate_span
 from .timeline import PENDING, UNKNOWN, BufferedChange, BufferedPast, Kept
-from .trees import Frame, Leaf, same, tree_of, weight
+from .trees import Frame, same, weight
 
 # One clock for everything in the buffer, which is never set back.
 
@@ -54,25 +55,21 @@ _TIME = attrgetter("time")
 
 
 class Frames:
-    """All frames with something in them, by their paths.
-
-    Args:
-        seconds: How far back the past reaches.
-
-    Attributes:
-        bytes: About how much memory their content takes.
-    """
+    """All frames with something in them, by their paths."""
 
     def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
+        self._seconds = seconds  # how far back the past reaches
         self._lines: dict[Path, list[Frame]] = {}
-        self.bytes = 0
+        self.bytes = 0  # about how much memory their content takes
 
     def add(self, path: Path, tree: Any, when: float) -> None:
         """Note the frames in a tree, which is at a path since an instant that is after all others."""
         for where, it in walk(tree, path):
             if isinstance(it, Frame):
                 line = self._lines.setdefault(where, [])
+                if line and line[-1] is it:
+                    continue
+                it = it.moved() if it.time else it  # as an item of a list does
                 it.time = max(when, line[-1].time if line else when)  # sorted, though a clock may be set back
                 line.append(it)
                 self.bytes += it.size
@@ -84,7 +81,6 @@ class Frames:
         return line[index] if index >= 0 and line[index].time >= since else None
 
     def concerning(self, path: Path) -> Iterator[Frame]:
-        """Yield the frames at, above and below a path."""
         for where, line in self._lines.items():
             if related(where, path):
                 yield from line
@@ -107,11 +103,11 @@ class Frames:
         """Let go of so much that at most so many bytes are left."""
         # First the whole arrays of which there is a picture, oldest first, down to a quarter of the room.
         spare = sorted([frame for line in self._lines.values() for frame in line if _has_both(frame)], key=_TIME)
-        held = sum([frame.leaf.size for frame in spare])
+        held = sum([frame.described.size for frame in spare])
         for frame in spare:
             if self.bytes <= most or held <= most // _WHOLE_SHARE:
                 break
-            held -= frame.leaf.size
+            held -= frame.described.size
             self._drop_whole(frame)
         if self.bytes > most:
             self._thin_evenly(most, now)
@@ -187,31 +183,20 @@ _TRIM_SECONDS = 1.0
 _FILLED = 0.9
 """The part of the bytes that is left full when room is made: it is then a while until more must be."""
 
-_LARGEST_TEXT = 1 << 18
+LARGEST_TEXT = 1 << 18
 """Bytes of a document's text up to which it is kept as the state before the first change."""
 
 
 class History:
-    """What is known of the past of every top-level key.
-
-    Args:
-        seconds: How long a change is kept.
-        budget: Bytes that all of it may take; the oldest goes first.
-
-    Attributes:
-        clock: The time of all that is in it.
-        start: From when on the past is known, in seconds since 1970.
-        frames: The arrays that were read.
-        dropped: How many changes had to go before their time.
-    """
+    """What is known of the past of every top-level key."""
 
     def __init__(self, seconds: float, budget: int) -> None:
-        self.seconds = seconds
-        self.budget = budget
-        self.clock = BufferClock()
-        self.start = self.clock.now()
-        self.frames = Frames(seconds)
-        self.dropped = 0
+        self.seconds = seconds  # how long a change is kept
+        self.budget = budget  # bytes that all of it may take; the oldest goes first
+        self.clock = BufferClock()  # the time of all that is in it
+        self.start = self.clock.now()  # from when on the past is known, in seconds since 1970
+        self.frames = Frames(seconds)  # the arrays that were read
+        self.dropped = 0  # how many changes had to go before their time
         self._bytes = 0  # of all but the frames
         self._lines: dict[str, BufferedPast] = {}
         # The same changes twice: by key, to know what a key held; all in order, to forget the oldest first.
@@ -221,7 +206,6 @@ class History:
 
     @property
     def bytes(self) -> int:
-        """Return about how much memory all of it takes."""
         return self._bytes + self.frames.bytes
 
     # --- what happened
@@ -245,31 +229,35 @@ class History:
         self.add(path, tree, weight(tree), when, answer=answer)
 
     def begin(self, name: str, text: Text | None) -> None:
-        """Note what a key held before anything is known to have changed."""
         if name in self._lines:
             return
         # Of a long document only a mark is kept: what it held before its first change is unknown.
-        base = MISSING if text is None else text if len(text) <= _LARGEST_TEXT else UNKNOWN
+        base = MISSING if text is None else text if len(text) <= LARGEST_TEXT else UNKNOWN
         line = self._lines[name] = BufferedPast(name, base, None if base is UNKNOWN else text)
         self._bytes += line.base_size + _OVERHEAD
 
-    def differs(self, name: str, text: Text | None, when: float) -> bool:
-        """Return whether a document's text, read just now, is not what the changes led to.
+    def difference(self, name: str, tree: Any, text: Text | None, when: float) -> Path | None:
+        """Return the deepest place with all that differs from what the changes led to, None if nothing does.
 
-        Of a long one nothing is known at first: it differs from when on it was `remember`ed.
+        Of a long document nothing is known at first: it differs from when on it was `remember`ed.
+
+        Args:
+            name: The key.
+            tree: What is there; MISSING if there is nothing.
+            text: The text it was made of; None if there is none, or it is newer than that.
+            when: The present.
         """
         line = self._lines.get(name)
         if line is None:
-            return text is not None
-        if text is None:
-            return line.state(when) is not MISSING
-        # The same text, or a digest of it: nothing has changed. This is what most looks find.
-        if line.text == _mark(text):
-            return False
+            return None if tree is MISSING else (name,)
+        # The same text, or a digest of it: nothing has changed. This is what most reads find.
+        if text is not None and line.text == _mark(text):
+            return None
         state = line.state(when)
-        if state is UNKNOWN:
-            return line.text is not None or len(text) <= _LARGEST_TEXT
-        return state is MISSING or not same(tree_of(text, name), state)
+        if state is UNKNOWN and text is not None:
+            return (name,) if line.text is not None or len(text) <= LARGEST_TEXT else None
+        inner = difference(state, tree, same)
+        return None if inner is None else (name, *inner)
 
     def remember(self, name: str, text: Text | None) -> None:
         """Note what was read last, and is in the changes."""
@@ -289,7 +277,7 @@ class History:
             self._trimmed = when
             self._fold(sum(1 for _ in takewhile(lambda change: change.time < when - self.seconds, self._all)))
             self.start = max(self.start, when - self.seconds)
-            self.frames.forget(self.start, lambda path: isinstance(self.tree(path, when), Frame | Leaf))
+            self.frames.forget(self.start, lambda path: isinstance(self.tree(path, when), Frame | Unfetched))
         if self.bytes > self.budget:
             # Pictures go first, thinned evenly; but not below half of all memory for the sake of plain values.
             room = int(_FILLED * self.budget) - self._bytes
@@ -329,16 +317,10 @@ class History:
 
     @property
     def names(self) -> Iterable[str]:
-        """All keys of which anything is known."""
         return self._lines.keys()
 
     def knows(self, name: str) -> bool:
         return name in self._lines
-
-    def is_whole(self, name: str) -> bool:
-        """Return whether all of a key is known, as far as it was heard of at all."""
-        line = self._lines.get(name)
-        return line is None or line.whole
 
     def unchanged(self, name: str, since: float) -> bool:
         """Return whether a key is known not to have changed since an instant: it is as it is now."""
@@ -362,11 +344,11 @@ class History:
             return Kept(UNKNOWN)
         kept = line.kept(path, at)
         # Of an array the line knows only that it changed; which picture of it is still there, the frames know.
-        if not isinstance(kept.value, Frame | Leaf):
+        if not isinstance(kept.value, Frame | Unfetched):
             return kept
         frame = self.frames.before(path, at, line.moved(path, at))
         if frame is None:
-            return Kept(kept.value.leaf if isinstance(kept.value, Frame) else kept.value, kept.late)
+            return Kept(kept.value.described if isinstance(kept.value, Frame) else kept.value, kept.late)
         # A millisecond at least: the picture is older than the last change, if only just.
         late = kept.late if frame is kept.value else max(line.newest(path, at) - frame.time, 1e-3)
         return Kept(frame, late)
@@ -396,7 +378,6 @@ class History:
         return count / (span[1] - span[0]) if count else None
 
     def between(self, since: float, until: float) -> Iterator[BufferedChange]:
-        """Yield the changes after `since` and not after `until`, newest first."""
         for change in reversed(self._all):
             if change.time <= since:
                 return
@@ -446,4 +427,4 @@ class History:
 
 def _mark(text: bytes) -> bytes:
     """Return what tells a text from others: itself, or a digest of a long one."""
-    return text if len(text) <= _LARGEST_TEXT else hashlib.blake2b(text, digest_size=16).digest()
+    return text if len(text) <= LARGEST_TEXT else hashlib.blake2b(text, digest_size=16).digest()

@@ -10,6 +10,7 @@ from typing import Any
 from ...connection import RedisInterface
 from ...errors import BadType, ConnectionLost, MissingKey, NotConnected, ServerNotReady
 from ...plan.paths import Path, show
+from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, walk
 from ...store.catalog import outline
 from ...store.publish import PublishSpace
@@ -17,9 +18,22 @@ from ...store.reader import DocumentReader
 from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek
-from .source import Node, NotKept, Page, Sample, Series, Status, address, counted, node_of, numbers_in, snippets
+from .source import (
+    Node,
+    NotKept,
+    Page,
+    Sample,
+    Series,
+    Status,
+    address,
+    counted,
+    matching,
+    node_of,
+    numbers_in,
+    snippets,
+)
 from .timeline import UNKNOWN
-from .trees import Frame, Leaf, differing, thawed, tree_of_outline
+from .trees import Frame, differing, thawed, tree_of_outline
 
 _LARGEST = 1 << 28
 """Bytes of arrays up to which a value is read for a page."""
@@ -29,9 +43,6 @@ _SHARED_SECONDS = 0.2
 
 _SHORT = 128
 """Bytes of a value up to which it is read to be drawn."""
-
-# Places that are looked at for one search, so that the program answers others meanwhile.
-_WALKED = 200_000
 
 _UNTOLD = (
     "what is only stored is looked for once a second, and overwritten arrays are not noticed: the server does not tell"
@@ -166,7 +177,7 @@ class LiveSource:
         """Return the value at a path, arrays included; readings of the same moment are shared."""
         name = str(path[0])
         # Of arrays that the server does not tell of, the present does not speak for the past.
-        if at is None or (self.history.unchanged(name, at) and self._follower.is_told(name)):
+        if at is None or (self.history.unchanged(name, at) and self._follower.is_settled(name)):
             try:
                 return Sample(await self._read(path), 0.0, self._age(path, at))
             except _AWAY:
@@ -182,7 +193,7 @@ class LiveSource:
         frame = kept.value
         # The best that is left of it.
         value = frame.preview if frame.whole is None else frame.whole
-        return Sample(frame.leaf if value is None else value, kept.late, max(at - frame.time, 0.0))
+        return Sample(frame.described if value is None else value, kept.late, max(at - frame.time, 0.0))
 
     def _age(self, path: Path, at: float | None) -> float | None:
         """Return for how long what is there now had been there at an instant of the past."""
@@ -232,7 +243,7 @@ class LiveSource:
 
     async def _has_leaves(self, path: Path) -> bool:
         tree = tree_of_outline(await outline(self.interface, path))
-        return any(isinstance(it, Leaf) for _, it in walk(tree, path))
+        return any(isinstance(it, Unfetched) for _, it in walk(tree, path))
 
     # --- time
 
@@ -277,17 +288,8 @@ class LiveSource:
 
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""
-        needle = text.lower()
-        found: dict[Path, None] = {(name,): None for name in self._names(at) if needle in address((name,)).lower()}
-        walked = 0
-        for name, tree in self.history.matching(_words(needle), self.history.clock.now() if at is None else at):
-            for path, _ in walk(tree, (name,)):
-                walked += 1
-                if len(found) >= most or walked > _WALKED:
-                    return list(found)[:most]
-                if len(path) > 1 and needle in address(path).lower():
-                    found[path] = None
-        return list(found)[:most]
+        needle, when = text.lower(), self.history.clock.now() if at is None else at
+        return matching(needle, self._names(at), self.history.matching(_words(needle), when), most)
 
 
 def _words(needle: str) -> list[str]:

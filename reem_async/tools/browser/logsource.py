@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import bisect
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path as FilePath
 from typing import Any, TypeVar
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, show
-from ...plan.trees import MISSING, get, walk
+from ...plan.trees import MISSING, get
 from ..recording.log import Log, open_log
 from .source import (
     Node,
@@ -22,9 +22,9 @@ from .source import (
     Sample,
     Series,
     Status,
-    address,
     counted,
     is_small_vector,
+    matching,
     node_of,
     numbers_in,
     rate_span,
@@ -35,37 +35,10 @@ Result = TypeVar("Result")
 
 # States, and lists of times, that are kept: neighbouring instants are asked for together.
 _CACHED = 8
-# Places that are looked at for one search.
-_WALKED = 200_000
 # Values that are read to find out whether a path is worth drawing.
 _LOOKS = 6
 _ROUNDING = 1e-6
 """Seconds: instants here are floats, those in the file nanoseconds; what happens at an instant belongs to it."""
-
-
-class _Times:
-    """When there was news of which path: read once it is asked for, since all of a long recording takes seconds."""
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-        self._known: OrderedDict[Path, np.ndarray[Any, Any]] = OrderedDict()
-
-    def concerning(self, path: Path) -> np.ndarray[Any, Any]:
-        """Return the times of all that concerns `path`, all there are for the root; sorted."""
-        if path not in self._known:
-            self._known[path] = self._log.news_times(path)
-            while len(self._known) > _CACHED:
-                self._known.popitem(last=False)
-        self._known.move_to_end(path)
-        return self._known[path]
-
-    def rate(self, name: str, at: float) -> float | None:
-        """Return updates per second of a key about `at`."""
-        # The same span as of a live server, so that both show the same rate.
-        span = rate_span(at, self._log.start, max(self._log.end, at))
-        since, until = span or (self._log.start, at)  # a recording of less than a second counts as one
-        count = self._log.news_count((name,), since, until)
-        return count / max(until - since, 1.0) if count else None
 
 
 class LogSource:
@@ -88,8 +61,9 @@ class LogSource:
     def __init__(self, path: str | FilePath, ships: Sequence[Any] | None = None) -> None:
         self.title = FilePath(path).name
         self.log: Log = open_log(path, ships)
-        self._times = _Times(self.log)
-        self._states: OrderedDict[float, dict[str, Any]] = OrderedDict()
+        # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
+        self._times = lru_cache(_CACHED)(self.log.news_times)
+        self._state = lru_cache(_CACHED)(self._read_state)
         self._turns: anyio.CapacityLimiter | None = None
 
     async def start(self) -> None:
@@ -115,13 +89,15 @@ class LogSource:
             self._turns = anyio.CapacityLimiter(1)
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
-    def _state(self, at: float) -> dict[str, Any]:
-        if at not in self._states:
-            self._states[at] = {name: tree_of_outline(it) for name, it in self.log.outline_at(at).items()}
-            while len(self._states) > _CACHED:
-                self._states.popitem(last=False)
-        self._states.move_to_end(at)
-        return self._states[at]
+    def _read_state(self, at: float) -> dict[str, Any]:
+        return {name: tree_of_outline(it) for name, it in self.log.outline_at(at).items()}
+
+    def _rate(self, name: str, at: float) -> float | None:
+        # The same span as of a live server, so that both show the same rate.
+        span = rate_span(at, self.log.start, max(self.log.end, at))
+        since, until = span or (self.log.start, at)  # a recording of less than a second counts as one
+        count = self.log.news_count((name,), since, until)
+        return count / max(until - since, 1.0) if count else None
 
     def _when(self, at: float | None) -> float:
         return self.log.end + _ROUNDING if at is None else at
@@ -133,7 +109,7 @@ class LogSource:
         value = get(self._state(at), path)
         if value is MISSING:
             return None
-        rate = self._times.rate(str(path[0]), at) if len(path) == 1 else None
+        rate = self._rate(str(path[0]), at) if len(path) == 1 else None
         return node_of(path, value).stamped(self.log.last_news(path, at), rate)
 
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
@@ -167,14 +143,14 @@ class LogSource:
         return await self._do(lambda: self._step(at, forward, path))
 
     def _step(self, at: float, forward: bool, path: Path) -> float | None:
-        times = self._times.concerning(path)
+        times = self._times(path)
         place = (
             bisect.bisect_right(times, at + _ROUNDING) if forward else bisect.bisect_left(times, at - 3 * _ROUNDING) - 1
         )
         return float(times[place]) + _ROUNDING if 0 <= place < len(times) else None
 
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        return await self._do(lambda: counted(self._times.concerning(path), start, end, bins))
+        return await self._do(lambda: counted(self._times(path), start, end, bins))
 
     async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
         """Return nothing: a recording has all its arrays."""
@@ -184,7 +160,7 @@ class LogSource:
         return await self._do(lambda: numbers_in(self._samples(path, start, end)))
 
     def _samples(self, path: Path, start: float, end: float) -> Iterable[tuple[float, Any]]:
-        times = self._times.concerning(path)
+        times = self._times(path)
         places = np.linspace(0, len(times) - 1, min(len(times), _LOOKS)).astype(int)
         news = [float(times[place]) - (place > 0) * _ROUNDING for place in places]
         # Large arrays are not read for this. What was deleted at the end may have been numbers before.
@@ -193,17 +169,8 @@ class LogSource:
             yield from self.log[path].values(start, end)
 
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
-        return await self._do(lambda: self._search(text.lower(), self._state(self._when(at)), most))
-
-    def _search(self, needle: str, state: dict[str, Any], most: int) -> list[Path]:
-        found = [(name,) for name in sorted(state) if needle in address((name,)).lower()][:most]
-        inner: list[Path] = list(found)
-        for number, (path, _) in enumerate(walk(state, ())):
-            if len(inner) >= most or number > _WALKED:
-                break
-            if len(path) > 1 and needle in address(path).lower():
-                inner.append(path)
-        return inner
+        state = await self._do(lambda: self._state(self._when(at)))
+        return await self._do(lambda: matching(text.lower(), sorted(state), state.items(), most))
 
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")

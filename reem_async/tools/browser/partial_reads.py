@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from ...errors import BadData, MissingKey, NotAllowed, WrongKind
+from ...errors import BadData
 from ...plan import Command, Plan, Reply
-from ...plan.keys import Keys
 from ...plan.paths import Path, to_jsonpath
-from ...plan.reads import count_in, entries_command, get_command
-from ...plan.replies import checked, type_name
+from ...plan.reads import count_in, entries_command
+from ...plan.replies import type_name
 from ...plan.trees import is_addressable
 from ...session import Session
 from .source import Node, node_of, shown_text
@@ -65,7 +64,6 @@ async def _fill(
     texts: dict[int, int],
     nodes: list[Node | None],
 ) -> None:
-    """Fetch the lengths of containers and the values of all else."""
     # A long text is described by its length and not fetched; texts[index] is 0 for all other types.
     asked = [(index, kind) for index, kind in kinds.items() if texts[index] <= _LONGEST]
     replies = await _ask(session, [_question(kind)(*where[index]) for index, kind in asked])
@@ -89,7 +87,6 @@ def _question(kind: str) -> Callable[[str, str], Command]:
 
 
 async def _preview(session: Session, where: Mapping[int, tuple[str, str]], nodes: list[Node | None]) -> None:
-    """Put the items of short lists of numbers into their nodes."""
     short = [
         index
         for index, node in enumerate(nodes)
@@ -130,49 +127,6 @@ async def keys_at(session: Session, path: Path) -> list[str] | int | None:
     if isinstance(length, list) and length and isinstance(length[0], int):
         return length[0]
     return None
-
-
-async def noted_texts(session: Session, paths: Sequence[Path]) -> list[tuple[bytes | None, Reply] | None]:
-    """Return the text at each path, None if nothing is there, and the note of the last update that is in it.
-
-    One round trip. None in place of both if something was published while the text was read.
-    """
-    documents = [session.keys(path[0]) for path in paths]
-    commands: list[Command] = []
-    for keys, path in zip(documents, paths, strict=True):
-        commands += [("GET", keys.last), get_command(keys, path[1:]), ("GET", keys.last)]
-    replies = await _ask(session, commands)
-    # Without the right to read notes there are none.
-    notes = [None if isinstance(reply, Exception) else reply for reply in replies]
-    # The note before and after the text: if they are equal, that update is in it, and no later one.
-    return [
-        (_found(reply, keys), before) if before == after else None
-        for keys, before, reply, after in zip(documents, notes[::3], replies[1::3], notes[2::3], strict=True)
-    ]
-
-
-async def noted_text(session: Session, path: Path) -> tuple[bytes | None, Reply]:
-    """Return the text at a path, None if nothing is there, and the server's note of the last update that is in it.
-
-    One round trip, in which nothing is published.
-    """
-    keys = session.keys(path[0])
-    commands: list[Command] = [get_command(keys, path[1:]), ("GET", keys.last)]
-    reply, note = await session.run(Plan(commands, tuple, atomic=True))
-    return _found(reply, keys), note
-
-
-def _found(reply: Reply, keys: Keys) -> bytes | None:
-    return (_text(reply, keys) or b"")[1:-1] or None  # what a path of the server finds is in a list
-
-
-def _text(reply: Reply, keys: Keys) -> bytes | None:
-    """Return a document's text, None if there is no document that may be read."""
-    try:
-        found = checked(reply, keys, ())
-    except (MissingKey, NotAllowed, WrongKind):
-        return None
-    return bytes(found) if isinstance(found, bytes | bytearray) else None
 
 
 def _place(session: Session, path: Path) -> tuple[str, str]:

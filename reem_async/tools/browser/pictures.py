@@ -27,19 +27,13 @@ _MOST_CURVES = 16
 
 @dataclass(frozen=True, slots=True)
 class ArrayViews:
-    """How an array can be shown.
+    """How an array can be shown."""
 
-    Attributes:
-        view: What says most: "image", "line" or "table"; empty for an array without items.
-        views: All that make sense, each with the part of the array it begins with.
-    """
-
-    view: str
-    views: dict[str, Slice]
+    view: str  # what says most: "image", "line" or "table"; empty for an array without items
+    views: dict[str, Slice]  # all that make sense, each with the part of the array it begins with
 
 
 def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> ArrayViews:
-    """Return how an array of this dtype and shape is best shown."""
     if 0 in shape:
         return ArrayViews("", {})
     if not shape:
@@ -47,8 +41,8 @@ def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> ArrayViews:
     numeric = dtype.kind in "biuf"
     views: dict[str, Slice] = {}
     # The order is that of the tabs of the page.
-    if numeric and (plane := _image_slice(dtype, shape)) is not None:
-        views["image"] = plane
+    if numeric and len(shape) >= 2:
+        views["image"] = _leading(shape, 3 if _has_channels(shape) else 2)
     if numeric or dtype.kind == "c":
         views["line"] = _line_slice(shape)
     views["table"] = _leading(shape, 2) if not _has_channels(shape) else (None, None, 0)[-len(shape) :]
@@ -60,7 +54,8 @@ def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> ArrayViews:
 
 
 def _best(shape: tuple[int, ...], views: dict[str, Slice]) -> str:
-    if "image" in views and min(_image_size(shape)) >= _SMALL:
+    size = shape[-3:-1] if _has_channels(shape) else shape[-2:]
+    if "image" in views and min(size) >= _SMALL:
         return "image"
     narrow = len(shape) == 1 or (len(shape) == 2 and shape[1] <= _MOST_CURVES)
     return "line" if "line" in views and narrow and shape[0] > _SMALL else "table"
@@ -68,16 +63,6 @@ def _best(shape: tuple[int, ...], views: dict[str, Slice]) -> str:
 
 def _has_channels(shape: tuple[int, ...]) -> bool:
     return len(shape) >= 3 and shape[-1] in (1, 3, 4) and min(shape[-3:-1]) > 1
-
-
-def _image_size(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return shape[-3:-1] if _has_channels(shape) else shape[-2:]
-
-
-def _image_slice(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Slice | None:
-    if len(shape) < 2:
-        return None
-    return _leading(shape, 3 if _has_channels(shape) else 2)
 
 
 def _line_slice(shape: tuple[int, ...]) -> Slice:
@@ -146,17 +131,14 @@ class RenderedPicture:
     """An array as a picture.
 
     Attributes:
-        png: The file.
         low, high: The numbers that were given the first and the last colour.
-        bad: How many numbers are NaN or infinite; they are magenta.
-        size: Width and height of the array.
     """
 
     png: bytes
     low: float
     high: float
-    bad: int
-    size: tuple[int, int]
+    bad: int  # how many numbers are NaN or infinite; they are magenta
+    size: tuple[int, int]  # width and height of the array
 
 
 def paint(
@@ -235,14 +217,16 @@ def shrunk(plane: np.ndarray[Any, Any], side: int) -> np.ndarray[Any, Any]:
 
 
 def _levels(plane: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
-    """Return numbers from 0 to 255."""
-    if plane.dtype == np.uint8 and (low, high) == (0.0, 255.0):
-        return plane
+    return plane if plane.dtype == np.uint8 and (low, high) == (0.0, 255.0) else _scaled(plane, low, high, 255)
+
+
+def _scaled(plane: np.ndarray[Any, Any], low: float, high: float, most: int) -> np.ndarray[Any, Any]:
+    """Return numbers from 0 for `low` to `most` for `high`; 0 for NaN."""
     # Halves: the difference of two large floats may be more than the largest float.
     width = (high / 2 - low / 2) or 1.0
     with np.errstate(all="ignore"):
-        scaled = (plane.astype(np.float64) / 2 - low / 2) / width * 255.0
-    return np.clip(np.nan_to_num(scaled, nan=0.0, posinf=255.0, neginf=0.0) + 0.5, 0, 255).astype(np.uint8)
+        scaled = (plane.astype(np.float64) / 2 - low / 2) / width * most
+    return np.clip(np.nan_to_num(scaled, nan=0.0, posinf=most, neginf=0.0) + 0.5, 0, most).astype(np.uint8)
 
 
 def _mark(pixels: np.ndarray[Any, Any], plane: np.ndarray[Any, Any]) -> None:
@@ -287,20 +271,17 @@ class Preview:
     """A small picture of an array.
 
     Attributes:
-        file: A JPEG file of bytes, a PNG file of anything else: its numbers in 254 levels from `low` to `high`.
         dtype, shape: Those of the array.
-        chosen: The part of the array that it shows: what a view begins with.
         low, high: The range of the numbers in that part.
-        bad: How many of them are NaN or infinite.
     """
 
-    file: bytes
+    file: bytes  # a JPEG file of bytes, a PNG file of anything else: its numbers in 254 levels from `low` to `high`
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
-    chosen: Slice
+    chosen: Slice  # the part of the array that it shows: what a view begins with
     low: float
     high: float
-    bad: int
+    bad: int  # how many of them are NaN or infinite
 
     def paint(self, colours: str, low: float | None, high: float | None, *, side: int, bgr: bool) -> RenderedPicture:
         """Return the picture, as `pictures.paint` would make it of the array; raises BadValue."""
@@ -335,15 +316,9 @@ def preview_of(array: np.ndarray[Any, Any]) -> Preview | None:
         image = Image.fromarray(np.ascontiguousarray(shrunk(plane, _SIDE)))
         image.save(file, "PNG" if image.mode == "RGBA" else "JPEG", quality=_QUALITY)  # JPEG has no transparency
     else:
-        Image.fromarray(_preview_levels(shrunk(plane, _SIDE), low, high)).save(file, "PNG", compress_level=3)
-    small = file.getvalue()
+        small = shrunk(plane, _SIDE)
+        levels = np.where(np.isfinite(small), _scaled(small, low, high, _LEVELS) + np.uint8(1), np.uint8(0))
+        Image.fromarray(np.ascontiguousarray(levels)).save(file, "PNG", compress_level=3)
+    found = Preview(file.getvalue(), array.dtype, array.shape, chosen, low, high, bad)
     # A preview that is not much smaller than its array is no help.
-    return Preview(small, array.dtype, array.shape, chosen, low, high, bad) if len(small) < array.nbytes // 2 else None
-
-
-def _preview_levels(plane: np.ndarray[Any, Any], low: float, high: float) -> np.ndarray[Any, Any]:
-    numbers = plane.astype(np.float64)
-    with np.errstate(all="ignore"):
-        scaled = (numbers / 2 - low / 2) / ((high / 2 - low / 2) or 1.0) * _LEVELS
-    levels = np.clip(np.nan_to_num(scaled) + 0.5, 0, _LEVELS).astype(np.uint8) + np.uint8(1)
-    return np.ascontiguousarray(np.where(np.isfinite(numbers), levels, np.uint8(0)))
+    return found if len(found.file) < array.nbytes // 2 else None

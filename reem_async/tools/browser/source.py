@@ -6,14 +6,16 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ...errors import BadKey, ReemError
 from ...plan.paths import Path, check_top_key, parse, parse_suffix, suffix
-from ...plan.trees import is_addressable
-from .trees import Frame, Leaf, leaf_of
+from ...plan.placeholders import Unfetched
+from ...plan.trees import is_addressable, walk
+from .trees import Frame, described
 
 # Paths in URLs and snippets: one text for each path, which leads back to exactly that path.
 
@@ -112,7 +114,6 @@ class Node:
     shared: bool = False
 
     def stamped(self, when: float | None, rate: float | None, *, shared: bool = False) -> Node:
-        """Return the node with its last change, and how it came."""
         return replace(self, time=when, rate=rate, shared=shared)
 
     def as_json(self) -> dict[str, Any]:
@@ -133,28 +134,22 @@ class Node:
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Some of the items of a dict or list, or of the top-level keys.
-
-    Attributes:
-        total: How many there are.
-        start: Which the first is.
-        nodes: The items.
-    """
+    """Some of the items of a dict or list, or of the top-level keys."""
 
     total: int
-    start: int
+    start: int  # which the first is
     nodes: list[Node]
 
 
 def node_of(path: Path, value: Any) -> Node:
-    """Return the node of a value, an array or a `Leaf`."""
+    """Return the node of a value, an array or a `Unfetched`."""
     if isinstance(value, dict | list):
         return Node(path, type(value).__name__, _preview(value), None, len(value))
     if isinstance(value, str):
         return Node(path, "str", shown_text(value), len(value.encode(errors="replace")))
     if value is None or isinstance(value, bool | int | float):
         return Node(path, type(value).__name__, _plain(value), 8, None, value)
-    leaf = leaf_of(value)
+    leaf = described(value)
     return Node(path, leaf.label, visible(leaf.summary), leaf.size)
 
 
@@ -163,12 +158,27 @@ def _plain(value: Any) -> str:
 
 
 def _preview(value: dict[str, Any] | list[Any]) -> str:
-    """Return the items of a short list of plain values; empty for anything else."""
     if isinstance(value, dict) or not 0 < len(value) <= _PREVIEW_ITEMS:
         return ""
     if not all(item is None or isinstance(item, bool | int | float) for item in value):
         return ""
     return "[" + ", ".join([_plain(item).removesuffix(".0") for item in value]) + "]"
+
+
+# Places that are looked at for one search, so that the program answers others meanwhile.
+_WALKED = 200_000
+
+
+def matching(needle: str, names: Iterable[str], trees: Iterable[tuple[str, Any]], most: int) -> list[Path]:
+    """Return paths with `needle` in them: keys first, then what is below these keys, each with its tree."""
+    found: dict[Path, None] = {(name,): None for name in names if needle in address((name,)).lower()}
+    places = (path for name, tree in trees for path, _ in walk(tree, (name,)) if len(path) > 1)
+    for path in islice(places, _WALKED):
+        if len(found) >= most:
+            break
+        if needle in address(path).lower():
+            found[path] = None
+    return list(found)[:most]
 
 
 # The source.
@@ -195,35 +205,25 @@ class Status(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A value at an instant.
+    """A value at an instant."""
 
-    Attributes:
-        value: The value, arrays included; a `Preview` of an array of which no more is kept.
-        late: Seconds by which it is older than it should be, since what came after was not kept.
-        age: Seconds from when it was read to the instant asked for; None if that is not known.
-    """
-
-    value: Any
-    late: float = 0.0
-    age: float | None = None
+    value: Any  # the value, arrays included; a `Preview` of an array of which no more is kept
+    late: float = 0.0  # seconds by which it is older than it should be, since what came after was not kept
+    age: float | None = None  # seconds from when it was read to the instant asked for; None if that is not known
 
 
 class Series(NamedTuple):
-    """Numbers over time.
+    """Numbers over time."""
 
-    Attributes:
-        names: What each line is: one empty text, or the indexes of a list.
-        times: Seconds since 1970.
-        lines: For each name as many numbers as there are times, None where there was no number.
-    """
-
-    names: list[str]
-    times: list[float]
-    lines: list[list[float | None]]
+    names: list[str]  # what each line is: one empty text, or the indexes of a list
+    times: list[float]  # seconds since 1970
+    lines: list[list[float | None]]  # for each name as many numbers as there are times, None where there was no number
 
 
 class Source(Protocol):
     """What the page can ask. An instant is in seconds since 1970; None is now, or the end of a recording.
+
+    What concerns a path is at it, above or below it. `most` is how many are returned at most.
 
     Attributes:
         title: Where it is from, without credentials.
@@ -235,53 +235,31 @@ class Source(Protocol):
     live: bool
     writable: bool
 
-    async def start(self) -> None:
-        """Begin. Idempotent."""
+    # Both are idempotent.
+    async def start(self) -> None: ...
+    async def close(self) -> None: ...
+    def status(self) -> Status: ...
 
-    async def close(self) -> None:
-        """End. Idempotent."""
+    # Python that reads a path, by what to call it; no passwords in it.
+    def snippets(self, path: Path, at: float | None) -> dict[str, str]: ...
 
-    def status(self) -> Status:
-        """Return the span of time that can be shown, and whether the source can be read."""
+    # None where nothing is; for the root, children are the top-level keys. `value` raises MissingKey or NotKept.
+    async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]: ...
+    async def children(self, path: Path, start: int, count: int, at: float | None) -> Page: ...
+    async def value(self, path: Path, at: float | None) -> Sample: ...
+    async def search(self, text: str, at: float | None, most: int) -> list[Path]: ...
+    async def write(self, path: Path, value: Any) -> None: ...
 
-    def snippets(self, path: Path, at: float | None) -> dict[str, str]:
-        """Return Python that reads a path, by what to call it; no passwords in it."""
+    # Which paths were published or seen to change; which have another value at one instant than at another.
+    async def changes(self, since: float, until: float, most: int) -> list[Path]: ...
+    async def differing(self, since: float, until: float, most: int) -> set[Path]: ...
 
-    async def nodes(self, paths: Sequence[Path], at: float | None) -> list[Node | None]:
-        """Return what is at each path, None where nothing is."""
-
-    async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
-        """Return some of what is directly below a path, the top-level keys for the root."""
-
-    async def value(self, path: Path, at: float | None) -> Sample:
-        """Return the value at a path; raises MissingKey or NotKept."""
-
-    async def changes(self, since: float, until: float, most: int) -> list[Path]:
-        """Return which paths were published or seen to change, at most so many."""
-
-    async def differing(self, since: float, until: float, most: int) -> set[Path]:
-        """Return which paths have another value at one instant than at another, at most so many."""
-
-    async def step(self, at: float, forward: bool, path: Path) -> float | None:
-        """Return the instant of the next or previous change at, above or below a path."""
-
-    async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        """Return how many changes at, above or below a path fall into each of `bins` equal parts of a span."""
-
-    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]:
-        """Return of which of `bins` equal parts of a span arrays at, above or below a path are kept.
-
-        2 stands for whole ones, 1 for previews, 0 for none. Empty if all of them are kept, or there are none.
-        """
-
-    async def series(self, path: Path, start: float, end: float) -> Series:
-        """Return the number, or list of numbers, at a path over time."""
-
-    async def search(self, text: str, at: float | None, most: int) -> list[Path]:
-        """Return paths that have `text` in them, top-level keys first."""
-
-    async def write(self, path: Path, value: Any) -> None:
-        """Publish a value."""
+    # The instant of the next or previous change; how many changes fall into each of `bins` equal parts of a span, and
+    # how the arrays of that part are kept: 2 whole, 1 as previews, 0 not. Empty if all are kept, or there are none.
+    async def step(self, at: float, forward: bool, path: Path) -> float | None: ...
+    async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]: ...
+    async def pictures(self, start: float, end: float, bins: int, path: Path) -> list[int]: ...
+    async def series(self, path: Path, start: float, end: float) -> Series: ...
 
 
 # Seconds before an instant in which updates are counted.
@@ -326,6 +304,20 @@ def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
     return Series([f"[{index}]" for index in range(width)] if width else [""], times, lines)
 
 
+def thinned(columns: np.ndarray[Any, Any], most: int) -> list[int]:
+    """Return about so many rows to draw, those where a column has its extremes among them; all if there are no more."""
+    count, curves = columns.shape
+    if count <= most:
+        return list(range(count))
+    step = -(-count * 2 * curves // most)
+    chosen = {0, count - 1}
+    for edge in range(0, count, step):
+        piece = columns[edge : edge + step].astype(np.float64)
+        for substitute, pick in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+            chosen.update((edge + pick(np.where(np.isnan(piece), substitute, piece), axis=0)).tolist())
+    return sorted(chosen)
+
+
 def _row(value: Any) -> Any:
     """Return the items of a short list or vector, None for a longer one, and anything else as it is."""
     array = value.whole if isinstance(value, Frame) else value
@@ -338,7 +330,7 @@ def _row(value: Any) -> Any:
 
 def is_small_vector(value: Any) -> bool:
     """Return whether an array, or what is known of one, may be so small that its items are drawn over time."""
-    return isinstance(value, Leaf | Frame | np.ndarray) and leaf_of(value).size <= _LARGEST_VECTOR
+    return isinstance(value, Unfetched | Frame | np.ndarray) and described(value).size <= _LARGEST_VECTOR
 
 
 def _number(value: Any) -> float | None:

@@ -23,33 +23,20 @@ _LOOK_BACK = 2000
 
 
 class BufferedChange(NamedTuple):
-    """One change.
+    """One change."""
 
-    Attributes:
-        time: Seconds since 1970.
-        path: What changed, top-level key first.
-        value: What is there since; MISSING if it was removed, PENDING if it is not known.
-        size: About how many bytes this takes in memory.
-        answer: It is what was found where a change was announced before: not one more change.
-    """
-
-    time: float
-    path: Path
-    value: Any
-    size: int
-    answer: bool = False
+    time: float  # seconds since 1970
+    path: Path  # what changed, top-level key first
+    value: Any  # what is there since; MISSING if it was removed, PENDING if it is not known
+    size: int  # about how many bytes this takes in memory
+    answer: bool = False  # it is what was found where a change was announced before: not one more change
 
 
 class Kept(NamedTuple):
-    """A value of the past.
+    """A value of the past."""
 
-    Attributes:
-        value: The value; MISSING if there was none, UNKNOWN if it is not known what there was.
-        late: Seconds from this value to a later change before the instant asked for, which was not kept.
-    """
-
-    value: Any
-    late: float = 0.0
+    value: Any  # the value; MISSING if there was none, UNKNOWN if it is not known what there was
+    late: float = 0.0  # seconds from this value to a later change before the instant asked for, which was not kept
 
 
 class ChangeIndex:
@@ -63,7 +50,6 @@ class ChangeIndex:
         self._numbers.setdefault(path, []).append(number)
 
     def drop(self, end: int) -> None:
-        """Forget all numbers below `end`."""
         # Numbers of changes that are forgotten; a path without any is forgotten too.
         for path in list(self._numbers):
             numbers = self._numbers[path]
@@ -86,24 +72,12 @@ class ChangeIndex:
                     yield number
 
     def of(self, path: Path) -> list[int]:
-        """Return the numbers of all changes that concern `path`, in order."""
         found = [numbers for where, numbers in self._numbers.items() if related(where, path)]
         return found[0].copy() if len(found) == 1 else sorted([number for numbers in found for number in numbers])
 
 
 class BufferedPast(Past[int]):
-    """What is known of one top-level key. Positions of changes are their numbers, from the first one ever.
-
-    Args:
-        name: The key.
-        base: What it held at first: a document's text, a tree, MISSING or UNKNOWN.
-
-    Attributes:
-        changes: The changes since, oldest first.
-        text: The document's text when it was last looked at, a digest of a long one; None if it changed since.
-        base_size: About how many bytes `base` takes.
-        whole: All of the key is known, after the last change at least.
-    """
+    """What is known of one top-level key. Positions of changes are their numbers, from the first one ever."""
 
     __slots__ = (
         "_base",
@@ -116,20 +90,19 @@ class BufferedPast(Past[int]):
         "base_size",
         "changes",
         "text",
-        "whole",
     )
 
     def __init__(self, name: str, base: Any, text: bytes | None = None) -> None:
         self._name = name
-        self._base = base
+        self._base = base  # what it held at first: a document's text, a tree, MISSING or UNKNOWN
         self._times: list[float] = []
         self._gone = 0  # the number of the first change that is still here
         self._known, self._pending = ChangeIndex(), ChangeIndex()
         self._moves: list[int] = []  # where an item was removed from a list: those behind it have other paths since
-        self.base_size = len(base) if isinstance(base, bytes) else 0
-        self.changes: list[BufferedChange] = []
+        self.base_size = len(base) if isinstance(base, bytes) else 0  # about how many bytes `base` takes
+        self.changes: list[BufferedChange] = []  # the changes since, oldest first
+        # The document's text when it was last looked at, a digest of a long one; None if it changed since
         self.text = text
-        self.whole = base is not UNKNOWN
 
     def add(self, change: BufferedChange) -> None:
         """Append a change; times never go back."""
@@ -142,7 +115,6 @@ class BufferedPast(Past[int]):
         (self._pending if change.value is PENDING else self._known).add(change.path, number)
         if change.value is MISSING and isinstance(change.path[-1], int):
             self._moves.append(number)
-        self.whole = self.whole or (len(change.path) == 1 and change.value is not PENDING)
 
     @property
     def is_over(self) -> bool:
@@ -150,7 +122,6 @@ class BufferedPast(Past[int]):
         return not self.changes and self._base is MISSING
 
     def upto(self, at: float) -> int:
-        """Return how many of the changes are not after `at`."""
         return bisect_right(self._times, at)
 
     def fold(self, count: int) -> int:
@@ -268,7 +239,6 @@ class BufferedPast(Past[int]):
         return sorted([self._times[number - self._gone] for number in numbers if number not in answers])
 
     def seen(self, path: Path) -> list[float]:
-        """Return from when on there was something else to be seen at `path`, in order."""
         return [self._times[number - self._gone] for number in self._known.of(path)]
 
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:

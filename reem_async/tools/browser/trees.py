@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any
 
@@ -12,7 +12,7 @@ import orjson
 
 from ...errors import BadData
 from ...plan.paths import Path
-from ...plan.placeholders import Unreadable, find, marked
+from ...plan.placeholders import Unfetched, Unreadable, find, marked
 from ...plan.trees import MISSING, get, mapped, walk
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
@@ -24,50 +24,29 @@ _OVERHEAD = 200
 """Bytes of memory that an array takes besides its items."""
 
 
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """What a ship holds, whose bytes are not here.
-
-    Attributes:
-        label: The ship's label, such as "numpy".
-        summary: What it is, for people.
-        size: Bytes.
-        suffix: Which key on the server has it: its name after the tag; None if that is not known.
-    """
-
-    label: str
-    summary: str
-    size: int
-    suffix: str | None = field(default=None, compare=False)
-
-
 class Frame:
-    """An array or bytes of the past, in the place of a value in a tree: the content is let go of as room runs short.
-
-    Attributes:
-        leaf: What it is.
-        whole: The value, None once there is no room for it.
-        preview: A small picture of it; None if there is none.
-        time: Since when it is known, in seconds since 1970.
-    """
+    """An array or bytes of the past, in the place of a value in a tree: the content is let go of as room runs short."""
 
     # Not a dataclass: two frames are the same only if they are one, and there are thousands.
-    __slots__ = ("leaf", "preview", "time", "whole")
+    __slots__ = ("described", "preview", "time", "whole")
 
     def __init__(self, whole: np.ndarray[Any, Any] | bytes) -> None:
-        self.leaf = leaf_of(whole)
-        self.whole: np.ndarray[Any, Any] | bytes | None = whole
+        self.described = described(whole)
+        self.whole: np.ndarray[Any, Any] | bytes | None = whole  # the value, None once there is no room for it
+        # A small picture of it; None if there is none
         self.preview = preview_of(whole) if isinstance(whole, np.ndarray) else None
-        self.time = 0.0
+        self.time = 0.0  # since when it is known, in seconds since 1970
+
+    def moved(self) -> Frame:
+        it = copy.copy(self)
+        it.time = 0.0
+        return it
 
     @property
     def size(self) -> int:
         """Return about how many bytes the content takes."""
         small = len(self.preview.file) + _OVERHEAD if self.preview else 0
-        return small + (self.leaf.size + _OVERHEAD if self.whole is not None else 0)
-
-
-_SHIPPED = (Frame, Leaf, np.ndarray, bytes)
+        return small + (self.described.size + _OVERHEAD if self.whole is not None else 0)
 
 
 def framed(tree: Any) -> Any:
@@ -76,28 +55,26 @@ def framed(tree: Any) -> Any:
 
 
 def thawed(tree: Any) -> Any:
-    """Return `tree` with the content of each `Frame` in its place, or a `Leaf` if the content is not kept."""
-    return mapped(tree, lambda it: (it.leaf if it.whole is None else it.whole) if isinstance(it, Frame) else it)
+    return mapped(tree, lambda it: (it.described if it.whole is None else it.whole) if isinstance(it, Frame) else it)
 
 
-def leaf_of(value: Any) -> Leaf:
+def described(value: Any) -> Unfetched:
     """Return what is to be said of a value that a ship carries."""
-    if isinstance(value, Leaf):
+    if isinstance(value, Unfetched):
         return value
     if isinstance(value, Frame):
-        return value.leaf
+        return value.described
     if isinstance(value, np.ndarray):
-        size, summary = _NUMPY.describe(value)
-        return Leaf("numpy", summary, size)
+        return Unfetched("numpy", *_NUMPY.describe(value))
     if isinstance(value, bytes):
-        return Leaf("bytes", "bytes", len(value))
+        return Unfetched("bytes", len(value), "bytes")
     if isinstance(value, Unreadable):
-        return Leaf("unreadable", value.reason, 0)
-    return Leaf(type(value).__name__, "", 0)
+        return Unfetched("unreadable", 0, value.reason)
+    return Unfetched(type(value).__name__, 0, "")
 
 
 def tree_of(text: bytes, name: str) -> Any:
-    """Return the tree in a document's text, a `Leaf` in the place of each placeholder.
+    """Return the tree in a document's text, an `Unfetched` in the place of each placeholder.
 
     In the place of something that looks like a placeholder and is none there is an `Unreadable`.
 
@@ -110,7 +87,7 @@ def tree_of(text: bytes, name: str) -> Any:
         raise BadData(f"{name}: what the server sent is not JSON: {error}") from None
     for slot in find(holder, name, []) if marked(text) else ():
         it = slot.placeholder
-        slot.container[slot.key] = Leaf(it.label, it.summary, it.size, it.suffix)
+        slot.container[slot.key] = Unfetched(it.label, it.size, it.summary)
     return holder[0]
 
 
@@ -121,11 +98,13 @@ def tree_of_outline(it: Outline) -> Any:
         return [tree_of_outline(child) for child in it.children]
     if it.kind in ("str", "int", "float", "bool", "NoneType"):
         return it.value
-    return Leaf(it.kind, it.summary, it.size)
+    return Unfetched(it.kind, it.size, it.summary)
 
 
 def same(one: Any, other: Any) -> bool:
     """Return whether two trees are equal, as far as is known: of arrays, that they are alike."""
+    if one is other:
+        return True
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(same(item, other[key]) for key, item in one.items())
     if isinstance(one, list) and isinstance(other, list):
@@ -133,26 +112,24 @@ def same(one: Any, other: Any) -> bool:
     # Types too: 1, 1.0 and True are equal in Python, but not the same value for a reader.
     if isinstance(one, _SCALARS) or isinstance(other, _SCALARS):
         return type(one) is type(other) and bool(one == other)
-    return leaf_of(one) == leaf_of(other)
+    facts = [(it.label, it.size, it.summary) for it in (described(one), described(other))]
+    return facts[0] == facts[1]
 
 
-def identical(one: Any, other: Any) -> bool:
-    """Return whether two trees are known to be equal, bit by bit; an array that is not here is not known."""
-    contents = [{path: _bits(it) for path, it in walk(tree, ()) if isinstance(it, _SHIPPED)} for tree in (one, other)]
-    return same(one, other) and contents[0] == contents[1] and None not in contents[0].values()
-
-
-def _bits(it: Any) -> bytes | None:
-    it = it.whole if isinstance(it, Frame) else it
-    if isinstance(it, np.ndarray):
-        return it.tobytes()
-    return it if isinstance(it, bytes) else None
+def is_kept(one: Any, other: Any) -> bool:
+    """Return whether the contents of two arrays, or bytes, that were read are known to be equal, bit by bit."""
+    one, other = (it.whole if isinstance(it, Frame) else it for it in (one, other))
+    if one is other:  # not read twice: nothing newer is known
+        return False
+    if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
+    return isinstance(one, bytes) and isinstance(other, bytes) and one == other
 
 
 def strip(tree: Any) -> Any:
-    """Return `tree` with a `Leaf` in the place of everything that a ship carries, but what a `Frame` holds."""
+    """Return `tree` with an `Unfetched` in the place of everything that a ship carries, but what a `Frame` holds."""
     kept = (Frame, Unreadable, *_SCALARS)
-    return mapped(tree, lambda it: it if isinstance(it, kept) or it is MISSING else leaf_of(it))
+    return mapped(tree, lambda it: it if isinstance(it, kept) or it is MISSING else described(it))
 
 
 def weight(tree: Any) -> int:
@@ -215,11 +192,7 @@ def _at(old: list[Any], index: int, new: list[Any], path: Path) -> list[Path]:
 
 
 def _equal(one: Any, other: Any) -> bool:
-    items, others = (it.whole if isinstance(it, Frame) else it for it in (one, other))
-    if isinstance(items, np.ndarray) and isinstance(others, np.ndarray):
-        # The bytes, so that NaN is equal to itself.
-        return items is not others and items.dtype == others.dtype and items.tobytes() == others.tobytes()
-    if isinstance(items, bytes) and isinstance(others, bytes):
-        return items is not others and items == others
+    if isinstance(one, Frame | np.ndarray | bytes):
+        return is_kept(one, other)
     plain = all(isinstance(it, str | bool | int | float | None) for it in (one, other))
     return plain and same(one, other)
