@@ -46,13 +46,9 @@ class LocalPath:
 
     Args:
         mode: "auto", "off", or "early": subscribers on this host are notified before the server has the update.
-        memory: Bytes that it may take in all.
 
     Raises:
         BadValue: Another mode, or no number of bytes.
-
-    Attributes:
-        early: Subscribers on this host are notified before the server has an update.
     """
 
     def __init__(self, mode: Any = "auto", memory: Any = MEMORY) -> None:
@@ -61,9 +57,9 @@ class LocalPath:
         if type(memory) is not int or memory < 0:
             raise BadValue(f"local_memory={memory!r:.40} is not a number of bytes")
         self._reader: LocalReader | None = None
-        self.early = mode == "early"
+        self.early = mode == "early"  # subscribers on this host are notified before the server has an update
         self._off = mode == "off" or memory == 0
-        self._memory = memory
+        self._memory = memory  # bytes that it may take in all
         self._pid = os.getpid()
         self._segments: dict[str, Segment] = {}
         self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
@@ -104,7 +100,6 @@ class LocalPath:
             self._audiences.popitem(last=False)
 
     def has_audience(self, keys: Keys) -> bool:
-        """Return whether a program on this host listened to a key when last asked."""
         return self._audiences.get(keys.channel, (0, 0.0))[0] > 0
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:

@@ -21,8 +21,7 @@ import numpy as np
 
 from ..concurrency.wakeup import Descriptor
 from ..plan.notices import Slot
-from .locks import lock_for_reading
-from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, stamp_at
+from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, lock_for_reading, stamp_at
 
 _MAPPINGS = 64
 """Segments that are kept mapped: so many cameras that publish through one host."""
@@ -42,27 +41,17 @@ _BLOCK = 512
 
 
 class _Pin(NamedTuple):
-    """A slot that is being looked into.
+    """A slot that is being looked into."""
 
-    Attributes:
-        root: What all arrays that look into it refer to.
-        number: Which slot.
-        stamp: What it held then.
-    """
-
-    root: weakref.ref[_Root]
+    root: weakref.ref[_Root]  # what all arrays that look into it refer to
     number: int
-    stamp: int
+    stamp: int  # what it held then
 
 
 class _Root(np.ndarray[Any, Any]):
-    """What all arrays that look into a slot refer to.
+    """What all arrays that look into a slot refer to."""
 
-    Attributes:
-        lock: Has the description open by which the slot is locked.
-    """
-
-    lock: mmap.mmap
+    lock: mmap.mmap  # has the description open by which the slot is locked
 
 
 class _Mapping:

@@ -12,6 +12,7 @@ a process has it open.
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import mmap
 import os
@@ -25,7 +26,6 @@ import numpy as np
 
 from ..concurrency.wakeup import Descriptor
 from ..plan.notices import starts
-from .locks import lock_for_writing, unlock
 
 SLOTS = 6
 """One that is written, three for a subscriber (see `reader.py`), two for others that are not as far."""
@@ -53,16 +53,46 @@ _POPULATE_WRITE = 23
 SEALS = getattr(fcntl, "F_SEAL_SHRINK", 0) | getattr(fcntl, "F_SEAL_GROW", 0) | _FUTURE_WRITE
 
 
-class Shape(NamedTuple):
-    """How a segment is divided.
+# Locks on bytes of a file that belong to an open file description, not to a process. The kernel gives them back when
+# the description is closed for the last time, so also when its process is killed. Each byte is that of one slot; no
+# process ever waits for one.
 
-    Attributes:
-        slots: How many there are.
-        room: Bytes in each.
-    """
+# struct flock of <fcntl.h> where off_t has 64 bits: l_type, l_whence, l_start, l_len, l_pid (0 for these locks), and
+# the padding at its end.
+_FLOCK = struct.Struct("@hhqqi4x")
+_TAKEN = (errno.EAGAIN, errno.EACCES)
+
+
+def lock_for_reading(descriptor: int, number: int) -> bool:
+    """Lock a slot beside other readers; returns False if it is being written."""
+    return _set(descriptor, fcntl.F_RDLCK, number)
+
+
+def lock_for_writing(descriptor: int, number: int) -> bool:
+    """Lock a slot for oneself; returns False if it is being read."""
+    return _set(descriptor, fcntl.F_WRLCK, number)
+
+
+def unlock(descriptor: int, number: int) -> None:
+    with contextlib.suppress(OSError):
+        _set(descriptor, fcntl.F_UNLCK, number)
+
+
+def _set(descriptor: int, kind: int, number: int) -> bool:
+    try:
+        fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, _FLOCK.pack(kind, 0, number, 1, 0))
+    except OSError as error:
+        if error.errno in _TAKEN:
+            return False
+        raise
+    return True
+
+
+class Shape(NamedTuple):
+    """How a segment is divided."""
 
     slots: int
-    room: int
+    room: int  # bytes in each
 
     @property
     def size(self) -> int:
@@ -70,12 +100,10 @@ class Shape(NamedTuple):
         return HEAD + self.slots * self.room
 
     def start(self, number: int) -> int:
-        """Return where a slot begins."""
         return HEAD + number * self.room
 
 
 def stamp_at(number: int) -> int:
-    """Return where the stamp of a slot is."""
     return _STAMPS + number * STAMP.size
 
 
@@ -95,19 +123,14 @@ class Segment:
         OSError: There is no memory, or no descriptor, to be had.
 
     Dropping it frees the memory; mapped slots stay valid.
-
-    Attributes:
-        shape: How it is divided.
-        descriptor: By which other processes reach it.
-        inode: Of the file.
-        used: When it was written last, by whatever clock the owner goes.
     """
 
     def __init__(self, room: int) -> None:
         self.shape = Shape(SLOTS, -(-room // mmap.PAGESIZE) * mmap.PAGESIZE)
-        self.used = 0.0
+        self.used = 0.0  # when it was written last, on the clock of its owner
         self._oldest = list(range(SLOTS))
         self._written: dict[int, weakref.ref[_Writing]] = {}
+        # By which other processes reach it
         self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         # Closed with the last reference: another thread may be writing when the interface is closed.
         self._owner = Descriptor(self.descriptor)

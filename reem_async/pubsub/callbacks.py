@@ -146,21 +146,13 @@ class Calls:
 
     They are made in the loop's next turn, when all that arrived in this one has been told to everybody. A task of
     their own would do the same at a higher price; only what must be awaited gets one.
-
-    Args:
-        caller: Makes a call.
-        updates: Where the updates come from.
-        kept: Where to be as long as there may be calls.
-
-    Attributes:
-        loop: The event loop.
     """
 
     def __init__(self, caller: Caller, updates: Stream[Update], kept: set[Any]) -> None:
         self.loop = asyncio.get_running_loop()
         self._caller = caller
         self._updates = updates
-        self._kept = kept
+        self._kept = kept  # where to be as long as there may be calls
         self._busy = False
         self._awaited: asyncio.Task[Any] | None = None
         self._has_exited = False

@@ -72,61 +72,36 @@ class Look(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """Event: an update.
-
-    Attributes:
-        notice: What was heard of it.
-        data: All that is at the followed path; MISSING if nothing is. Not to be changed.
-        value: What was written; the same object as `data` if that is all of it.
-        missed: How many updates were lost since the last event that reported losses, None if unknown.
-    """
+    """Event: an update."""
 
     notice: Notice
-    data: Any
-    value: Any
-    missed: int | None
+    data: Any  # All that is at the followed path; MISSING if nothing is. Not to be changed.
+    value: Any  # what was written; the same object as `data` if that is all of it
+    missed: int | None  # how many updates were lost since the last event that reported losses, None if unknown
 
 
 class Skipped(NamedTuple):
-    """Event: what a large update wrote cannot be reported, since it was changed before it was read.
-
-    Attributes:
-        notice: What was heard of it.
-        data: All that is at the followed path.
-        newest: No later update of this path is reported in its place.
-    """
+    """Event: what a large update wrote cannot be reported, since it was changed before it was read."""
 
     notice: Notice
-    data: Any
-    newest: bool
+    data: Any  # all that is at the followed path
+    newest: bool  # no later update of this path is reported in its place
 
 
 class Stored(NamedTuple):
-    """Event: what is there differs from all that was published.
+    """Event: what is there differs from all that was published."""
 
-    Attributes:
-        path: The deepest place, below what is followed, that holds all that differs.
-        data: All that is at the followed path; MISSING if nothing is.
-        value: What is at `path`; MISSING if nothing is.
-    """
-
-    path: Path
-    data: Any
-    value: Any
+    path: Path  # the deepest place, below what is followed, that holds all that differs
+    data: Any  # all that is at the followed path; MISSING if nothing is
+    value: Any  # what is at `path`; MISSING if nothing is
 
 
 class Snapshot(NamedTuple):
-    """Event: what is there, at the beginning or after a loss.
+    """Event: what is there, at the beginning or after a loss."""
 
-    Attributes:
-        data: All that is at the followed path.
-        initial: It was there when following began.
-        missed: How many updates were lost, None if unknown.
-    """
-
-    data: Any
-    initial: bool
-    missed: int | None
+    data: Any  # all that is at the followed path
+    initial: bool  # it was there when following began
+    missed: int | None  # how many updates were lost, None if unknown
 
 
 class Ready(NamedTuple):
@@ -160,24 +135,14 @@ class Report(Enum):
 
 
 class EventMaker:
-    """Makes events of what changes a copy.
-
-    Args:
-        path: Where the copy is, below the top-level key.
-        rest: What is followed below that.
-        outputs: Where the events go.
-
-    Attributes:
-        report: How the next snapshot is reported.
-        missed: How many updates were lost and not reported yet, None if unknown.
-    """
+    """Makes events of what changes a copy."""
 
     def __init__(self, path: Path, rest: Path, outputs: collections.deque[Output]) -> None:
-        self._path = path
-        self._rest = rest
+        self._path = path  # where the copy is, below the top-level key
+        self._rest = rest  # what is followed below that
         self._outputs = outputs
-        self.report = Report.INITIAL
-        self.missed: int | None = 0
+        self.report = Report.INITIAL  # how the next snapshot is reported
+        self.missed: int | None = 0  # how many updates were lost and not reported yet, None if unknown
 
     def begin(self, report: Report) -> None:
         """Report the next snapshot like this. After a loss it is not known how many updates the snapshot has."""

@@ -44,13 +44,6 @@ class Follower(Listener):
     """Keeps a local copy of one path equal to the server's, and hands out each update.
 
     All methods but `value` and `at` are called on the event loop.
-
-    Attributes:
-        keys: The top-level key's names.
-        born: If nothing was there a moment ago, what was heard of it until it is followed; else None.
-        failure: The exception that has ended it, None while it follows.
-        down: There is no connection, or it is new and what is there was not read yet.
-        on_state: Called with each state of the copy in order, and with the present one after each step, if `stored`.
     """
 
     def __init__(
@@ -83,9 +76,11 @@ class Follower(Listener):
         self._may_be_gone = True  # the last read, or the probe after it, may have found no document at all
         self._reads_for_probe = False  # the next read is to see what a probe has shown
         self._probe_refusal: Exception | None = None
+        # If nothing was there a moment ago, what was heard of it until it is followed; else None
         self.born: list[Notice] | None = None
         self.failure: Exception | None = None
-        self.down = True
+        self.down = True  # there is no connection, or it is new and what is there was not read yet
+        # Called with each state of the copy in order, and with the present one after each step, if `stored`
         self.on_state: Callable[[Any], None] = unnoticed
 
     @contained
@@ -212,7 +207,6 @@ class Follower(Listener):
     # --- what the replica asks for
 
     def _perform(self) -> None:
-        """Execute the replica's outputs; more may be added meanwhile."""
         outputs = self._replica.outputs
         while outputs:
             output = outputs.popleft()
@@ -223,12 +217,9 @@ class Follower(Listener):
             if self.stored and isinstance(output, Updated | Stored | Snapshot):
                 self.on_state(output.data)
         if self.stored:
-            self._note_age()
-
-    def _note_age(self) -> None:
-        if self._replica.is_current:
-            self._valid_at = max(self._valid_at, self._asked)  # it is from the last read, or newer
-        self.on_state(self._replica.at())
+            if self._replica.is_current:
+                self._valid_at = max(self._valid_at, self._asked)  # it is from the last read, or newer
+            self.on_state(self._replica.at())
 
     def _do(self, output: Output) -> None:
         if isinstance(output, Read):
@@ -241,13 +232,14 @@ class Follower(Listener):
             self._arm(output)
         elif isinstance(output, Stored):
             self._looks.found()
-            self._tell_stored(output)
+            self._tell_state(output.path, output.data, output.value, Origin.STORED)
         elif isinstance(output, Open):
             self._open(output)
         elif isinstance(output, Skipped):
             self._skip(output)
         elif isinstance(output, Snapshot):
-            self._tell_snapshot(output)
+            data, initial = output.data, output.initial
+            self._tell_state((), data, data, Origin.FOUND, initial=initial, gap=not initial, missed=output.missed)
         elif isinstance(output, Ready):
             self.down = False
             if self.ready is not None and not self.ready.done():
@@ -361,32 +353,15 @@ class Follower(Listener):
             how = Origin.PUBLISHED, gone, notice.early
             queue.put(Update(path, data, value, False, time, publisher, sequence, missed != 0, missed, *how))
 
-    def _tell_stored(self, event: Stored) -> None:
-        path = self._path(event.path)
+    def _tell_state(self, inner: Path, tree: Any, value: Any, origin: Origin, **how: Any) -> None:
+        """Report what is there, and who published it is unknown."""
+        path = self._path(inner)
         for queue in self.queues:
-            data = own(event.data)
-            value = data if event.value is event.data else own(event.value)
-            queue.put(Update(path, data, value, origin=Origin.STORED, deleted=event.value is MISSING))
-
-    def _tell_snapshot(self, event: Snapshot) -> None:
-        path, gone = self._path(()), event.data is MISSING
-        for queue in self.queues:
-            data = own(event.data)
-            queue.put(
-                Update(
-                    path,
-                    data,
-                    data,
-                    initial=event.initial,
-                    gap=not event.initial,
-                    missed=event.missed,
-                    origin=Origin.FOUND,
-                    deleted=gone,
-                )
-            )
+            data = own(tree)
+            own_value = data if value is tree else own(value)
+            queue.put(Update(path, data, own_value, origin=origin, deleted=value is MISSING, **how))
 
     def _path(self, inner: Path) -> str:
-        """Return a path below what is followed, as people write it."""
         return show((self.keys.name, *self._replica.path, *self._replica.rest, *inner))
 
     def _skip(self, event: Skipped) -> None:
@@ -414,7 +389,7 @@ def checked_largest(largest: float | None) -> float:
 
 
 def unnoticed(tree: Any) -> None:
-    """Take no notice of a state."""
+    """Ignore a state."""
 
 
 def own(tree: Any) -> Any:

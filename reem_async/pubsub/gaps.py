@@ -22,16 +22,11 @@ class Numbered(Protocol):
     """An update as anybody has heard of it, such as a `Notice` or an `Event`."""
 
     @property
-    def publisher(self) -> str:
-        """The id of the interface that published it."""
-
+    def publisher(self) -> str: ...
     @property
-    def sequence(self) -> int:
-        """Its number among this publisher's updates of the top-level key."""
-
+    def sequence(self) -> int: ...
     @property
-    def time(self) -> float:
-        """When it was published, on the publisher's clock."""
+    def time(self) -> float: ...
 
 
 class Numbers:

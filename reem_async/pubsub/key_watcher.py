@@ -50,20 +50,13 @@ class Subscriptions(Protocol):
     tasks: Tasks
 
     async def follow_here(self, listener: Listener) -> None: ...
-
     async def follow_all(self, listeners: Sequence[Listener]) -> None: ...
-
     async def unfollow(self, listener: Listener) -> None: ...
-
     async def unfollow_here(self, listener: Listener) -> None: ...
 
 
 class KeyWatcher:
-    """Follows, for each listener to a pattern, all keys that there are, and those that come to be.
-
-    Args:
-        manager: Where keys are followed.
-    """
+    """Follows, for each listener to a pattern, all keys that there are, and those that come to be."""
 
     def __init__(self, manager: Subscriptions) -> None:
         self._manager = manager
@@ -190,19 +183,13 @@ def literal(glob: str) -> str | None:
 
 
 class _Part(Listener):
-    """A part of what the listener to a pattern follows: a listener of the subscription manager.
-
-    Args:
-        listener: The listener to the pattern; held weakly, so that a dropped one is not followed for any more.
-        topic: What it subscribes to.
-    """
+    """A part of what the listener to a pattern follows. It holds that listener weakly, so that it can be dropped."""
 
     def __init__(self, listener: Listener, topic: Topic) -> None:
         super().__init__(topic, listener.max_batch_delay)
         self._listener: Callable[[], Listener | None] = weakref.ref(listener)
 
     def let_go(self) -> None:
-        """Notify the listener no more."""
         self._listener = _nobody
 
     def lost(self, reason: Exception) -> None:
@@ -221,18 +208,14 @@ def _nobody() -> None:
 
 
 class _KeyListener(_Part):
-    """One key of a pattern: a listener of the subscription manager that hands everything on.
-
-    Attributes:
-        begun: It is followed.
-        seen: When the key was there last, something was heard of it, or it began to be followed.
-    """
+    """One key of a pattern: a listener of the subscription manager that hands everything on."""
 
     def __init__(self, listener: Listener, document: bytes, new_keys: _NewKeysListener | None) -> None:
         channel = keys_of(document.decode(errors="surrogateescape")).channel
         super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
         self._new_keys = new_keys  # where its first notices came from, or None if only this key is meant
-        self.begun = False
+        self.begun = False  # it is followed
+        # When the key was there last, something was heard of it, or it began to be followed
         self.seen = time.monotonic()
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
@@ -257,24 +240,18 @@ class _KeyListener(_Part):
 
 
 class _NewKeysListener(_Part):
-    """What publishers tell all nodes: a listener of the subscription manager.
-
-    Attributes:
-        fresh: The keys that were just heard of, in their order, and
-        following: whether they are about to be followed.
-    """
+    """What publishers tell all nodes: a listener of the subscription manager."""
 
     def __init__(self, key_watcher: KeyWatcher, listener: Listener) -> None:
         super().__init__(listener, listener.topic)
         self._key_watcher = key_watcher
-        self.fresh: dict[bytes, None] = {}
-        self.following = False
+        self.fresh: dict[bytes, None] = {}  # the keys that were just heard of, in their order
+        self.following = False  # they are about to be followed
         self._telling = False  # of a gap, in this turn of the event loop
         self._buffers: dict[bytes, ReorderBuffer] = {}
 
     @property
     def waits(self) -> bool:
-        """Whether an update has come and is not handed on yet."""
         return any(each.waits for each in self._buffers.values())
 
     def buffer(self, channel: bytes) -> ReorderBuffer:

@@ -29,12 +29,7 @@ _MOST_WARNINGS = 100
 
 
 class Topic(NamedTuple):
-    """What to subscribe to.
-
-    Attributes:
-        name: A channel, or
-        pattern: if this is set, a glob pattern of channels.
-    """
+    """What to subscribe to: a channel, or a glob pattern of channels."""
 
     name: bytes
     pattern: bool = False
@@ -67,27 +62,19 @@ class Listener:
     """What is notified of updates. Its methods do nothing unless a listener needs them.
 
     Args:
-        topic: What it subscribes to.
-        max_batch_delay: Seconds that updates may wait for each other before it is notified.
         queues: What is closed when it is followed no more.
-
-    Attributes:
-        note: The key where the server keeps a note of the last update; None if there are many, or others compare it.
-        ready: Done when it has begun to follow.
-        stored: It is notified of keys that were changed, not only of what is published.
-        heartbeat: Seconds between probes that it needs; infinite if those that all get will do.
-        local: It takes large values from the memory of publishers of the same host.
     """
 
     def __init__(self, topic: Topic, max_batch_delay: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
         self.topic = topic
-        self.max_batch_delay = max_batch_delay
+        self.max_batch_delay = max_batch_delay  # seconds that updates may wait for each other before it is notified
         self.queues: list[BoundedQueue] = [*queues]
+        # The key where the server keeps a note of the last update; None if there are many, or others compare it
         self.note: str | None = None
-        self.ready: asyncio.Future[None] | None = None
-        self.stored = False
-        self.heartbeat = math.inf
-        self.local = False
+        self.ready: asyncio.Future[None] | None = None  # done when it has begun to follow
+        self.stored = False  # it is notified of keys that were changed, not only of what is published
+        self.heartbeat = math.inf  # seconds between probes that it needs; infinite if those that all get will do
+        self.local = False  # it takes large values from the memory of publishers of the same host
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         """Begin over `wire`, which is subscribed."""
@@ -175,15 +162,7 @@ class Inbox:
     """Tells each listener what is pushed for him.
 
     Args:
-        transport: Whose server it is.
-        ships: What carries values that are not JSON.
-        topics: The listeners to each topic.
         local: How values in the memory of publishers of the same host are looked at.
-        moved: Called with topics that their server does not have any more, and why.
-        empty: Called with a topic that has no listener any more.
-
-    Attributes:
-        watchers: Notified of every key that the server says was changed, whichever listener read it.
     """
 
     def __init__(
@@ -200,9 +179,10 @@ class Inbox:
         self._topics = topics
         self._view = local.view if local.host else None
         self._early = f"@{local.host}".encode() if local.host else None
-        self._moved = moved
-        self._empty = empty
+        self._moved = moved  # called with topics that their server does not have any more, and why
+        self._empty = empty  # called with a topic that has no listener any more
         self._warned: set[bytes] = set()
+        # Notified of every key that the server says was changed, whichever listener read it
         self.watchers = ListenerGroup()
         database = transport.options.database
         self._tail = b"}:notices" + (f"@{database}".encode() if database else b"")

@@ -53,14 +53,7 @@ def manager_of(session: Session) -> SubscriptionManager:
 
 
 class SubscriptionManager:
-    """The subscription connections of an interface in one event loop, and the listeners, by topic.
-
-    Attributes:
-        place: The process and the event loop it belongs to.
-        callers: What makes calls for updates, kept here although the program may not hold it.
-        tasks: All that runs in the background for what is followed; ended by `close`.
-        invalidations: What has servers say which keys were changed.
-    """
+    """The subscription connections of an interface in one event loop, and the listeners, by topic."""
 
     def __init__(self, transport: Transport, ships: Ships, local: LocalPath) -> None:
         self.transport = transport
@@ -72,7 +65,7 @@ class SubscriptionManager:
         self._unsure: set[Topic] = set()  # their keys are on their way to another node
         self._beginners: Sequence[Listener] = ()  # they begin by themselves once their topics are subscribed
         self._lock = asyncio.Lock()
-        self.tasks = Tasks()
+        self.tasks = Tasks()  # all that runs in the background for what is followed; ended by `close`
         self._reconnecting: asyncio.Task[Any] | None = None
         self._key_watcher: KeyWatcher | None = None
         self._reported: set[str] = set()
@@ -80,12 +73,10 @@ class SubscriptionManager:
         self._closed = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
         self._subscribing = Subscribing(transport, local.host, self._confirmed)
-        self.invalidations = Invalidations()
-        self._heartbeats = Heartbeats(
-            self.tasks, self._listeners_over, self._forget_empty, self._answered, self._on_note
-        )
-        self.callers: set[Any] = set()
-        self.place = os.getpid(), asyncio.get_running_loop()
+        self.invalidations = Invalidations()  # what has servers say which keys were changed
+        self._heartbeats = Heartbeats(self)
+        self.callers: set[Any] = set()  # what makes calls for updates, kept here although the program may not hold it
+        self.place = os.getpid(), asyncio.get_running_loop()  # the process and the event loop it belongs to
 
     async def follow(self, listener: Listener) -> None:
         """Subscribe, then let the listener begin; when this returns, no later update is missed."""
@@ -299,7 +290,7 @@ class SubscriptionManager:
         self._unsure.discard(topic)
         self._subscribing.leave(self._subscribed.pop(topic, None), topic)
 
-    def _forget_empty(self) -> list[Listener]:
+    def forget_empty(self) -> list[Listener]:
         """Forget topics without listeners; return the listeners that are left."""
         if self._local.host:
             self._local.reader.let_go()
@@ -307,14 +298,15 @@ class SubscriptionManager:
             self._forget_if_empty(topic)  # all were dropped without closing
         return self._listeners()
 
-    def _listeners_over(self, wire: Wire) -> list[Listener]:
+    def listeners_over(self, wire: Wire) -> list[Listener]:
         return self._listeners([topic for topic, there in self._subscribed.items() if there is wire])
 
-    def _answered(self) -> None:
+    def answered(self) -> None:
         if not self.transport.sharded:  # a node says nothing of the others
             self.transport.states.answered()
 
-    def _on_note(self, listener: Listener, note: Reply) -> None:
+    def on_note(self, listener: Listener, note: Reply) -> None:
+        """Hand a listener the server's note of its key, unless that is an error of the server."""
         if is_moved(note):  # this node is only a replica now
             self._moved([listener.topic], str(note))
         elif is_unapplied(note):
@@ -327,7 +319,6 @@ class SubscriptionManager:
             listener.on_note(note)
 
     def _moved(self, topics: list[Topic], reason: str) -> None:
-        """Resynchronise these topics where they are now."""
         for topic in topics:
             wire = self._subscribed.pop(topic, None)
             self._unsure.discard(topic)
@@ -358,12 +349,10 @@ class SubscriptionManager:
         self._repair()
 
     def _repair(self) -> None:
-        """Subscribe what is missing, in the background."""
         if not self._closed and self._reconnecting is None and self._missing():
             self._reconnecting = self.tasks.start(self._reconnect(), "reem reconnect")
 
     def _missing(self) -> list[Topic]:
-        """Return the topics that are followed and not subscribed."""
         if self._closed:
             return []
         return [

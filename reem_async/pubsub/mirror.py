@@ -31,33 +31,24 @@ _NO_STATE: Any = object()
 
 
 class Tried(NamedTuple):
-    """The result of a call of a predicate.
+    """The result of a call of a predicate."""
 
-    Attributes:
-        fits: The predicate is fulfilled.
-        value: The value that it was called with.
-        again: Seconds after which to try again even if nothing changes.
-    """
-
-    fits: bool
-    value: Any = None
-    again: float = math.inf
+    fits: bool  # the predicate is fulfilled
+    value: Any = None  # the value that it was called with
+    again: float = math.inf  # seconds after which to try again even if nothing changes
 
 
 class Wait:
     """One call of `wait_until`, and the states of the copy that it has not seen yet.
 
     The event loop adds states, the caller takes them out, perhaps on another thread; each step is one of C.
-
-    Attributes:
-        states: Trees, the oldest first. They are never changed in place.
-        seen: The tree that the predicate was called with last.
-        waiter: Done when there is something to look at; on the event loop only.
     """
 
     def __init__(self) -> None:
+        # Trees, the oldest first. They are never changed in place.
         self.states: collections.deque[Any] = collections.deque(maxlen=_MOST_STATES)
-        self.seen: Any = _NO_STATE
+        self.seen: Any = _NO_STATE  # the tree that the predicate was called with last
+        # Done when there is something to look at; on the event loop only
         self.waiter: asyncio.Future[None] | None = None
 
     def wake(self) -> None:
@@ -154,7 +145,6 @@ class Mirror(Following):
         return follower
 
     def _check(self) -> None:
-        """Raise Stale if the copy must not be relied on."""
         if self._link.closed:
             raise Stale(f"{self.channel}: this mirror is closed; make a new one")
         if self._link.interface_closed:
@@ -241,14 +231,12 @@ class Mirror(Following):
         await asyncio.wait([wait.waiter], timeout=None if seconds == math.inf else seconds)
 
     def _give_up(self, timeout: float | None) -> NoReturn:
-        """Raise TimeoutError."""
         follower = self._link.follower
         reason = self._stale(follower) if follower is not None else "this mirror does not follow"
         why = f"; {reason}" if reason else ""
         raise TimeoutError(f"{self.channel}: did not come true within {timeout:g} s{why}") from None
 
     def _take(self, tree: Any) -> None:
-        """Hand a state of the copy to those who wait."""
         follower = self._link.follower
         for wait in tuple(self._waiting):  # another thread may add one meanwhile
             if (wait.states[-1] if wait.states else wait.seen) is not tree and follower and not self._stale(follower):
@@ -269,7 +257,6 @@ class Mirror(Following):
 
 
 def _check_wait(predicate: Any, timeout: Any) -> None:
-    """Raise BadType or BadValue for arguments of `wait_until` that cannot be."""
     if not callable(predicate):
         raise BadType(f"predicate={shorten(predicate)} is not a function; use one that is called with the value")
     if timeout is not None:

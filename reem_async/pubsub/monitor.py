@@ -240,11 +240,7 @@ class Monitor(PatternStream[Event]):
 
 
 class _PatternListener(Listener):
-    """One subscription of a monitor: a listener of the subscription manager, which holds it weakly.
-
-    Attributes:
-        wire: The connection, in a cluster one of them; None while there is none.
-    """
+    """One subscription of a monitor: a listener of the subscription manager, which holds it weakly."""
 
     def __init__(self, monitor: Monitor, topic: Topic) -> None:
         super().__init__(topic, monitor.patience, [monitor.queue])
@@ -253,7 +249,6 @@ class _PatternListener(Listener):
 
     @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
-        """Take the connection; after a broken one, say so."""
         self.wire = wire
         if beginning is Beginning.AFTER_LOSS:
             self._monitor._resynchronised()
@@ -261,19 +256,16 @@ class _PatternListener(Listener):
 
     @contained
     def lost(self, reason: Exception) -> None:
-        """Remember that updates may be lost. A call that waits for the beginning gets `reason`."""
         self.wire = None
         self._monitor._lost()
         super().lost(reason)
 
     @contained
     def changed(self, key: str | None) -> None:
-        """Hand it on."""
         self._monitor.changed(key)
 
     @contained
     def invalidate(self, channel: bytes) -> None:
-        """Remember that an update of a key was lost."""
         if not self._is_others(channel):
             self._monitor._doubt(channel)
 

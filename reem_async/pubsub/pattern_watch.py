@@ -86,7 +86,6 @@ class PatternWatch(PatternStream[Update]):
         return leaving
 
     def _new(self, found: set[str]) -> list[str]:
-        """Return the keys that are to be followed and are not."""
         lacking = (found - self._followed.keys()) | (found & self._unreadable.keys())
         return sorted(name for name in lacking if self._paths(name))
 
@@ -125,7 +124,6 @@ class PatternWatch(PatternStream[Update]):
                     self._let_go(follower)
 
     def _lacking(self, name: str) -> Iterable[Path]:
-        """Return the places in a key that are to be followed and are not."""
         unreadable = self._unreadable.pop(name, ())
         return unreadable if name in self._followed else self._paths(name)
 
@@ -169,7 +167,6 @@ class PatternWatch(PatternStream[Update]):
             self._failed.add(name)
 
     def heard(self, notice: Notice, channel: bytes) -> None:
-        """Follow the key of which an update was published, unless it is followed."""
         name = name_of(channel, self._session.namespace)
         born = self._born.get(name)
         if born is not None:
@@ -214,7 +211,6 @@ class PatternWatch(PatternStream[Update]):
             self._manager.tasks.start(self._manager.unfollow_here(follower), "reem unfollow")
 
     async def look(self) -> None:
-        """Follow new keys, and stop following those that are gone."""
         followed = list(self._followed)
         try:
             found = await present_keys(self._session, self.tops)

@@ -79,7 +79,6 @@ class PatternStream(Stream[Item]):
         return self._listeners
 
     def _channels(self, pattern: Pattern) -> bytes:
-        """Return the pattern of the channels of the keys that `pattern` names."""
         return channel_pattern(pattern, self._session.namespace, self._session.options.database)
 
     @abstractmethod

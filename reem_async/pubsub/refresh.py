@@ -41,7 +41,6 @@ class RefreshTimer(Generic[Owner]):
     Args:
         owner: Whose looks they are; held weakly, since a follower ends by being dropped.
         look: Called with the owner when a look is due.
-        pace: How soon.
 
     Attributes:
         heard: Counts the notices; the owner adds them.

@@ -92,8 +92,6 @@ class Outcome(Enum):
 
 
 class State(Enum):
-    """What a replica is doing; the module's docstring draws it."""
-
     OFFLINE = auto()
     ARMING = auto()
     READING = auto()
@@ -111,31 +109,23 @@ _AT_REST = State.CURRENT, State.UNREAD, State.BROKEN
 class Replica:
     """A local copy of one path.
 
-    Args:
-        keys: The top-level key's names.
-        path: The path below it.
-        ships: What carries values that are not JSON.
-        cache: What is known of documents.
-        largest: Bytes of an attachment up to which it is fetched; a larger one is left: an `Unfetched` is kept.
-
     Attributes:
-        path: What is kept, below the top-level key: what is followed, up to the first index that counts
-            from the end (which item that is changes with its list; updates count from the front).
+        path: What is kept, below the top-level key: what is followed, up to the first index that counts from the
+            end (which item that is changes with its list; updates count from the front).
         rest: What is followed below `path`.
-        tree: The copy, never changed in place; other threads may look at it.
-        state: What it is doing.
-        outputs: What is to be done and told, oldest first; who drives takes it out.
     """
 
     def __init__(self, keys: Keys, path: Path, ships: Ships, cache: ShapeCache, largest: float = math.inf) -> None:
         end = next((place for place, key in enumerate(path) if isinstance(key, int) and key < 0), len(path))
         self.path, self.rest = path[:end], path[end:]
-        self.tree: Any = MISSING
+        self.tree: Any = MISSING  # the copy, never changed in place; other threads may look at it
         self.state = State.OFFLINE
+        # What is to be done and told, oldest first; who drives takes it out
         self.outputs: collections.deque[Output] = collections.deque()
         self._keys = keys
         self._ships = ships
         self._cache = cache
+        # Bytes of an attachment up to which it is fetched; a larger one is left: an `Unfetched` is kept
         self._largest = largest
         self._events = EventMaker(self.path, self.rest, self.outputs)
         self._tell = self._events.update
@@ -211,7 +201,6 @@ class Replica:
         return outcome is not Outcome.NEW
 
     def unreadable(self) -> None:
-        """A message could not be read."""
         if self.state is not State.OFFLINE:
             self._take(Heard(None, None))
 
@@ -296,7 +285,6 @@ class Replica:
     # --- snapshots
 
     def _read_after(self, heard: Heard[Notice]) -> None:
-        """Take a snapshot, which has what was heard last."""
         self._division.covered.append(heard)
         self._read()
 

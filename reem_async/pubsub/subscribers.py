@@ -26,13 +26,7 @@ __all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "U
 
 
 class Link:
-    """A follower and the manager it is at: made by the first `follow`, and again after a fork or in another loop.
-
-    Attributes:
-        on_state: Called with each state of the copy; see `Follower`.
-        closed: It was closed, and does not begin again.
-        follower: The present one, or one of another process or loop; None before it has begun.
-    """
+    """A follower and the manager it is at: made by the first `follow`, and again after a fork or in another loop."""
 
     def __init__(
         self,
@@ -52,10 +46,11 @@ class Link:
         self._stored = stored
         self._largest = largest
         self._heartbeat = heartbeat
-        self.on_state: Callable[[Any], None] = unnoticed
+        self.on_state: Callable[[Any], None] = unnoticed  # called with each state of the copy; see `Follower`
         self._manager: SubscriptionManager | None = None
         self._following: asyncio.Lock | None = None
-        self.closed = False
+        self.closed = False  # it was closed, and does not begin again
+        # The present one, or one of another process or loop; None before it has begun
         self.follower: Follower | None = None
 
     @property
@@ -239,7 +234,6 @@ class SilentSubscriber(Following):
 
 
 def _rebuilt(kind: type[SilentSubscriber], arguments: tuple[Any, ...], stored: bool) -> SilentSubscriber:
-    """Make a subscriber from the parts of a pickled one."""
     return kind(*arguments, stored=stored)
 
 
@@ -363,7 +357,6 @@ class CallbackSubscriber(SilentSubscriber):
         return _rebuilt, (type(self), arguments, self.stored)
 
     def _caller(self) -> Caller:
-        """Return what makes the calls."""
         return Caller(self.channel, self._call, self.kwargs)
 
     async def close(self) -> None:

@@ -7,7 +7,7 @@ import logging
 import weakref
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 from ..concurrency.tasks import Tasks
 from ..errors import ServerNotReady, is_of_command
@@ -25,17 +25,12 @@ _PERIOD = 1.0
 
 
 class Subscribing:
-    """Subscribes to topics over connections that the caller chooses.
-
-    Args:
-        transport: Whose server it is.
-        host: What names this host to publishers that share memory with it; none if that is off.
-        confirmed: Called with a topic and the connection when the server has confirmed a subscription.
-    """
+    """Subscribes to topics over connections that the caller chooses."""
 
     def __init__(self, transport: Transport, host: str | None, confirmed: Callable[[Topic, Wire], None]) -> None:
         self._transport = transport
-        self._host = host
+        self._host = host  # what names this host to publishers that share memory with it; none if that is off
+        # Called with a topic and the connection when the server has confirmed a subscription
         self._on_confirmed = confirmed
         self._invited: set[Topic] = set()  # publishers of this host know of a listener
 
@@ -115,11 +110,7 @@ class Invalidations:
             wire.tracked = True
 
     async def touch(self, wire: Wire, names: Iterable[str], touched: Callable[[], None]) -> bool:
-        """Read keys over a connection, so that the server tells once when they are changed. One round trip.
-
-        Returns whether it will tell. `touched` is called in order with what it tells: what it has told of before was
-        changed before. When this returns it may have told more.
-        """
+        """Do as `SubscriptionManager.touch`, over a connection."""
         if not wire.alive or not wire.tracked:
             return False
         answered = asyncio.get_running_loop().create_future()
@@ -154,38 +145,31 @@ class Invalidations:
             )
 
 
+class Connections(Protocol):
+    """What is needed of the subscription manager, which imports this module."""
+
+    tasks: Tasks
+
+    def listeners_over(self, wire: Wire) -> list[Listener]: ...
+    def forget_empty(self) -> list[Listener]: ...
+    def answered(self) -> None: ...
+    def on_note(self, listener: Listener, note: Reply) -> None: ...
+
+
 class Heartbeats:
     """Asks over each connection for the notes of the last updates, every second.
 
     Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
     time to live has passed. Belongs to an event loop.
-
-    Args:
-        tasks: Where the looks run.
-        listeners: Returns the listeners over a connection.
-        forget: Called every second: forgets topics without listeners, and returns the listeners that are left.
-        answered: Called when a connection has answered.
-        on_note: Called with a listener and the server's note for it, or an error of the server.
     """
 
-    def __init__(
-        self,
-        tasks: Tasks,
-        listeners: Callable[[Wire], list[Listener]],
-        forget: Callable[[], list[Listener]],
-        answered: Callable[[], None],
-        on_note: Callable[[Listener, Reply], None],
-    ) -> None:
-        self._tasks = tasks
-        self._listeners = listeners
-        self._forget = forget
-        self._answered = answered
-        self._on_note = on_note
+    def __init__(self, manager: Connections) -> None:
+        self._manager = manager
         self._period = _PERIOD
         self._beating: dict[Wire, asyncio.Task[Any]] = {}
 
     def start(self, wire: Wire) -> None:
-        self._beating[wire] = self._tasks.start(self._beat(wire), "reem heartbeat")
+        self._beating[wire] = self._manager.tasks.start(self._beat(wire), "reem heartbeat")
 
     def lost(self, wire: Wire) -> None:
         self._beating.pop(wire, None)
@@ -219,15 +203,15 @@ class Heartbeats:
 
     def _needed(self) -> float:
         """Return the seconds between looks that those who still listen need."""
-        return min([_PERIOD, *(listener.heartbeat for listener in self._forget())])
+        return min([_PERIOD, *(listener.heartbeat for listener in self._manager.forget_empty())])
 
     def _notes(self, wire: Wire) -> list[str]:
-        return sorted({listener.note for listener in self._listeners(wire) if listener.note is not None})
+        return sorted({listener.note for listener in self._manager.listeners_over(wire) if listener.note is not None})
 
     def _probe(self, wire: Wire, now: float) -> None:
         """Ask for the types of the documents that are due by the middle of this period."""
         documents: dict[str, list[weakref.ref[Listener]]] = {}
-        for listener in self._listeners(wire):
+        for listener in self._manager.listeners_over(wire):
             if (document := listener.probe(now + self._period / 2)) is not None:
                 documents.setdefault(document, []).append(weakref.ref(listener))
         if documents:
@@ -249,10 +233,10 @@ class Heartbeats:
             answered.set_result(None)
         if isinstance(notes, Exception):
             return
-        self._answered()
+        self._manager.answered()
         if not names:
             return
         found = dict(zip(names, notes, strict=False))
-        for listener in self._listeners(wire):
+        for listener in self._manager.listeners_over(wire):
             if listener.note in found:
-                self._on_note(listener, found[listener.note])
+                self._manager.on_note(listener, found[listener.note])

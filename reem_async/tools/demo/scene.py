@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
 
-__all__ = ["BALL_RADIUS", "REACH", "Array", "Camera", "angles_to", "points_of"]
-
 Array = np.ndarray[Any, Any]
 
 SHOULDER, UPPER, FORE, HAND = 0.13, 0.30, 0.27, 0.10  # height of the shoulder, lengths of the links
