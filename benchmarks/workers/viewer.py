@@ -12,6 +12,8 @@ import time
 import urllib.error
 import urllib.parse
 import urllib.request
+from collections.abc import Callable
+from typing import Any
 
 _EVERY = 0.1  # seconds between two looks of REEM's page
 _LARGE = 100_000  # bytes; a message of so many has a picture
@@ -34,19 +36,19 @@ def page(address: str, camera: str) -> None:
 
 def foxglove(folder: str) -> None:
     """Subscribe to all channels of each server as it comes."""
+    from websockets.sync.client import connect  # before the threads, which would import it at the same time
+
     known: set[str] = set()
     while True:
         for path in pathlib.Path(folder).glob("*"):
             if path.name not in known:
                 known.add(path.name)
-                threading.Thread(target=take_all, args=(path.name,), daemon=True).start()
+                threading.Thread(target=take_all, args=(connect, path.name), daemon=True).start()
         time.sleep(0.1)
 
 
-def take_all(port: str) -> None:
+def take_all(connect: Callable[..., Any], port: str) -> None:
     """Receive all messages of one server."""
-    from websockets.sync.client import connect
-
     address = f"ws://127.0.0.1:{port}"
     with connect(address, subprotocols=["foxglove.sdk.v1"], max_size=None, compression=None) as socket:
         for message in socket:
@@ -57,6 +59,7 @@ def take_all(port: str) -> None:
             channels = json.loads(message).get("channels", [])
             wanted = [{"id": channel["id"], "channelId": channel["id"]} for channel in channels]
             if wanted:
+                time.sleep(0.2)  # foxglove-sdk 0.30 announces a channel a moment before it accepts subscriptions
                 socket.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
 
 
