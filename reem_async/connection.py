@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self
 
+from .errors import SELF_EXPLANATORY
 from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
@@ -151,7 +152,10 @@ class RedisInterface:
             NotConnected: No server listens there.
             redis.exceptions.AuthenticationError: Wrong user or password.
         """
-        await self.session.initialize()
+        try:
+            await self.session.initialize()
+        except SELF_EXPLANATORY as error:
+            raise error.with_traceback(None) from None
 
     async def close(self) -> None:
         """End all subscriptions and close all connections. Idempotent."""

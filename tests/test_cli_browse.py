@@ -76,7 +76,7 @@ def test_the_options_write_and_namespace(server_url, interface, key):
         reem.KeyValueStore(spaced)["only"] = 1
         arguments = ("--url", server_url, "--namespace", f"{key.prefix}:", "--allow-write")
         with browsing(*arguments) as (_, said):
-            assert "look and write" in said
+            assert "reading and writing" in said
             answer = httpx.get(f"{address_in(said)}api/tree?open=10:0:", timeout=PATIENCE, trust_env=False)
             assert [node["label"] for node in answer.json()["branches"][0]["nodes"]] == ["only"]
 

@@ -326,7 +326,7 @@ REFUSALS = [
     (lambda at: at["image"][7].write(3), PathRefused, r"\[7\]: "),
     (lambda at: at["l"][1].write(1), PathRefused, "the list index is out of range; a list only grows by appending$"),
     (lambda at: at["d"][0].write(1), PathRefused, r"\.d is of type object and has no element 0"),
-    (lambda at: at["s"][0].write(1), PathRefused, r"\.s is of type string and has no element 0"),
+    (lambda at: at["s"][0].write(1), PathRefused, r"\.s is an array, or text, and has no element 0"),
     (lambda at: at["n"][0].write(1), PathRefused, r"\.n is of type integer and has no element 0"),
 ]
 OF_STORES = [

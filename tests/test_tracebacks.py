@@ -104,6 +104,19 @@ async def test_of_several_calls_that_share_a_failure_each_says_so_in_one_line():
             assert len(shown(error)[1]) <= 3
 
 
+def test_a_program_that_starts_before_its_server_says_so_in_a_few_lines():
+    async def connect():
+        async with reem_async.RedisInterface("redis://127.0.0.1:1"):
+            pass
+
+    with pytest.raises(NotConnected) as caught:
+        asyncio.run(connect())
+    check(caught.value, 2)
+    with pytest.raises(NotConnected) as caught, reem.RedisInterface("redis://127.0.0.1:1"):
+        pass
+    check(caught.value, 4)
+
+
 FOLLOWING = {
     "mirror": lambda interface: reem.SilentSubscriber("a", interface).listen(),
     "callback": lambda interface: reem.CallbackSubscriber("a", interface, print, {}).listen(),

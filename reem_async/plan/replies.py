@@ -180,10 +180,10 @@ def settable(keys: Keys, path: Path) -> Plan:
                 refusal = PathRefused if place else MissingTop
                 raise refusal(f"{whole}: there is no {outer} to write into")
             if kind not in ("object", "array") or (kind == "object") != isinstance(inner, str):
-                # On the server an array is a text, its placeholder.
-                is_array = kind == "string" and isinstance(inner, int)
-                hint = "; or it is an array: change a copy and write an array as a whole" if is_array else ""
-                raise PathRefused(f"{whole}: {outer} is of type {kind} and has no element {inner!r}{hint}")
+                what, cure = f"of type {kind}", ""
+                if kind == "string" and isinstance(inner, int):  # on the server an array is a text, its placeholder
+                    what, cure = "an array, or text,", " to write: change a copy, and write an array as a whole"
+                raise PathRefused(f"{whole}: {outer} is {what} and has no element {inner!r}{cure}")
         if kinds[-1] is None and isinstance(path[-1], int):
             raise out_of_range(keys, path)
 

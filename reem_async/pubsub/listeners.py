@@ -258,7 +258,7 @@ class Inbox:
         if channel not in self._warned and len(self._warned) < _MOST_WARNINGS:
             self._warned.add(channel)
             logger.warning(
-                "a message on %s could not be read and is left out: %s (said once for each channel; "
+                "a message on %s could not be read and is left out: %s (reported once for each channel; "
                 "interface.unreadable counts them)",
                 shorten(channel),
                 error,

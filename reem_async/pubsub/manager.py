@@ -112,7 +112,7 @@ class SubscriptionManager:
             if it.place not in self._reported and len(self._reported) < _MOST_REPORTED:
                 self._reported.add(it.place)
                 self.transport.states.unreadable += 1
-                logger.warning("%s cannot be read, what is beside it can: %s (said once)", it.place, it.reason)
+                logger.warning("%s cannot be read, the values beside it can: %s (reported once)", it.place, it.reason)
 
     @property
     def hears_of_changes(self) -> bool:

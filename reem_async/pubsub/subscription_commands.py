@@ -137,8 +137,8 @@ class Invalidations:
         if not self._warned:
             self._warned = True
             logger.warning(
-                "what is only stored cannot be followed at this server, only what is published is told; a recording "
-                "has the rest at its keyframes, and the page looks for it: %s "
+                "the server does not report what is stored without publishing: only published updates are delivered; "
+                "recordings read the rest at keyframes, and the page every second: %s "
                 "(the user needs the right %s, as in deploy/users.acl)",
                 reason,
                 right,

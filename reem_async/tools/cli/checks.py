@@ -9,7 +9,7 @@ from enum import StrEnum
 from statistics import median
 from typing import NamedTuple
 
-from reem_async.tools.cli.output import named, size_text
+from reem_async.tools.cli.output import counted, named, size_text
 
 
 class CheckStatus(StrEnum):
@@ -64,10 +64,11 @@ def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
         return Finding("server", OK, f"answers at {address}; this user may not ask for its version")
     name = facts.info.get("server_name", "redis")
     number = facts.info.get(f"{name}_version") or facts.info.get("redis_version", "?")
-    hours = facts.number("uptime_in_seconds") / 3600
+    seconds = facts.number("uptime_in_seconds")
+    age = f"{seconds / 3600:.1f} hours" if seconds >= 3600 else counted(seconds // 60, "minute")
     # Valkey reports its own version beside the version of Redis that it is compatible with.
     mode = facts.info.get("redis_mode") or facts.info.get("server_mode", "standalone")
-    text = f"{name} {number} at {address}, {mode}, up for {hours:.1f} hours"
+    text = f"{name} {number} at {address}, {mode}, up for {age}"
     if mode == "cluster" and not sharded:
         return Finding("server", WARN, text, f"this is one node of several; reach all: redis+cluster://{address}")
     return Finding("server", OK, text)
@@ -175,8 +176,8 @@ def subscribers(facts: Facts) -> Finding:
     hard, soft, seconds = map(int, words[start : start + 3])
     if not hard and not soft:
         return Finding("subscribers", OK, "may fall behind without limit")
-    text = f"are disconnected when they owe {size_text(hard)}" if hard else "are disconnected when they owe"
-    text += f", or {size_text(soft)} for {seconds} s" if soft else ""
+    limits = [size_text(hard)] * (hard > 0) + [f"{size_text(soft)} for {seconds} s"] * (soft > 0)
+    text = f"are disconnected when what waits for them reaches {', or '.join(limits)}"
     closed = facts.number("client_output_buffer_limit_disconnections")
     if closed:
         return Finding("subscribers", WARN, f"{closed} clients were disconnected as too slow; they {text}", _LARGER)

@@ -49,7 +49,7 @@ _EXTRAS = {
     "server": "a server of its own for `reem up`",
     "fast": "a faster event loop",
     "tools": "recording, replay and the browser",
-    "demo": "the demonstration, and .png files",
+    "demo": "the picture of `make demo`",
 }
 _STYLES = {OK: ("✓", "green"), WARN: ("!", "yellow"), FAIL: ("✗", "red"), UNKNOWN: ("?", "cyan")}
 

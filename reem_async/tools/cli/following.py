@@ -17,7 +17,7 @@ from reem_async.plan.notices import LARGEST_INLINE
 from reem_async.plan.paths import parse_shown
 from reem_async.pubsub.monitor import Event, Monitor
 from reem_async.pubsub.pattern_watch import PatternWatch
-from reem_async.tools.cli.output import emit_json, note, write_over
+from reem_async.tools.cli.output import counted, emit_json, note, write_over
 from reem_async.tools.cli.running import TIMED_OUT
 
 _WAITING = 100_000
@@ -46,7 +46,7 @@ class Ending:
         """Say in one line how it went; return the exit code."""
         more = " or more" * (len(self.paths) >= _MOST_PATHS)
         where = f"{len(self.paths)}{more} path{'' if len(self.paths) == 1 else 's'}"
-        words = [f"{self.taken} updates of {where} in {self.seconds:.1f} s", f"{self.lost} lost"]
+        words = [f"{counted(self.taken, 'update')} of {where} in {self.seconds:.1f} s", f"{self.lost} lost"]
         if self.gaps:
             words.append(f"{self.gaps} gaps of unknown length")
         if self.skipped:
