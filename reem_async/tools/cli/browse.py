@@ -148,8 +148,8 @@ def _address(host: str, port: int, token: str | None) -> str:
 def _tell(source: Source, address: str, alone: bool, allow_write: bool) -> None:
     emit(styled("REEM's browser is up", "green") + f", showing {clean(source.title)}")
     who = "programs of this machine" if alone else "every program that has this address: it has a token in it"
-    may = "look and write" if allow_write and source.writable else "look"
-    facts_lines([("address", address), ("open to", who), ("they may", may), ("to stop", "Ctrl-C")])
+    rights = "reading and writing" if allow_write and source.writable else "reading"
+    facts_lines([("address", address), ("open to", who), ("allows", rights), ("to stop", "Ctrl-C")])
 
 
 def demo(
