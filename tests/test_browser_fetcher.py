@@ -31,7 +31,7 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
     await apspace[key()].write({"l": [0, 1, 2, 3], "image": LARGE})
     await apspace[key()]["l"][0].delete()
 
-    async def fence():
+    async def fence(channel):
         await apspace[key()]["l"][0].delete()
         for _ in range(3):
             page.hear(await anext(monitor))
@@ -46,7 +46,7 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
     """The connection of the notices breaks: it stays unknown until it is looked at again."""
     await apspace[key()].write({"n": 1, "image": LARGE})
 
-    async def fence():
+    async def fence(channel):
         raise ConnectionLost("gone")
 
     page, history = followed(binterface, key(), fence)

@@ -9,17 +9,19 @@ key puts in one order what is heard in both ways.
 from __future__ import annotations
 
 import asyncio
+import collections
 import logging
 import re
 import time
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
 
 from ..concurrency.tasks import Tasks
 from ..errors import InterfaceClosed, RedisError
 from ..plan.keys import DOCUMENT, keys_of
 from ..plan.notices import Notice
+from ..plan.paths import fits
 from ..session import QUIET
 from ..transport import Transport, scanned
 from ..transport.wire import Wire
@@ -29,7 +31,7 @@ from .reorder import ReorderBuffer
 
 logger = logging.getLogger("reem.subscribe")
 
-# Seconds between looks whether something still waits, and how often: a second in all, twice what a buffer waits.
+# Seconds between looks whether a key is settled, and how often: a second in all, twice what a buffer waits.
 _MOMENT, _MOMENTS = 0.005, 200
 
 _GONE = QUIET + 30.0
@@ -77,6 +79,7 @@ class KeyWatcher:
             # First the channel to all nodes, then the look: a key that is made in between is heard of.
             await self._manager.follow_here(new_keys)
             await self._look(listener, late=False)
+            new_keys.looked()
         except BaseException:
             await self.unfollow(listener)
             raise
@@ -114,10 +117,20 @@ class KeyWatcher:
         finally:
             new_keys.following = False
 
-    async def settled(self) -> None:
-        """Return when no update that has arrived waits for an older one, or after a second."""
+    async def settled(self, channels: Iterable[bytes] | None) -> None:
+        """Return when keys are heard of at their own nodes only, where a PING is behind their notices.
+
+        Waits a second at most: for the keys of some channels, which are followed if they were not found yet, or for
+        all that are followed.
+        """
+        for channel in channels or ():
+            for listener, new_keys in list(self._new_keys.items()):
+                if fits(listener.topic.name, channel):
+                    document = _document(channel)
+                    new_keys.buffer(channel, here=document in self._followed.get(listener, ()))
+                    self.heard(listener, document)
         for _ in range(_MOMENTS):
-            if not any(new_keys.waits for new_keys in list(self._new_keys.values())):
+            if all(new_keys.is_settled(channels) for new_keys in list(self._new_keys.values())):
                 return
             await asyncio.sleep(_MOMENT)
 
@@ -159,9 +172,9 @@ class KeyWatcher:
         }
         followed.update(found)
         for key_listener in found.values():
-            if late and new_keys is not None:
-                # Its first updates may have been published before it was found.
-                new_keys.buffer(key_listener.topic.name).late = True
+            if new_keys is not None:
+                # If it is late, its first updates may have been published before it was found.
+                new_keys.buffer(key_listener.topic.name, here=not late)
         try:
             await self._manager.follow_all(list(found.values()))
         except BaseException:
@@ -174,6 +187,10 @@ class KeyWatcher:
 def _glob(listener: Listener) -> str:
     """Return the pattern of the documents whose channels a listener's pattern names."""
     return listener.topic.name.decode().removeprefix("{").removesuffix(_TAIL)
+
+
+def _document(channel: bytes) -> bytes:
+    return channel.removeprefix(b"{").removesuffix(_TAIL.encode())
 
 
 def literal(glob: str) -> str | None:
@@ -222,6 +239,7 @@ class _KeyListener(_Part):
         self.begun = True
         self.seen = time.monotonic()
         if self._new_keys is not None:
+            self._new_keys.buffer(self.topic.name, here=True).begun()
             self._new_keys.begin(wire, beginning)
         elif (listener := self._listener()) is not None:
             listener.start(wire, beginning)
@@ -230,7 +248,7 @@ class _KeyListener(_Part):
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         self.seen = time.monotonic()
         if self._new_keys is not None:
-            self._new_keys.buffer(channel).told_here(notice)
+            self._new_keys.buffer(channel, here=True).told_here(notice)
         elif (listener := self._listener()) is not None:
             listener.on_notice(notice, channel)
 
@@ -249,17 +267,21 @@ class _NewKeysListener(_Part):
         self.following = False  # they are about to be followed
         self._telling = False  # of a gap, in this turn of the event loop
         self._buffers: dict[bytes, ReorderBuffer] = {}
+        # What came before the first look was over; if the look found its key, it was published before that.
+        self._early: collections.deque[tuple[Notice, bytes]] | None = collections.deque(maxlen=_MOST)
 
-    @property
-    def waits(self) -> bool:
-        return any(each.waits for each in self._buffers.values())
+    def is_settled(self, channels: Iterable[bytes] | None) -> bool:
+        """Return whether the keys of some channels, or all, are listened to at their own nodes only."""
+        found = self._buffers.values() if channels is None else map(self._buffers.get, channels)
+        return all(buffer is None or buffer.here for buffer in found)
 
-    def buffer(self, channel: bytes) -> ReorderBuffer:
+    def buffer(self, channel: bytes, *, here: bool = False) -> ReorderBuffer:
+        """Return the buffer of a key; a new one as given, so that of a forgotten key all is taken as it comes."""
         found = self._buffers.get(channel)
         if found is None:
-            if len(self._buffers) >= _MOST:  # of a key that is forgotten, all is taken as it comes
+            if len(self._buffers) >= _MOST:
                 del self._buffers[next(iter(self._buffers))]
-            found = self._buffers[channel] = ReorderBuffer(self._listener, channel)
+            found = self._buffers[channel] = ReorderBuffer(self._listener, channel, here=here)
         return found
 
     def forget(self, channel: bytes) -> bool:
@@ -288,8 +310,17 @@ class _NewKeysListener(_Part):
     def _told(self) -> None:
         self._telling = False
 
+    def looked(self) -> None:
+        """The first look is over: hand on what came of keys that are newer."""
+        early, self._early = self._early or (), None
+        for notice, channel in early:
+            self.on_notice(notice, channel)
+
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         if (listener := self._listener()) is None:
             return
+        if self._early is not None:
+            self._early.append((notice, channel))
+            return
         self.buffer(channel).told_to_all(notice)
-        self._key_watcher.heard(listener, channel.removeprefix(b"{").removesuffix(_TAIL.encode()))
+        self._key_watcher.heard(listener, _document(channel))

@@ -256,15 +256,21 @@ class SubscriptionManager:
         wanted = list(self._topics if topics is None else topics)
         return [listener for topic in wanted for listener in self._topics.get(topic, NO_LISTENERS).present()]
 
-    async def fence(self) -> None:
+    async def fence(self, channels: Iterable[str] | None = None) -> None:
         """Return when all that was published before now to what is followed has been told; one round trip.
+
+        In a cluster, up to a second more for keys that a pattern has found just now: what was published to them before
+        they were followed comes by other nodes.
+
+        Args:
+            channels: Of the keys that matter; of all if not given.
 
         Raises:
             ConnectionLost: A connection broke meanwhile.
         """
         await asyncio.gather(*[wire.roundtrip([("PING",)]) for wire in self._wires.values() if wire.alive])
         if self._key_watcher is not None:
-            await self._key_watcher.settled()
+            await self._key_watcher.settled(None if channels is None else [each.encode() for each in channels])
 
     async def unfollow(self, listener: Listener) -> None:
         if self._key_watcher is not None and listener.topic.pattern:

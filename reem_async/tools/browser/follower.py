@@ -189,7 +189,7 @@ class FollowedKey:
                 replies = await session.transport.roundtrip(wire_commands(step.plan), bulk=step.plan.bulk)
                 step = feed.answered(replies)
             elif isinstance(step, Fence):
-                await self._follower.fence()
+                await self._follower.fence(self._keys.channel)
                 step = feed.fenced()
             else:
                 raise Conflict(f"{self.name}: updates came that were never heard of")
@@ -345,9 +345,9 @@ class Follower:
         async for event in self._monitor:
             self._take(event)
 
-    async def fence(self) -> None:
-        """Take all updates that were published before now."""
-        await manager_of(self.session).fence()
+    async def fence(self, channel: str) -> None:
+        """Take all updates that were published to a key before now."""
+        await manager_of(self.session).fence([channel])
         self._pump()
 
     def _pump(self) -> None:

@@ -74,7 +74,7 @@ class KeyReader:
         session: The server.
         keys: The key's names.
         queue: What waits to be written, of which a read tells.
-        fence: Returns when all that was published before has been heard of.
+        fence: Returns when all that was published to the key before has been heard of.
         limit: How many may read at once.
 
     Attributes:

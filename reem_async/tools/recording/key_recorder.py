@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Protocol
 
@@ -49,7 +50,7 @@ class Collector(Protocol):
     patterns: list[Pattern]
     fetching: asyncio.Semaphore
 
-    async def fence(self) -> None: ...
+    async def fence(self, channels: Sequence[str] | None = None) -> None: ...
 
     def look_for_losses(self) -> None: ...
 
@@ -80,7 +81,8 @@ class KeyRecorder:
         self._name = name
         self._queue = KeyQueue()
         keys = collector.session.keys(name)
-        self._reader = KeyReader(collector.session, keys, self._queue, collector.fence, collector.fetching)
+        fence = partial(collector.fence, [keys.channel])
+        self._reader = KeyReader(collector.session, keys, self._queue, fence, collector.fetching)
         self._known = False
         self._complaint = ""  # why it could not be read the last time
         self._last_large = 0  # the log time of the last update that was fetched

@@ -299,11 +299,11 @@ class Recorder:
         for event in arrived(self._monitor) if self._monitor is not None else ():
             self._keys.of(event.name).on_event(event)
 
-    async def fence(self) -> None:
-        """Wait until everything published before now has been handed to the key recorders."""
+    async def fence(self, channels: Sequence[str] | None = None) -> None:
+        """Wait until everything published before now, to some keys or all, has been handed to the key recorders."""
         if self._monitor is not None:
             with contextlib.suppress(InterfaceClosed):
-                await manager_of(self.session).fence()
+                await manager_of(self.session).fence(channels)
         self._pump()
 
     @property
