@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import weakref
 
 import hypothesis.strategies as st
