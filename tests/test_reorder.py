@@ -240,7 +240,7 @@ async def test_what_a_recorder_reads_is_behind_updates_that_come_late_over_other
     async with Recorder(other, [key("*")], file) as recorder:
         for number in range(1, 21):
             await space[key("n")].write(number)
-        await recorder._find()
+        await recorder._search()
         await asyncio.sleep(0.1)
         assert (key("n") in recorder._keys._recorders, recorder.status.messages) == (True, first)
     with open_log(file) as log:
