@@ -326,53 +326,21 @@ def test_enums_that_are_numbers_or_text_are_stored_as_these(front, key):
 # --- callbacks --------------------------------------------------------------------------------------------
 
 
-def _in_order(data, updated_path, extra):
-    return data, updated_path, extra
+CALLBACKS = {
+    "in order": lambda data, updated_path, extra: (data, updated_path, extra),
+    "turned": lambda updated_path, data, extra: (data, updated_path, extra),
+    "all by name": lambda **given: (given["data"], given["updated_path"], given["extra"]),
+    "data by name": lambda data, **given: (data, given["updated_path"], given["extra"]),
+    "only by name": lambda *, extra, updated_path, data: (data, updated_path, extra),
+    "other names": lambda value, where, extra: (value, where, extra),
+    "path first": lambda updated_path, value, extra: (value, updated_path, extra),
+    "data last": lambda where, data, extra: (data, where, extra),
+    "all by place": lambda *given, extra: (*given, extra),
+    "rest by name": lambda value, where, **given: (value, where, given["extra"]),
+}
 
 
-def _turned(updated_path, data, extra):
-    return data, updated_path, extra
-
-
-def _all_by_name(**given):
-    return given["data"], given["updated_path"], given["extra"]
-
-
-def _data_by_name(data, **given):
-    return data, given["updated_path"], given["extra"]
-
-
-def _only_by_name(*, extra, updated_path, data):
-    return data, updated_path, extra
-
-
-def _other_names(value, where, extra):
-    return value, where, extra
-
-
-def _path_first(updated_path, value, extra):
-    return value, updated_path, extra
-
-
-def _data_last(where, data, extra):
-    return data, where, extra
-
-
-def _all_by_place(*given, extra):
-    return *given, extra
-
-
-def _rest_by_name(value, where, **given):
-    return value, where, given["extra"]
-
-
-CALLBACKS = [
-    *(_in_order, _turned, _all_by_name, _data_by_name, _only_by_name),
-    *(_other_names, _path_first, _data_last, _all_by_place, _rest_by_name),
-]
-
-
-@pytest.mark.parametrize("function", CALLBACKS, ids=lambda function: function.__name__)
+@pytest.mark.parametrize("function", CALLBACKS.values(), ids=CALLBACKS)
 def test_a_callback_gets_what_it_names(interface, pspace, key, function):
     """0.1 gave data and path by name; other names are given by position, as the manual says."""
     told = []
@@ -415,7 +383,12 @@ async def test_a_coroutine_function_too(ainterface, apspace, key):
 @pytest.mark.parametrize("package", [reem, reem_async])
 @pytest.mark.parametrize(
     ("function", "kwargs"),
-    [(lambda: None, {}), (lambda data: None, {}), (lambda data, updated_path: None, {"extra": 5}), (_in_order, {})],
+    [
+        (lambda: None, {}),
+        (lambda data: None, {}),
+        (lambda data, updated_path: None, {"extra": 5}),
+        (CALLBACKS["in order"], {}),
+    ],
 )
 def test_a_callback_that_cannot_be_called_so_is_refused_at_once(package, function, kwargs):
     with pytest.raises(TypeError, match="callback_function cannot be called"):
