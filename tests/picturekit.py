@@ -1,14 +1,8 @@
-"""A robot with a camera and a depth camera, and how much of it the page's slider has.
-
-The quick version is in test_browser_pictures.py. All of it, with the defaults of `reem browse`, in 70 seconds:
-
-    .venv/bin/python tests/picturekit.py
-"""
+"""A robot with a camera and a depth camera, and how much of it the page's slider has."""
 
 import contextlib
 import itertools
 import json
-import statistics
 import subprocess
 import sys
 import time
@@ -17,9 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from reem import PublishSpace, RedisInterface
-from reem.server import EmbeddedServer
-
-INSTANTS = 155
 
 
 def robot(url, name):
@@ -46,7 +37,7 @@ def robot(url, name):
 
 @contextlib.contextmanager
 def running_robot(url, name):
-    process = subprocess.Popen([sys.executable, __file__, "robot", url, name])
+    process = subprocess.Popen([sys.executable, __file__, url, name])
     try:
         yield process
     finally:
@@ -54,7 +45,7 @@ def running_robot(url, name):
         process.wait()
 
 
-def look_back(ask, path, start, end, instants=INSTANTS):
+def look_back(ask, path, start, end, instants):
     """Ask for the picture at so many instants of a span; returns what is said of each, None where there is none."""
     found = []
     for at in np.linspace(start, end, instants):
@@ -63,42 +54,9 @@ def look_back(ask, path, start, end, instants=INSTANTS):
     return found
 
 
-def told(answers):
-    pictures = [answer for answer in answers if answer is not None]
-    ages = [answer["age"] for answer in pictures if answer["age"] is not None]
-    previews = sum([answer["preview"] for answer in pictures])
-    return (
-        f"{len(pictures)} of {len(answers)} instants have a picture, {previews} of them small; "
-        f"{len(ages)} with an age: median {statistics.median(ages):.2f} s, at most {max(ages):.2f} s"
-    )
-
-
-def main():
-    from browserkit import client_of, served
-
-    from reem_async import RedisInterface as AsyncInterface
-    from reem_async.tools.browser import LiveSource
-
-    with EmbeddedServer() as server:
-        make = served(lambda: LiveSource(AsyncInterface(server.url)))
-        with make as (address, source), running_robot(server.url, "robot"), client_of(address) as ask:
-            before = resident()
-            time.sleep(66)
-            grown = (resident() - before) / 1e6
-            for name in ("camera", "depth"):
-                span = ask.json("tree", open="1:0:")
-                print(f"{name}: {told(look_back(ask, f'robot.{name}.image', span['start'] + 2, span['end']))}")
-            print(f"{span['end'] - span['start']:.1f} s kept, {source.history.dropped} changes dropped")
-            counted, bound = source.history.bytes / 1e6, source.history.budget / 1e6
-            print(f"memory: {counted:.0f} MB counted of {bound:.0f} MB, the process grew by {grown:.0f} MB")
-
-
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["robot"]:
-        robot(*sys.argv[2:])
-    else:
-        main()
+    robot(*sys.argv[1:])

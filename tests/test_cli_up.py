@@ -176,38 +176,23 @@ def test_without_the_extra(missing):
 
 
 @pytest.mark.long
-def test_a_plain_server_is_started_when_told():
-    import reem
-
-    with up("--plain", "--port", "0") as (process, said):
-        port = port_in(said)
-        assert "documents stored as text: the server has no JSON module" in said
-        with redis.Redis(port=port) as client:
-            assert b"ReJSON" not in [module[b"name"] for module in client.module_list()]
-        with reem.RedisInterface(f"redis://localhost:{port}") as interface:
-            store = reem.KeyValueStore(interface)
-            store["a"] = {"x": 1, "l": [1]}
-            store["a"]["x"] = 2
-            assert store["a"].read() == {"x": 2, "l": [1]}
-        process.send_signal(signal.SIGINT)
-        rest, errors = process.communicate(timeout=10)
-        assert (process.returncode, errors) == (0, "")
-        assert "Stopped." in rest
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("options", [["--cluster"], ["--cluster", "--plain"]], ids=" ".join)
-def test_a_cluster_until_told_to_stop(options):
-    import reem
-
+@pytest.mark.parametrize("options", [["--plain", "--port", "0"], ["--cluster"], ["--cluster", "--plain"]], ids=" ".join)
+def test_servers_of_other_kinds_until_told_to_stop(options):
     with up(*options) as (process, said):
-        url = re.search(r"address +(redis\+cluster://\S+)\n", said)[1]
-        assert said.count("process ") == 6
+        if "--cluster" in options:
+            url = re.search(r"address +(redis\+cluster://\S+)\n", said)[1]
+            assert said.count("process ") == 6
+        else:
+            url = f"redis://localhost:{port_in(said)}"
+            assert "documents as text: the server has no JSON module" in said
+            with redis.Redis(port=port_in(said)) as client:
+                assert b"ReJSON" not in [module[b"name"] for module in client.module_list()]
         with reem.RedisInterface(url) as interface:
             store = reem.KeyValueStore(interface)
-            for name in ("a", "b", "c", "d"):
-                store[name] = {"x": name}
-            assert [store[name]["x"].read() for name in ("a", "b", "c", "d")] == ["a", "b", "c", "d"]
+            for name in "abcd":
+                store[name] = {"x": 1, "l": [1]}
+                store[name]["x"] = name
+            assert [store[name].read() for name in "abcd"] == [{"x": name, "l": [1]} for name in "abcd"]
         process.send_signal(signal.SIGINT)
         rest, errors = process.communicate(timeout=10)
         assert (process.returncode, errors) == (0, "")

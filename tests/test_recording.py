@@ -191,10 +191,6 @@ async def test_bad_arguments(key, binterface, file, tmp_path):
         with pytest.raises(error):
             Recorder(binterface, **{"path": file, **arguments})
         assert not file.exists(), arguments
-    nobody = reem_async.RedisInterface("redis://127.0.0.1:1")
-    with pytest.raises(reem_async.NotConnected):
-        await Recorder(nobody, path=file).start()
-    assert not file.exists()
     file.write_bytes(b"precious")
     with pytest.raises(BadValue, match="overwrite=True"):
         Recorder(binterface, path=file)

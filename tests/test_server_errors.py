@@ -12,7 +12,6 @@ from conftest import FRONTS, PLAIN, eventually
 from own_servers import caller, connect, free_port, own_server
 
 import reem
-import reem_async
 from reem_async.plan.replies import refusal
 
 both = pytest.mark.parametrize("name", list(FRONTS))
@@ -38,12 +37,6 @@ def admin(server):
 def opened(name, url, space="KeyValueStore", **options):
     with contextlib.closing(FRONTS[name](url, space, **options)) as front:
         yield front
-
-
-def listen(front, key):
-    if isinstance(front.interface, reem.RedisInterface):
-        return reem.SilentSubscriber(key, front.interface).listen()
-    return front.run(reem_async.SilentSubscriber(key, front.interface).listen())
 
 
 def edit(front, key):
@@ -341,7 +334,7 @@ def test_a_node_of_a_cluster_is_told_apart():
                 with refused(reem.ClusterNode, there):
                     front.read([there])
                 with refused(reem.ClusterNode, there):
-                    listen(front, there)
+                    front.wait(front.kvs[there].watch().listen())
 
 
 def test_the_code_alone_decides():
