@@ -6,7 +6,6 @@ import json
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -52,10 +51,6 @@ def look_back(ask, path, start, end, instants):
         answer = ask.ask("image", path=path, at=at)
         found.append(json.loads(answer.headers["x-picture"]) if answer.status_code == 200 else None)
     return found
-
-
-def resident():
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 if __name__ == "__main__":
