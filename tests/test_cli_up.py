@@ -184,7 +184,7 @@ def test_servers_of_other_kinds_until_told_to_stop(options):
             assert said.count("process ") == 6
         else:
             url = f"redis://localhost:{port_in(said)}"
-            assert "documents as text: the server has no JSON module" in said
+            assert "documents stored as text: the server has no JSON module" in said
             with redis.Redis(port=port_in(said)) as client:
                 assert b"ReJSON" not in [module[b"name"] for module in client.module_list()]
         with reem.RedisInterface(url) as interface:
