@@ -1,7 +1,5 @@
 """The browser, run for tests: a real uvicorn on a real port, in a thread of its own."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import threading

@@ -1,7 +1,5 @@
 """Runs `reem`: in this process, as a user does, and in a terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pathlib

@@ -1,7 +1,5 @@
 """Stores of old versions, as these wrote them, and what they hold."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket

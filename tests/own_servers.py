@@ -1,7 +1,5 @@
 """Private servers with settings of their own, and peers that only pretend to be servers."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import functools

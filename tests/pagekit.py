@@ -1,7 +1,5 @@
 """Chromium, headless, as a visitor of the page."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

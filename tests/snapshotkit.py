@@ -1,7 +1,5 @@
 """What tests of snapshots share: two private servers, what to fill them with, and all that they hold."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import struct

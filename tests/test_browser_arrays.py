@@ -1,7 +1,5 @@
 """Arrays on the screen: pictures, slices, tables, lines, histograms."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The page as something one leaves open all day: what it marks, says and plots."""
 
 # ruff: noqa: F811 - fixtures are named as arguments
-from __future__ import annotations
-
 import re
 import time
 

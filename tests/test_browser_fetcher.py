@@ -1,7 +1,5 @@
 """What the page reads into its past goes between the updates where it belongs."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

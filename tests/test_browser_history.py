@@ -1,7 +1,5 @@
 """The rolling buffer: what was where at which instant, within its bytes."""
 
-from __future__ import annotations
-
 import copy
 import random
 

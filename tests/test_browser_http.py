@@ -1,7 +1,5 @@
 """What the browser answers, over a real port and from a real server."""
 
-from __future__ import annotations
-
 import asyncio
 import io
 import socket

@@ -1,8 +1,6 @@
 """The page, in headless Chromium: clicking, searching, dragging the slider, and what is seen then."""
 
 # ruff: noqa: F811 - fixtures are named as arguments
-from __future__ import annotations
-
 import re
 import time
 

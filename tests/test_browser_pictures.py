@@ -1,7 +1,5 @@
 """Arrays of the past: a picture for each instant, with its age, within the bytes there are."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import time

@@ -1,7 +1,5 @@
 """A recording in the browser: the same pages, over the time it was made."""
 
-from __future__ import annotations
-
 import asyncio
 
 import numpy as np

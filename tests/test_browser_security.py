@@ -1,7 +1,5 @@
 """Who may ask the browser, and for what: other sites, other names, scripts in keys, writes."""
 
-from __future__ import annotations
-
 import html
 import re
 import socket

@@ -1,7 +1,5 @@
 """What is only stored reaches the page's past when the server says that it was changed: nothing is read at rest."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

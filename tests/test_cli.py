@@ -3,8 +3,6 @@
 Starting Python and importing everything takes half a second, so most calls are made in this process.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import signal

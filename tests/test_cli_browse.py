@@ -1,7 +1,5 @@
 """`reem browse`, run as a user runs it."""
 
-from __future__ import annotations
-
 import contextlib
 import re
 import signal

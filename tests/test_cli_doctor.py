@@ -1,7 +1,5 @@
 """`reem doctor`: what it finds on servers that are as they should be, and on those that are not."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket

@@ -1,7 +1,5 @@
 """echo, hz, bw and delay: what is heard, what is counted, and how they end."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -1,7 +1,5 @@
 """The command line with odd names, files, clocks, encodings, and with Ctrl-C at a question."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

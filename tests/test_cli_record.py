@@ -1,7 +1,5 @@
 """`reem record`, `reem play` and `reem log`, run as a user runs them."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

@@ -1,7 +1,5 @@
 """`reem snapshot`, run as a user runs it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

@@ -1,7 +1,5 @@
 """reem top, and what all commands have in common: files, NaN, one report at the end."""
 
-from __future__ import annotations
-
 import io
 import json
 import time

@@ -1,7 +1,5 @@
 """`reem up` and `reem --version`, run as a user runs them."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pathlib

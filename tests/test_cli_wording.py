@@ -1,7 +1,5 @@
 """Messages of the library advise what can be typed on the command line too, not only arguments of Python."""
 
-from __future__ import annotations
-
 import ast
 import re
 

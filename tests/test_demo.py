@@ -1,7 +1,5 @@
 """`reem demo` as a newcomer runs it: one command, then the three lines that it prints."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

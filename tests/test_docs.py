@@ -10,8 +10,6 @@ How a page is written, so that it can be followed:
 - `bash` is for commands of other programs that cannot run here, such as docker. All other languages are shown only.
 """
 
-from __future__ import annotations
-
 import importlib.metadata
 import importlib.util
 import os

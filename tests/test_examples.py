@@ -1,7 +1,5 @@
 """The examples run, in both fronts, without a warning, and show what they say they show."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

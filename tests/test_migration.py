@@ -1,7 +1,5 @@
 """What REEM 0.0.11, 0.1.2 and 0.1.3 have stored: never read wrong, converted in place, whatever happens meanwhile."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

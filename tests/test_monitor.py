@@ -1,7 +1,5 @@
 """What tools build on: which keys there are, what is in them, and every update of all of them."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import re

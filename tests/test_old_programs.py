@@ -1,7 +1,5 @@
 """What programs of REEM 0.0.x and 0.1.x import, and the ways in which they call it."""
 
-from __future__ import annotations
-
 import asyncio
 import enum
 import functools

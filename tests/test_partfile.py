@@ -1,7 +1,5 @@
 """Files that get their name once they are whole: beside other programs, on odd file systems, in shared directories."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import fcntl

@@ -1,7 +1,5 @@
 """Recording a real server, and looking into what was recorded."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import time

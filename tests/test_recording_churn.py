@@ -1,7 +1,5 @@
 """Recording keys that come and go, under ever new names or the same ones."""
 
-from __future__ import annotations
-
 import asyncio
 import random
 import time

@@ -4,8 +4,6 @@ Who stores does not tell anybody, so whatever breaks the connection that the ser
 is recorded read anew, and touched anew at the server that has it now.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import itertools

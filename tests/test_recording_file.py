@@ -1,7 +1,5 @@
 """The file itself: read by others, cut short, damaged, on a full disk, after kill -9."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What a recording is made of, without a server: JSON with notes, schemas, protobuf messages, times, key files."""
 
-from __future__ import annotations
-
 import importlib
 import struct
 import weakref

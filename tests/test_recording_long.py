@@ -1,7 +1,5 @@
 """Long recordings of many keys: what is asked of one does not read all of it."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What cannot be recorded, or be read again: it alone is missing, and everything says so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from conftest import aeventually, assert_same

@@ -1,7 +1,5 @@
 """What is recorded while values overtake each other, in lists of numbers, of samples, and by parts of keys."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 import random

@@ -1,7 +1,5 @@
 """A recorder that cannot keep up: what it drops is read anew, and never taken for something that was only stored."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 

@@ -1,7 +1,5 @@
 """A recording at a robot's rates; `make recording` runs the same for ten minutes."""
 
-from __future__ import annotations
-
 from conftest import sized
 from rates.measure import run
 

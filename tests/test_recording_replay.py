@@ -1,7 +1,5 @@
 """Replaying: pace, start in the middle, loops, names, and what an export holds."""
 
-from __future__ import annotations
-
 import ast
 import asyncio
 import contextlib

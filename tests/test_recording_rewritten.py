@@ -3,8 +3,6 @@
 A generator draws the variants: all that MCAP leaves optional. A failure names its seed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """Recording what is only stored: the server says which keys were changed, so nothing is asked for at rest."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import csv

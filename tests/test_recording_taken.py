@@ -1,7 +1,5 @@
 """Somebody else is at the file of a recording: another recorder, or a program that deletes, replaces or cuts it."""
 
-from __future__ import annotations
-
 import gc
 import os
 import pathlib

@@ -1,7 +1,5 @@
 """A few events of a robot's week; `make week` goes on for an hour."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """What the server refuses comes as an error of its own class, which says what to do; nothing is half written."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 

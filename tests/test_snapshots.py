@@ -1,7 +1,5 @@
 """Portable snapshots: what is saved is of one instant, and restored bit for bit."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 import tracemalloc

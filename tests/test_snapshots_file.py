@@ -1,7 +1,5 @@
 """The file of a portable snapshot: whole or refused, under its name or not there at all."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """Restoring beside what is there, with few rights; RDB files."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

@@ -1,7 +1,5 @@
 """The targets: each takes any bytes and raises something only if a decoder does what it must not."""
 
-from __future__ import annotations
-
 import argparse
 import random
 
