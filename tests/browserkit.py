@@ -46,13 +46,10 @@ def served(make_source, **options):
 
 
 def live(url, seconds=60.0, budget=64 << 20, namespace=""):
-    """What makes a live source."""
     return lambda: LiveSource(RedisInterface(url, namespace=namespace), seconds, budget)
 
 
 class Client:
-    """Asks a browser as a page does."""
-
     def __init__(self, address, **options):
         self.http = httpx.Client(base_url=address, timeout=PATIENCE, trust_env=False, **options)
 
@@ -65,7 +62,6 @@ class Client:
         return answer.json()
 
     def rows(self, path="", **values):
-        """The rows of one branch, by label."""
         (branch,) = self.json("tree", open=f"1000:0:{path}", **values)["branches"]
         assert "error" not in branch, branch
         return {node["label"]: node for node in branch["nodes"]}

@@ -74,7 +74,6 @@ class CommandLine:
         return [REEM, command, "--namespace", self.namespace, *map(str, arguments)]
 
     def __call__(self, command, *arguments, input=None, **changes):  # noqa: A002
-        """Run a command in this process."""
         return invoked(*self.words(command, *arguments)[1:], input=input, **{"REEM_URL": self.url, **changes})
 
     def process(self, command, *arguments, **changes):

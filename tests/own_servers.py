@@ -75,7 +75,6 @@ def free_port():
 
 @contextlib.contextmanager
 def own_server(*lines, json=True, directory=None, wait=True):
-    """A server of one's own, stopped at the end."""
     chosen = program(json)
     while True:
         with contextlib.suppress(PortTaken):

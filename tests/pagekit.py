@@ -37,8 +37,6 @@ def address(server_url):
 
 
 class Visitor:
-    """Opens pages and remembers what their consoles said."""
-
     def __init__(self, chromium, address):
         self.chromium = chromium
         self.address = address

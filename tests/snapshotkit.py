@@ -51,7 +51,6 @@ TREE = {
 
 @pytest.fixture(scope="module")
 def servers():
-    """Two private servers: where from, and where to."""
     with EmbeddedServer() as source, EmbeddedServer() as target:
         yield [source, target]
 
@@ -70,7 +69,6 @@ def snapshots(tmp_path):
 
 @pytest.fixture
 def raws(servers):
-    """A plain client of each, both empty."""
     with contextlib.ExitStack() as stack:
         clients = [stack.enter_context(redis.Redis.from_url(server.url)) for server in servers]
         for client in clients:

@@ -237,7 +237,6 @@ def test_the_page_of_a_dict_has_its_pictures_and_plots_together_and_rows_for_the
 
 @pytest.mark.long
 def test_a_depth_image_with_holes_and_a_path_of_points(visit, pspace, key):
-    """NaN is counted below the picture; rows of two numbers are lines in a pane, not a picture two pixels wide."""
     depth = np.full((480, 640), 1.5, np.float32)
     depth[:10, :10] = np.nan
     pspace[key()] = {"depth": depth, "path": np.cumsum(np.ones((40, 2)), 0)}

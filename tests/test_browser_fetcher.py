@@ -41,7 +41,6 @@ async def test_each_update_is_in_what_is_shown_once_though_it_is_heard_of_late(k
 
 
 async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, binterface):
-    """The connection of the notices breaks: it stays unknown until it is looked at again."""
     await apspace[key()].write({"n": 1, "image": LARGE})
 
     async def fence(channel):

@@ -93,7 +93,6 @@ def test_long_texts_are_not_fetched_for_the_tree_but_for_the_view(ask, kvs, key)
 
 
 def test_the_snippets_of_a_path_are_programs_that_read_it(ask, robot, kvs, key):
-    """Also of a key that no path leads to: they read what holds it."""
     kvs[key()] = {"d": {"a\\b": [5, 6]}}
     for path, said in ((f'{robot}["a.b"]["c d"]', "5"), (f'{key()}.d["a\\\\b"][1]', "6")):
         for front, code in ask.json("node", path=path)["snippets"].items():
@@ -265,8 +264,6 @@ def test_the_past_is_as_it_was(ask, page, pspace, key):
 
 
 def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(ask, pspace, kvs, key):
-    """It is told from what was published, which is not taken for it."""
-
     def mode(at):
         return ask.json("node", path=f"{key()}.mode", at=at).get("text")
 
@@ -303,7 +300,6 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
 
 
 def content(ask, name, at):
-    """What is shown of the past, None if it is not kept."""
     answer = ask.http.get(f"/view/{name}", params={"format": "json", "at": at})
     return answer.json() if answer.status_code == 200 else None
 

@@ -71,7 +71,6 @@ def test_reading_arrays_ends_though_news_come_as_it_is_cancelled(server_url):
 
 
 def picture(value):
-    """A picture too regular to be large as a file."""
     return np.full((480, 640, 3), value, np.uint8)
 
 

@@ -140,7 +140,6 @@ async def test_a_key_that_is_new_is_found_by_its_name(server_url, key, akvs):
 async def test_an_array_that_is_stored_right_behind_a_published_one_is_seen(
     server_url, key, akvs, apspace, nobody_looks, size
 ):
-    """The word that it was changed is not taken for that of the published one."""
     await apspace[key()].write({"x": 1, "array": np.zeros(size)})
     async with past_of(server_url, key()) as source:
         for number in range(1, 16):
@@ -167,7 +166,6 @@ async def test_what_is_stored_anew_as_it_was_is_no_change(server_url, key, akvs,
 
 
 async def test_what_is_published_all_the_time_is_read_now_and_then(server_url, key, apspace, raw):
-    """Not after each update, though each is a change."""
     await apspace[key()].write({"x": 0})
     async with past_of(server_url, key()) as source:
         before = commands_run(raw)

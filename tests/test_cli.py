@@ -21,7 +21,6 @@ from reem_async.tools.cli.commands import COMMANDS
 
 @pytest.fixture
 def kvs(cli):
-    """A store in the same namespace, with something in it."""
     with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
         store = blocking.KeyValueStore(interface)
         store["foo"] = {
@@ -151,7 +150,6 @@ def test_the_password_may_be_in_a_variable_of_its_own():
 
 
 def test_a_warning_is_one_line_that_says_how_to_silence_it(cli):
-    """No server answers under this name; only the words matter."""
     cli.url = "redis://robot.invalid:6379"
     warning, error = cli.process("ls", PYTHONWARNINGS="").stderr.splitlines()
     assert warning.startswith("reem ls: warning: the connection to robot.invalid:6379 is not encrypted")

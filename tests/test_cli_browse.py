@@ -13,7 +13,6 @@ from conftest import PATIENCE
 
 @contextlib.contextmanager
 def browsing(*words):
-    """A run that goes on, and what it said."""
     with running("browse", "--port", "0", "--no-open", *words) as process:
         yield process, said_until(process, "  to stop")
 

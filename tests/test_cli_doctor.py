@@ -123,7 +123,6 @@ def test_a_server_that_throws_keys_away(own):
 
 
 def nodes_with(report, check):
-    """What is said of a check, node by node."""
     return [
         (row["node"], row["status"]) for row in map(json.loads, report.stdout.splitlines()) if row["check"] == check
     ]

@@ -259,7 +259,6 @@ async def test_what_comes_too_fast_is_counted(cli, space, monkeypatch):
 
 
 def once(function):
-    """What calls a function when it is called first."""
     left = [function]
 
     def call(_):

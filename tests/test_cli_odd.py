@@ -103,7 +103,6 @@ def test_a_file_that_came_to_be_while_the_value_was_fetched_stays(cli, kvs, tmp_
 
 
 def made(path, entries=(), index=None, **head):
-    """A snapshot with a valid digest, whatever it says."""
     writer = ArchiveWriter(path, header("s", "", "*", "1") | head)
     for entry in entries:
         writer.add(entry)
@@ -146,7 +145,6 @@ def test_a_restore_that_fails_says_how_far_it_came(servers, tmp_path):  # noqa: 
 
 
 def shell(cli, words, rest):
-    """Run a command in a shell, with something behind it."""
     line, env = f"{shlex.join(words)} {rest}", cli.environment()
     return subprocess.run(["sh", "-c", line], env=env, capture_output=True, text=True, timeout=20, check=False)
 
@@ -270,7 +268,6 @@ TIMES = [f"{kind}8[{unit}]" for kind in "mM" for unit in ("Y", "M", "D", "h", "s
 
 @pytest.mark.parametrize("seed", range(6))
 def test_json_keeps_every_value_beside_any_other(seed):
-    """Of random bits as every dtype: the same from the command line and from the page, beside None and NaN too."""
     print("seed", seed)
     rng = np.random.default_rng(seed)
     for name in [

@@ -216,7 +216,6 @@ def test_on_a_terminal_a_line_is_written_over(key, server_url, pspace, tmp_path)
 
 @pytest.mark.parametrize("ships", [["--ship", "test_unreadable:Pose"], []])
 def test_a_ship_of_the_users_own_is_named_on_the_command_line(server_url, key, reem, tmp_path, ships):
-    """With it its values are recorded; without it they are counted, by `log info` and `play` too."""
     with RedisInterface(server_url, [Pose(), NumpyShip()]) as interface:
         KeyValueStore(interface)[key()] = {"n": 1, "pose": 1 + 2j, "array": IMAGE}
     run = reem("record", key(), "--duration", "0.5", *ships, PYTHONPATH=ROOT / "tests")

@@ -24,7 +24,6 @@ snapshots = snapshotkit.snapshots
 
 @contextlib.contextmanager
 def up(*words, **changes):
-    """A `reem up` that is up, and what it said."""
     with running("up", *words, env=environment(PYTHONDEVMODE="1", **changes)) as process:
         yield process, said_until(process, "  to stop")
 
@@ -72,7 +71,6 @@ print("done")
 
 
 def test_a_signal_may_come_at_any_moment():
-    """Also while the main thread looks whether one has come, and while another is handled."""
     run = python(STORM, flags=())
     assert (run.stdout, run.returncode) == ("done\n", 0), run.stderr
 

@@ -67,7 +67,6 @@ def title(path):
 
 
 def fenced(path):
-    """The blocks of a document, in order: language and text."""
     return re.findall(r"^```(\S+)[^\n]*\n(.*?)^```$", path.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
 
 
@@ -81,7 +80,6 @@ def shaped(expected):
 
 
 def ends(process):
-    """The exit code of a program that was interrupted; one that goes on is killed."""
     try:
         return process.wait(30)
     except subprocess.TimeoutExpired:
@@ -314,7 +312,6 @@ def test_a_decision_is_short():
 
 
 def test_files_that_contributing_names_are_there():
-    """A module that is merged or renamed is mended there too."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     for name in set(re.findall(r"[\w/]+\.py\b", text)):
         assert any((ROOT / place / name).exists() for place in ("", "reem_async", "reem_async/pubsub", "reem")), name

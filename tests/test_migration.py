@@ -425,7 +425,6 @@ def test_nothing_that_was_stored_is_believed(change):
     ids=lambda array: str(array.dtype),
 )
 def test_arrays_of_every_kind(array):
-    """Those too that the old versions could write but not read."""
     fields = {b"arr": array.tobytes(), b"dtype": str(array.dtype).encode(), b"shape": str(array.shape).encode()}
     assert_same(array_of(fields), array)
     assert_same(array_of({**fields, b"shape": fields[b"shape"].replace(b",", b"L,")}), array)

@@ -66,7 +66,6 @@ def test_they_are_the_very_classes_of_today():
 
 
 def test_a_new_program_imports_nothing_of_it():
-    """Nor of the plain client."""
     program = (
         "import sys, reem, reem.connection, reem.datatypes, reem_async\n"
         "reem.KeyValueStore('localhost')['a'], reem.PublishSpace, reem.CallbackSubscriber\n"
@@ -268,7 +267,6 @@ async def test_a_plain_client_for_asyncio(ainterface, akvs, key):
 
 
 def test_the_plain_client_is_for_one_server():
-    """Several have classes of their own in redis-py."""
     with pytest.raises(reem.Misuse, match="RedisCluster"):
         reem.RedisInterface("redis+cluster://localhost:7000").client  # noqa: B018
 
@@ -344,8 +342,6 @@ def test_a_callback_gets_what_it_names(interface, pspace, key, function):
     told = []
 
     class Told:
-        """A bound method has a first parameter that is given already."""
-
         def it(self, data, updated_path, extra):
             told.append((data, updated_path, extra))
 

@@ -69,7 +69,6 @@ async def test_trees_without_their_arrays(key, apspace, binterface, file):
 @settings(max_examples=sized(6, 12), deadline=None, suppress_health_check=list(HealthCheck))
 @given(batch=st.lists(st.tuples(mixed, st.sampled_from(["whole", "inside", "delete"])), min_size=3, max_size=8))
 def test_anything_recorded_replays_to_the_same(server_url, tmp_path_factory, batch):
-    """Random trees with arrays, written whole, below a path and deleted: record, look, replay, read back."""
     asyncio.run(_recorded_and_replayed(server_url, tmp_path_factory.mktemp("any") / "run.mcap", batch))
 
 
@@ -105,7 +104,6 @@ async def _recorded_and_replayed(url, file, batch):
 
 
 async def test_samples(key, akvs, binterface, file, tmp_path):
-    """Paths of a key file at their periods, without drift, whoever writes them; parents need not be recorded."""
     keys = tmp_path / "keys.csv"
     keys.write_text(
         f"{key('arm')}.joint, 0.02\n{key('arm')}.image, 0.1\n{key('arm')}.list[1], 0.05\n{key('no')}, 0.05\n"

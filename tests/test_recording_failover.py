@@ -63,7 +63,6 @@ class Storing:
             await asyncio.sleep(0.01)
 
     async def _store(self, handle, number):
-        """Change a number, an array, make and remove an entry; now and then remove the whole key."""
         if number % 7 == 6:
             with contextlib.suppress(MissingKey):
                 await handle.delete()
@@ -85,7 +84,6 @@ def outlined(trees):
 
 
 async def check(url, patterns, file, disturb):
-    """Store before, while and after something happens to the servers; the recording has it in time, and as stored."""
     async with reem_async.RedisInterface(url) as one, reem_async.RedisInterface(url) as two:
         kvs, storing = reem_async.KeyValueStore(one), None
         for name in NAMES:

@@ -231,7 +231,6 @@ def test_cut_anywhere_it_opens(names, file_and_values, tmp_path):
 
 
 def starts(data):
-    """Where the records of a file begin."""
     places, position = [], 8
     while position + 9 <= len(data):
         places.append(position)
@@ -254,7 +253,6 @@ def test_cut_in_its_index_a_chunk_is_read_whole(names, file_and_values, tmp_path
 
 
 def test_damaged_anywhere_nothing_wrong_is_returned(names, file_and_values, tmp_path):
-    """With an index a flipped byte costs the chunk around it at most; without one, what follows may be lost too."""
     file, seen = file_and_values
     data = file.read_bytes()
     rng = random.Random(7)

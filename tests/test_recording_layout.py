@@ -241,7 +241,6 @@ def test_a_schema_fits_until_a_type_changes():
 
 
 def test_a_schema_is_one_that_viewers_take():
-    """Every property has one type out of those that Foxglove knows, and objects stay open."""
     text = schema_text("reem.a", signature({"n": 1, "s": "", "o": {"x": None}, "l": [{"y": True}], "mixed": [1, ""]}))
     schema = orjson.loads(text)
     assert schema["type"] == "object"

@@ -17,7 +17,6 @@ START, STEP = 1_700_000_000_000_000_000, 250_000_000
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
-    """An update of each key in each chunk, two of the first; and a key that is in one chunk only."""
     file = tmp_path_factory.mktemp("long") / "run.mcap"
     sink = Sink(file, "zstd", {}, overwrite=False)
     for chunk in range(CHUNKS):

@@ -43,7 +43,6 @@ async def test_what_is_stored_beside_what_is_published_is_seen(key, apspace, akv
 
 
 async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(key, apspace, akvs, binterface, file):
-    """It is not recorded with a value that it did not have, nor behind what came later; what is left of it is found."""
     async with Recorder(binterface, [key()], file) as recorder:
         for number in range(10):
             await apspace[key()].write({"image": LARGE + number, "n": number, "state": "raw", "box": [1, 2, 3]})
@@ -80,7 +79,6 @@ async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(ke
 
 
 async def test_a_key_that_is_gone_was_not_deleted_by_a_publisher(key, apspace, akvs, binterface, file):
-    """Nobody published that. What was published is recorded where it was, once."""
     await apspace[key()].write({"x": 1})
     async with Recorder(binterface, [key()], file, keyframe=0.1) as recorder:
         await akvs[key()].delete()

@@ -69,7 +69,6 @@ BEGINNING = ("a", "kvs", {"n": 0, "p": 0})
     ids=["dropped", "stored before", "not applied"],
 )
 def test_what_is_read_after_a_loss_is_no_stored_change(file, then, told):
-    """Nor what a look finds that was under way."""
     writing = Writing(file)
     writing.put(Role.STATE, {"n": 0, "p": 0}, kind=Kind.READ)
     for role, value, *path in then:

@@ -112,7 +112,6 @@ async def test_step_by_step(names, key, log, akvs, binterface):
 
 
 async def test_loops_begin_with_what_was_there(names, key, log, akvs, binterface):
-    """What came during the recording is deleted at the next beginning."""
     replayer = Replayer(binterface, log, rate=50, loop=True, remap={names("arm"): key("b"), names("late"): key("c")})
     playing = asyncio.create_task(replayer.play())
     await aeventually(lambda: replayer.status.rounds >= 2)

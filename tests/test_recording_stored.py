@@ -83,7 +83,6 @@ async def test_what_is_stored_is_recorded_a_moment_later_between_what_is_publish
 
 
 async def test_what_others_store_and_several_changes_in_a_moment_are_seen(key, akvs, raw, binterface, file):
-    """A bare command, and as one recorded change what cannot be told apart any more."""
     await akvs[key()].write({"n": 0})
     async with recording(binterface, [key()], file) as recorder:
         reading = recorder._keys.of(key())
@@ -130,7 +129,6 @@ async def test_a_key_that_is_not_there_yet_is_heard_of_at_once(key, akvs, binter
 
 
 async def test_only_arrays_that_were_changed_are_fetched_again(key, apspace, akvs, raw, binterface, file):
-    """A number beside a large one costs no more than a number; an array that is stored or published is there, once."""
     if isinstance(raw, RawCluster):
         pytest.skip("counts the bytes of one server")
     await akvs[key()].write({"map": FRAME, "image": FRAME, "n": 0})
@@ -263,7 +261,6 @@ async def test_nothing_is_read_at_rest(key, akvs, raw, binterface, file):
 
 
 async def test_it_goes_on_after_a_broken_connection(key, akvs, server_url, raw, file):
-    """The keys are read anew then, and changes of these are told of over the new connection."""
     connect = reem_async.RedisInterface
     await akvs[key()].write({"n": 0, "a": FRAME})
     async with connect(server_url, client_name=key("recorder")) as other, recording(other, [key()], file) as recorder:

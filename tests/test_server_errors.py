@@ -51,7 +51,6 @@ def edit(front, key):
 
 
 def content(admin):
-    """All there is, as far as it matters."""
     found = {}
     for name in admin.scan_iter():
         kind = admin.type(name)
@@ -96,7 +95,6 @@ def write_bar(front):
 
 
 def assert_changes_are_refused(name, url, admin, kind, *words, changes=CHANGES):
-    """In stores and publish spaces alike; nothing is written and nobody is told anything."""
     before = content(admin)
     listener = admin.pubsub()
     listener.psubscribe("*")

@@ -58,8 +58,6 @@ async def test_an_empty_server_gives_an_empty_snapshot(here, there, raws, tmp_pa
 
 
 class Stored:
-    """A value of a ship that keeps it in one Redis type."""
-
     def __init__(self, kind):
         self.kind = kind
 

@@ -106,7 +106,6 @@ def test_what_a_newer_program_wrote_is_refused(tmp_path):
     ],
 )
 def test_an_index_is_not_trusted(tmp_path, entry):
-    """Its names become keys of the server."""
     with pytest.raises(BadData, match=r"a\.zip"):
         Archive(written(tmp_path / "a.zip", entry))
 

@@ -45,7 +45,6 @@ class PrivateServer:
         return self._process.pid
 
     def raw(self, **options) -> redis.Redis:
-        """A plain client that speaks to it directly and knows no retries."""
         return redis.Redis(port=self.port, retry=None, socket_timeout=10, decode_responses=True, **options)
 
     def start(self) -> None:
@@ -64,12 +63,10 @@ class PrivateServer:
         self._process = None
 
     def pause(self) -> None:
-        """SIGSTOP: connections stand, nothing is answered."""
         os.kill(self.pid, signal.SIGSTOP)
         self._stopped = True
 
     def resume(self) -> None:
-        """SIGCONT."""
         if self._stopped:
             os.kill(self.pid, signal.SIGCONT)
             self._stopped = False
