@@ -2,20 +2,17 @@
 
 import asyncio
 import contextlib
-import functools
 import inspect
 import socket
 import threading
 import time
 
 import numpy as np
-import pytest
 import redis
 from conftest import PATIENCE
 
 import reem
 import reem_async
-from reem_async.errors import ServerMissing
 from reem_async.server.process import HOST, PortTaken, ServerProcess, ServerProgram
 from reem_async.server.programs import find_program
 
@@ -52,13 +49,8 @@ class Configured(ServerProcess):
             yield client
 
 
-@functools.cache
 def program(json=True):
-    """The server program, or a skip where there is none."""
-    try:
-        found = find_program()
-    except ServerMissing as missing:
-        pytest.skip(f"needs a server of its own: {missing}")
+    found = find_program()
     return found if json else ServerProgram(found.path)
 
 
