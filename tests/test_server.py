@@ -25,6 +25,7 @@ import pytest
 import redis
 import snapshotkit
 from conftest import eventually, python
+from own_servers import other_addresses
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
@@ -273,17 +274,6 @@ class TestMemory:
             with pytest.raises(ServerFull):
                 kvs["frames"] = [bytes(1_000_000)] * 40
             assert kvs["kept"].read().sum() == 1000
-
-
-def other_addresses() -> list[str]:
-    """Addresses of this machine besides loopback; nothing is sent to find them out."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))
-        except OSError:
-            return []
-        address = probe.getsockname()[0]
-    return [] if address.startswith("127.") else [address]
 
 
 class TestPort:
