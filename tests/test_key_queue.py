@@ -17,8 +17,7 @@ from reem_async.plan.notices import ANNOUNCED, Notice, note_of
 from reem_async.plan.trees import MISSING, get
 from reem_async.pubsub.division import Division, Heard, divided_read
 from reem_async.pubsub.gaps import Numbers
-from reem_async.tools.recording.key_queue import KeyQueue
-from reem_async.tools.recording.order import Item
+from reem_async.tools.recording.key_queue import Item, KeyQueue
 from reem_async.tools.recording.stored import New, Unchanged, applied
 
 PUBLISHERS = "p", "q", "r"
@@ -367,7 +366,7 @@ def test_who_never_hears_of_what_is_published_gives_up():
 
 def test_the_queue_does_no_input_or_output():
     """It knows no loop, socket or client."""
-    for name in ("tools/recording/key_queue", "tools/recording/order", "pubsub/division", "pubsub/gaps"):
+    for name in ("tools/recording/key_queue", "pubsub/division", "pubsub/gaps"):
         path = ROOT / "reem_async" / f"{name}.py"
         assert roots(path) <= set(sys.stdlib_module_names) | {"reem_async"}
         assert not roots(path) & {"asyncio", "socket", "time", "threading"}

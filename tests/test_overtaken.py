@@ -8,7 +8,7 @@ import pytest
 from reem_async.plan.copies import is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED
 from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
-from reem_async.tools.recording.order import Item, is_replaced, settled, skipped
+from reem_async.tools.recording.key_queue import Item, is_replaced, settled, skipped
 from reem_async.tools.recording.stored import applied
 
 PLACES = [(), ("a",), ("a", "b"), ("a", "b", "c"), ("d",), ("l",), ("l", 0), ("l", 1), ("l", 0, "x")]

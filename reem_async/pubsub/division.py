@@ -23,7 +23,7 @@ Updates are heard in the order in which the server made them. What makes a read 
 - FENCING: that one may still be on its way. A PING on the connection of the notices is answered behind it.
 
 What is done with covered and later updates is the owner's: `replica.py` keeps a tree, the recorder a queue of what is
-to be written (`tools/recording/order.py`), the browser a history.
+to be written (`tools/recording/key_queue.py`), the browser a history.
 """
 
 from __future__ import annotations

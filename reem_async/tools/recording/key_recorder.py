@@ -22,9 +22,8 @@ from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
 from .format import Kind, Role
-from .key_queue import KeyQueue
+from .key_queue import Item, KeyQueue
 from .key_reader import Fetched, KeyReader
-from .order import Item
 from .stored import pruned
 from .times import Arrivals, Clock, published
 from .writer_thread import Operation, WriterThread
