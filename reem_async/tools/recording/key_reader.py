@@ -27,30 +27,21 @@ _SUFFIX = "", ".", "["
 
 
 class Fetched(NamedTuple):
-    """What was read.
+    """What was read."""
 
-    Attributes:
-        value: What is there; MISSING if nothing is.
-        size: Its bytes.
-        note: The server's note of the last update that is in it.
-    """
-
-    value: Any
+    value: Any  # MISSING if nothing is there
     size: int
-    note: Reply
+    note: Reply  # the server's note of the last update that is in it
 
 
 def size_of(raw_read: RawRead) -> int:
-    """Return how many bytes a read brought."""
     return sum([len(reply) for reply in raw_read.raw if isinstance(reply, bytes | bytearray)])
 
 
 async def fetch(session: Session, keys: Keys, path: Path) -> Fetched:
     """Read what is at `path` below a top-level key: one round trip, two where arrays were not known of.
 
-    An `Unreadable` stands in the place of what cannot be read.
-
-    Large values come over the connection for them. Cancelling leaves the connection usable.
+    An `Unreadable` is in the place of what cannot be read. Large values come over the connection for them.
     """
     await session.ships.ready()
     plan = read(keys, path, session.ships, session.cache, (("GET", keys.last),), tolerant=True)
@@ -68,18 +59,8 @@ class KeyReader:
     (`changed`). Attachments that were not changed are not read again. They are those of the instant of the rest only
     if no word of a change of theirs comes before a fence behind it.
 
-    Reads of one key come one behind the other.
-
-    Args:
-        session: The server.
-        keys: The key's names.
-        queue: What waits to be written, of which a read tells.
-        fence: Returns when all that was published to the key before has been heard of.
-        limit: How many may read at once.
-
-    Attributes:
-        feed: Between which updates a read belongs. It is `tracked` if the server reports when what was read last is
-            changed.
+    Reads of one key come one behind the other. The feed says between which updates a read belongs. It is `tracked` if
+    the server reports when what was read last is changed.
     """
 
     def __init__(self, session: Session, keys: Keys, queue: KeyQueue, fence: Wait, limit: asyncio.Semaphore) -> None:

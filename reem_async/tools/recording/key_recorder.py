@@ -1,4 +1,4 @@
-"""One top-level key while it is recorded: its updates in order, those that are only announced fetched.
+"""The keys that are recorded, and of each its updates in order, those that are only announced fetched.
 
 While a value is on its way the updates behind it wait (`key_queue.py`), so that what is written is in the order in
 which it was published. When the server says that something was changed, the whole is read a moment later: what
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ from ...errors import BadData, Conflict, NotAllowed, RedisError, WrongKind
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
+from ...pubsub.finder import present_keys
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
@@ -37,6 +39,10 @@ _LET_PASS = 0.004
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
 _FAST = 20_000_000
 """Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
+
+
+_MOST_SILENT_READS = 500
+"""Keys that are read again at one keyframe, if the server does not tell which were changed."""
 
 
 class Collector(Protocol):
@@ -62,18 +68,7 @@ class Collector(Protocol):
 
 
 class KeyRecorder:
-    """The updates of one top-level key.
-
-    Args:
-        collector: The recording.
-        name: The key.
-
-    Attributes:
-        busy: The task that fetches, None if there is nothing to fetch.
-        news: The whole was published since the last keyframe.
-        absent: The key is not on the server, as far as is known here.
-        looks: When to look for what was only stored.
-    """
+    """The updates of one top-level key."""
 
     def __init__(self, collector: Collector, name: str) -> None:
         self._collector = collector
@@ -86,9 +81,9 @@ class KeyRecorder:
         self._complaint = ""  # why it could not be read the last time
         self._last_large = 0  # the log time of the last update that was fetched
         self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
-        self.busy: asyncio.Task[None] | None = None
-        self.news = False
-        self.absent = False
+        self.busy: asyncio.Task[None] | None = None  # the task that fetches
+        self.news = False  # the whole was published since the last keyframe
+        self.absent = False  # the key is not on the server, as far as is known here
         self.looks = RefreshTimer(self, KeyRecorder._look, BACKGROUND)
 
     @property
@@ -241,3 +236,104 @@ class KeyRecorder:
             self._emit(given_up)
         if not is_there:
             self._collector.writer_thread.behind.add(self._name)
+
+
+class RecordedKeys:
+    """One `KeyRecorder` for each key that was met."""
+
+    def __init__(self, collector: Collector) -> None:
+        self._collector = collector
+        self.tops = list(dict.fromkeys(pattern.top for pattern in collector.patterns))
+        self._recorders: dict[str, KeyRecorder] = {}
+        self._over: set[str] = set()  # keys that were gone at the last keyframe
+
+    def of(self, name: str) -> KeyRecorder:
+        recorder = self._recorders.get(name)
+        if recorder is None:
+            recorder = self._recorders[name] = KeyRecorder(self._collector, name)
+        return recorder
+
+    def concerns(self, name: str) -> bool:
+        return any(pattern.concerns((name,)) for pattern in self._collector.patterns)
+
+    async def present(self) -> set[str]:
+        """Return the keys there are, of those that are recorded; those that are recorded by name always."""
+        globs = {top for top in self.tops if "*" in top or "?" in top}
+        return {*self.tops} - globs | await present_keys(self._collector.session, globs)
+
+    def changed(self, key: str | None) -> None:
+        if key is None:
+            for recorder in self._recorders.values():
+                recorder.changed(None)
+            return
+        document = key[1:].partition("}")[0] if key.startswith("{") else key
+        name = document.removeprefix(self._collector.session.namespace)
+        if name in self._recorders:
+            self._recorders[name].changed(key)
+
+    def follow(self, present: set[str]) -> None:
+        """Have the server report changes of keys that are there and that it does not report yet."""
+        for name in present:
+            if self.concerns(name):
+                self.of(name).follow()
+
+    def be_due(self) -> None:
+        """Let the next look read every key, however much was read of it of late."""
+        for recorder in self._recorders.values():
+            recorder.looks.earliest = 0.0
+
+    def look_at_once(self) -> None:
+        for recorder in self._recorders.values():
+            recorder.looks.now()
+
+    def lost(self) -> None:
+        """Note that updates of any key may be lost, and read all keys again."""
+        for recorder in self._recorders.values():
+            recorder.lost(None)
+
+    async def settled(self, patience: float) -> None:
+        """Wait until no key is being fetched, at most so many seconds."""
+        deadline = time.monotonic() + patience
+        while (
+            busy := [recorder.busy for recorder in self._recorders.values() if recorder.busy]
+        ) and time.monotonic() < deadline:
+            await asyncio.wait(busy, timeout=deadline - time.monotonic())
+
+    def cancel(self) -> None:
+        for recorder in self._recorders.values():
+            recorder.looks.cancel()
+            if recorder.busy is not None:
+                recorder.busy.cancel()
+
+    def read_silent(self, present: set[str]) -> None:
+        """Read keys that were not published as a whole since the last keyframe: they may have been stored."""
+        now, reads = asyncio.get_running_loop().time(), 0
+        for name in sorted(present | self._recorders.keys(), key=lambda name: self.of(name).looks.earliest):
+            recorder = self.of(name)
+            if recorder.news or not self.concerns(name) or (name not in present and recorder.absent):
+                continue
+            if recorder.looks.earliest <= now and reads < _MOST_SILENT_READS:
+                reads += 1
+                recorder.read()
+
+    def forget_news(self) -> None:
+        for recorder in self._recorders.values():
+            recorder.news = False
+
+    def keyframe(self, number: int) -> None:
+        self._let_go()
+        for recorder in self._recorders.values():
+            recorder.keyframe(number)
+        self.forget_news()
+
+    def _let_go(self) -> None:
+        """Keep nothing of keys that were gone at the last keyframe, too. One that comes again is a new one.
+
+        Programs may publish under ever new names. Those that were asked for by name stay: they are listed as if they
+        were there, and would be read again each time.
+        """
+        over = {name for name, recorder in self._recorders.items() if recorder.is_over and name not in self.tops}
+        for name in over & self._over:
+            del self._recorders[name]
+            self._collector.writer_thread.stored.discard(name)
+        self._over = over

@@ -29,8 +29,8 @@ from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...session import Session
 from .format import RecordingFailed, Role
+from .key_recorder import RecordedKeys
 from .output import FileGone
-from .recorded_keys import RecordedKeys
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import HURRIED, PATIENCE, Arrivals, Clock
@@ -140,7 +140,7 @@ class Recorder:
             raise BadValue("nothing to record: give a pattern such as '*', or paths to sample")
         self._keyframe_seconds = keyframe
         self._keyframes = 0
-        self._keys = RecordedKeys(self, self.patterns)
+        self._keys = RecordedKeys(self)
         tops = self._keys.tops
         self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
         if self._monitor is not None:
