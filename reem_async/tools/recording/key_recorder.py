@@ -20,6 +20,7 @@ from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...pubsub.finder import present_keys
+from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
 from ...session import Session
@@ -27,7 +28,7 @@ from .format import Kind, Role
 from .key_queue import Item, KeyQueue
 from .key_reader import Fetched, KeyReader
 from .stored import pruned
-from .times import Arrivals, Clock, published
+from .times import HURRIED, Arrivals, Clock, published
 from .writer_thread import Operation, WriterThread
 
 logger = logging.getLogger("reem.recording")
@@ -59,12 +60,7 @@ class Collector(Protocol):
 
     def look_for_losses(self) -> None: ...
 
-    def hurry(self) -> None: ...
-
     def failed(self, error: Exception) -> None: ...
-
-    @property
-    def hears_of_changes(self) -> bool: ...
 
 
 class KeyRecorder:
@@ -124,7 +120,7 @@ class KeyRecorder:
 
     def follow(self) -> None:
         """Have the server report changes; what was stored until then is looked for."""
-        if not self._reader.feed.tracked and self._collector.hears_of_changes:
+        if not self._reader.feed.tracked and manager_of(self._collector.session).hears_of_changes:
             self.looks.ask()
 
     def changed(self, key: str | None) -> None:
@@ -218,7 +214,7 @@ class KeyRecorder:
         collector = self._collector
         since, self._last_large = head.stamp[0] - self._last_large, head.stamp[0]
         if since < _FAST:
-            collector.hurry()
+            manager_of(collector.session).limit_batch_delay(HURRIED)  # large ones come fast: look more often
         let_pass = min(_LET_PASS, since / 1e9 / 5)  # none should be missed
         await asyncio.sleep(let_pass - collector.clock.since(head.stamp[0]))
 

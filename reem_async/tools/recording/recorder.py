@@ -33,7 +33,7 @@ from .key_recorder import RecordedKeys
 from .output import FileGone
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
-from .times import HURRIED, PATIENCE, Arrivals, Clock
+from .times import PATIENCE, Arrivals, Clock
 from .writer_thread import Operation, WriterThread
 
 # Seconds between looks at keyframes that are due, the disk, and keys that must be read again.
@@ -310,10 +310,6 @@ class Recorder:
     def hears_of_changes(self) -> bool:
         """Whether the server tells which keys are changed."""
         return manager_of(self.session).hears_of_changes
-
-    def hurry(self) -> None:
-        """Look more often for updates: large ones come fast."""
-        manager_of(self.session).limit_batch_delay(HURRIED)
 
     def failed(self, error: Exception) -> None:
         """End the recording for an unexpected error."""
