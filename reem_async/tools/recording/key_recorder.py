@@ -40,8 +40,6 @@ _LET_PASS = 0.004
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
 _FAST = 20_000_000
 """Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
-
-
 _MOST_SILENT_READS = 500
 """Keys that are read again at one keyframe, if the server does not tell which were changed."""
 
