@@ -76,8 +76,7 @@ class Inherited(WeakList[Item]):
 
     def __init__(self, action: Callable[[Item], object]) -> None:
         super().__init__()
-        if hasattr(os, "register_at_fork"):
-            os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
+        os.register_at_fork(after_in_child=lambda: [action(item) for item in self])
 
 
 class ThreadLock:

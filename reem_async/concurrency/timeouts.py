@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import array
 import asyncio
+import fcntl
 import socket
 import struct
 import sys
+import termios
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 
 from ..errors import BadValue
-
-try:
-    import fcntl
-    import termios
-except ImportError:  # Windows: what the kernel still holds cannot be asked there
-    fcntl = termios = None  # type: ignore[assignment]
 
 LONGEST = 1e6
 """Seconds that a time limit may have: eleven days, which is as good as none."""
@@ -122,7 +118,7 @@ def moved_last(last: float, now: float, before: int, left: int, limit: float) ->
 
 def unsent(connected: socket.socket | None) -> int:
     """Return how many bytes the other side has not confirmed yet, 0 where the kernel does not say."""
-    if connected is None or fcntl is None:
+    if connected is None:
         return 0
     count = array.array("i", [0])
     try:

@@ -70,9 +70,8 @@ class _Line:
         self._moved = 0.0  # when a byte of a large value, or of the reply to it, was last seen to move
         self._left = 0  # how many of its bytes were on their way up when last looked at
         self._set_limit(self._timeout)
-        self._poll = select.poll() if hasattr(select, "poll") else None
-        if self._poll is not None:
-            self._poll.register(self._socket, select.POLLIN)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
         self._small = SmallReader(options.largest)
         self._largest = options.largest
         self._large: LargeReader | None = None
@@ -197,15 +196,7 @@ class _Line:
 
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
-        if self._poll is not None:
-            return not self._poll.poll(0)  # nothing is due: an event is a stray reply, or the server has closed
-        try:
-            self._socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            return True
-        except (OSError, ValueError):
-            return False
-        return False
+        return not self._poll.poll(0)  # nothing is due: an event is a stray reply, or the server has closed
 
     def lost(self, reason: str) -> ConnectionLost:
         self.close()
