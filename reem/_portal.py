@@ -50,10 +50,6 @@ def finish(coroutine: Coroutine[Any, Any, Result]) -> Result:
     raise WrongLoop("this call has to wait for something that only an event loop can do")
 
 
-def _new_loop() -> asyncio.AbstractEventLoop:
-    return asyncio.new_event_loop() if uvloop is None else uvloop.new_event_loop()
-
-
 class _Call(Generic[Result]):
     """A coroutine on its way through the loop, and the thread that waits for its end.
 
@@ -130,7 +126,7 @@ class Portal:
     """An event loop in a daemon thread, and the way into it."""
 
     def __init__(self, name: str) -> None:
-        self._loop = _new_loop()
+        self._loop = asyncio.new_event_loop() if uvloop is None else uvloop.new_event_loop()
         self._calls: set[_Call[Any]] = set()
         self._ident: int | None = None
         self._last: Callable[[], Coroutine[Any, Any, None]] | None = None

@@ -67,10 +67,6 @@ def concerns(commands: Sequence[Command]) -> bool:
     return any(is_json(command) or is_look(command) for command in commands)
 
 
-def has_json(commands: Sequence[Command]) -> bool:
-    return any(map(is_json, commands))
-
-
 def is_json(command: Command) -> bool:
     return command[0] in _NAMES and len(command) > 1
 

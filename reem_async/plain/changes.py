@@ -56,7 +56,7 @@ def after_look(
     # EXEC ends the watch in any case.
     if watched is not None and sent:
         watched.clear()
-    if change.has_conflict(outcome):
+    if change.end and outcome[change.end] is None:  # another client was first
         return None if watched is None or not change.is_whole else [b"QUEUED"] * (len(commands) - 1) + [None]
     return change.answers(outcome, known)
 
@@ -111,6 +111,7 @@ class _Change:
 
     Attributes:
         is_whole: Whether the batch is a transaction.
+        end: The position of EXEC among what is sent; 0 if it is not.
     """
 
     def __init__(
@@ -128,10 +129,13 @@ class _Change:
             elif command[0] not in _FRAME:
                 self._others.append(place)
         # Several changes of one document become one SET, in the place of the last of them.
-        self._last = {place: key for key, place in last.items() if _is_changed(documents[key])}
+        changed = {
+            key for key, document in documents.items() if isinstance(document, TextDocument) and document.changed
+        }
+        self._last = {place: key for key, place in last.items() if key in changed}
         self._places: dict[int, int] = {}
         self._sent: list[Command] = []
-        self._end = 0  # the position of EXEC
+        self.end = 0
         self.is_whole = bool(commands[-1][0] == "EXEC")
 
     def commands(self, held: bool) -> list[Command]:
@@ -142,7 +146,7 @@ class _Change:
             self._sent = [*asking, MULTI]
             for place in inside:
                 self._add(place)
-            self._end = len(self._sent)
+            self.end = len(self._sent)
             self._sent.append(EXEC)
         # Nothing is changed after all (NX, or nothing to delete), but keys are watched.
         elif not held or self.is_whole:
@@ -156,7 +160,7 @@ class _Change:
     def only_deletes(self) -> bool:
         """Return whether it is no transaction and only deletes documents."""
         return (
-            self._end > 0
+            self.end > 0
             and not self.is_whole
             and not any(_is_there(self._documents[key]) for key in self._last.values())
             and all(self._commands[place][0] == "SMEMBERS" for place in self._others)
@@ -164,7 +168,7 @@ class _Change:
 
     def alone(self) -> list[Command]:
         """Return the commands without a transaction: a Redis that is out of memory accepts only single deletions."""
-        self._sent, self._end = [], 0
+        self._sent, self.end = [], 0
         asking = [ASKING] if asks(self._commands) else []
         for place in sorted(self._places):
             self._sent += asking
@@ -176,17 +180,14 @@ class _Change:
         key = self._last.get(place)
         self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
 
-    def has_conflict(self, replies: Sequence[Reply]) -> bool:
-        return self._end > 0 and replies[self._end] is None
-
     def answers(self, replies: Sequence[Reply], known: Known) -> list[Reply]:
         replies, answers = list(replies), self._answers
-        if self._end:
-            outcome = replies[self._end]
+        if self.end:
+            outcome = replies[self.end]
             if not isinstance(outcome, list):
                 return self._refused(replies, outcome)
             # Put each reply at the position of its command, as without a transaction.
-            replies[body_of(self._sent).start : self._end] = outcome
+            replies[body_of(self._sent).start : self.end] = outcome
         for place, at in self._places.items():
             key = self._last.get(place)
             if key is None or isinstance(replies[at], Exception):
@@ -205,19 +206,13 @@ class _Change:
             return answers
         # The plan knows of no transaction: the reason for the refusal is the reply to its commands.
         reason = next((reply for reply in replies if isinstance(reply, Exception)), outcome)
-        stored = [
-            reply for place, reply in enumerate(replies) if place < self._end and self._sent[place][0] in _STORING
-        ]
+        stored = [reply for place, reply in enumerate(replies) if place < self.end and self._sent[place][0] in _STORING]
         if reason is replies[self._sent.index(MULTI)] and not any(isinstance(reply, Exception) for reply in stored):
             reason = PartialWrite(f"{reason}; MULTI was refused, so a change by another client in between may be lost")
         for place, command in enumerate(self._commands):
             if is_json(command):
                 answers[place] = reason
         return answers
-
-
-def _is_changed(document: TextDocument | Exception) -> bool:
-    return isinstance(document, TextDocument) and document.changed
 
 
 def _is_there(document: TextDocument | Exception) -> bool:

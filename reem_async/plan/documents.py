@@ -263,17 +263,14 @@ class _Walker:
             raise self._refusal(value, path)
         if isinstance(value, np.generic):
             return self._numpy_scalar(value, path)
-        for base in (str, int, float, dict, list, tuple):
-            if isinstance(value, base):
-                return self._subclass(value, base, path)
-        raise self._refusal(value, path)
-
-    def _subclass(self, value: Any, base: type, path: Path) -> Any:
-        if base is dict:
+        if isinstance(value, dict):
             return self._container(value, path, self._dict)
-        if base is list or base is tuple:
+        if isinstance(value, list | tuple):
             return self._container(value, path, self._list)
-        return self.convert(_PLAIN[base](value), path)
+        for base, plain_value in _PLAIN.items():
+            if isinstance(value, base):
+                return self.convert(plain_value(value), path)
+        raise self._refusal(value, path)
 
     def _parcel(self, ship: Carrier, value: Any, path: Path) -> str:
         try:

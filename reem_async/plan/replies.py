@@ -73,7 +73,10 @@ _NO_MEMBERS: frozenset[bytes] = frozenset()
 def refusal(text: str) -> Refused | None:
     """Return the error for an error reply about the server, None for one about the command."""
     if _NO_JSON.match(text):
-        return NoJsonSupport(no_json())
+        return NoJsonSupport(
+            "the server has JSON, but not this command of RedisJSON; use Redis 8 (see compose.yaml), valkey-bundle, a "
+            "server without any JSON, or start one with `reem up`"
+        )
     # The beginning of an error of EXEC; the reason follows.
     text = text.removeprefix("EXECABORT Transaction discarded because of: ")
     kind, remedy = _REFUSALS.get(text.partition(" ")[0], (None, ""))
@@ -157,13 +160,6 @@ def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
     if not isinstance(members, list | set) or not all(type(member) is bytes for member in members):
         raise BadData(f"{keys.name}: the server sent {members!r:.60} where the members of {keys.registry} were due")
     return frozenset(members)
-
-
-def no_json() -> str:
-    return (
-        "the server has JSON, but not this command of RedisJSON; use Redis 8 (see compose.yaml), valkey-bundle, a "
-        "server without any JSON, or start one with `reem up`"
-    )
 
 
 def settable(keys: Keys, path: Path) -> Plan:

@@ -24,7 +24,7 @@ from ..plan.placeholders import Unreadable
 from ..session import Session
 from ..ships.registry import Ships
 from ..transport import Transport
-from ..transport.route import is_moved, is_unapplied
+from ..transport.route import Moved, is_unapplied
 from ..transport.wire import Wire, close_all
 from .key_watcher import KeyWatcher
 from .listeners import NO_LISTENERS, Beginning, Inbox, Listener, ListenerGroup, Topic
@@ -313,7 +313,7 @@ class SubscriptionManager:
 
     def on_note(self, listener: Listener, note: Reply) -> None:
         """Hand a listener the server's note of its key, unless that is an error of the server."""
-        if is_moved(note):  # this node is only a replica now
+        if isinstance(note, Moved):  # this node is only a replica now
             self._moved([listener.topic], str(note))
         elif is_unapplied(note):
             self._unsure.add(listener.topic)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -79,7 +78,7 @@ class NumpyShip(BlobShip):
             raise BadData("the array's bytes are gone from the server (evicted, or removed by a program without REEM)")
         view = memoryview(blob)
         size = _header_size(bytes(view[:12]), len(view))
-        dtype, shape = _header_parser(size)(bytes(view[:size]))
+        dtype, shape = (_parse_short if size <= _SHORT else _parse_long)(bytes(view[:size]))
         # Python's integers do not overflow, unlike numpy's, for a made-up shape.
         if math.prod(shape) * dtype.itemsize != len(view) - size:
             raise BadData(f"an array of {dtype} {list(shape)} has {len(view) - size} bytes; REEM did not write it")
@@ -198,10 +197,6 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
 
 # A structured dtype may take 60 KB to describe: only few of these are cached, or foreign arrays could fill the memory.
 _parse_short, _parse_long = lru_cache(maxsize=1024)(_parse_header), lru_cache(maxsize=16)(_parse_header)
-
-
-def _header_parser(size: int) -> Callable[[bytes], tuple[np.dtype[Any], tuple[int, ...]]]:
-    return _parse_short if size <= _SHORT else _parse_long
 
 
 def _literal(text: str) -> Any:

@@ -28,10 +28,6 @@ def default_ships() -> list[SpecialDatatypeShip]:
     return [NumpyShip(), BytesShip()]
 
 
-def is_asynchronous(ship: SpecialDatatypeShip) -> bool:
-    return any(inspect.iscoroutinefunction(getattr(ship, name, None)) for name in _METHODS)
-
-
 def _is_plain_blob(ship: BlobShip) -> bool:
     kind = type(ship)
     # A subclass that overrides these has its own commands, and is handled like any other ship.
@@ -77,7 +73,8 @@ class Ships:
     def __init__(self, ships: Iterable[SpecialDatatypeShip], new_recorder: Callable[[], Any]) -> None:
         self.given = list(ships)
         self.new_recorder = new_recorder
-        self.asynchronous = any(is_asynchronous(ship) for ship in self.given)
+        methods = [getattr(ship, name, None) for ship in self.given for name in _METHODS]
+        self.asynchronous = any(map(inspect.iscoroutinefunction, methods))
         self._registered: list[Registered] = []
         self._by_label: dict[str, Registered] = {}
         self.claimed: frozenset[type] = frozenset()

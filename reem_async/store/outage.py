@@ -93,7 +93,8 @@ class _Out:
     def put(self, it: _Kept) -> int:
         """Keep an assignment in place of those that it replaces; return their number."""
         path = it.assignment.path
-        outermost = _outermost_list(path)
+        # The outermost list on the path.
+        outermost = next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
         place = path, self._removals.get(outermost, 0) if outermost is not None else 0
         replaced = [each for each in self.kept if below(each[0], path) and (outermost is None or each[1] == place[1])]
         for each in replaced:
@@ -112,10 +113,6 @@ class _Out:
     def put_back(self, place: _Place, it: _Kept) -> None:
         self.kept = {place: it, **self.kept}
         self.size += it.size
-
-
-def _outermost_list(path: Path) -> Path | None:
-    return next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
 
 
 class Outage:

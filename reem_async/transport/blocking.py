@@ -168,14 +168,10 @@ class _Line:
                 except (BlockingIOError, TimeoutError):
                     self._check_moved(limit)
                 give_way()
-                while naps and self._others_wait():
+                while naps and any(line.waiting for line in self._lines):  # small calls of other threads
                     step = min(step, _SMALL_SLICE)
                     naps -= 1
                     time.sleep(_NAP)
-
-    def _others_wait(self) -> bool:
-        """Return whether small calls of other threads are under way."""
-        return any(line.waiting for line in self._lines)
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""

@@ -117,10 +117,6 @@ def refusal(replies: Sequence[Reply]) -> redis.exceptions.RedisError | None:
     return None
 
 
-def is_moved(reply: object) -> bool:
-    return isinstance(reply, Moved)
-
-
 def is_unapplied(reply: object) -> bool:
     """Return whether a reply or error means that a node did nothing, and another one, or a later try, may."""
     return isinstance(reply, Unapplied)

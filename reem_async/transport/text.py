@@ -14,7 +14,7 @@ from zlib import crc32
 
 from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, NoJsonSupport, NotConnected
-from ..plain.batches import Known, Steps, Watched, concerns, has_json
+from ..plain.batches import Known, Steps, Watched, concerns, is_json
 from ..plain.changes import after_look
 from ..plain.translation import directly, finished, looked_at, shortcut, translated
 from ..plan import Command, Reply
@@ -234,7 +234,7 @@ def over_wire(
     commands: Sequence[Command], done: Callable[[list[Reply] | Exception], None]
 ) -> tuple[Sequence[Command], Callable[[list[Reply] | Exception], None]]:
     """Return what to send in place of `commands`, which only read, and what to call with the replies."""
-    if not has_json(commands):
+    if not any(map(is_json, commands)):
         return commands, done
     steps = directly(commands, Known(), error_of)
 
