@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import functools
 import os
 import sys
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from importlib import import_module
 from threading import current_thread, main_thread
-from typing import Any, Literal, Self, TypeVar
+from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
 
 import reem_async
 from reem_async.concurrency.queues import Ended
@@ -43,6 +44,7 @@ def __getattr__(name: str) -> Any:
     return getattr(reem if hasattr(reem, name) else import_module("reem.legacy"), name)
 
 
+Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
 
 
@@ -311,3 +313,15 @@ class RedisInterface:
 
     def __repr__(self) -> str:
         return f"<reem.RedisInterface {self.hostname}>"
+
+
+def blocking(
+    call: Callable[Concatenate[reem_async.RedisInterface, Arguments], Coroutine[Any, Any, Result]],
+) -> Callable[Concatenate[RedisInterface, Arguments], Result]:
+    """Return the blocking form of a coroutine function of the core, which runs on the background loop."""
+
+    @functools.wraps(call)
+    def run(interface: RedisInterface, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
+        return interface._wait(call(interface._followers, *args, **options))
+
+    return run  # type: ignore[return-value]  # it also takes the interface by name
