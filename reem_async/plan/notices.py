@@ -129,7 +129,8 @@ def in_slot(
     It has no slot if it would be too long, because of thousands of arrays.
     """
     sizes = sizes_of_parts(text, attachments)
-    parts: list[Any] = [[*slot, sizes[0]], *_named_parts(attachments, sizes)]
+    parts: list[Any] = [[*slot, sizes[0]]]
+    parts += [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
     notice = _header(publisher, sequence, time, path, "look", parts, sum(sizes))
     return notice if len(notice) <= LARGEST_INLINE else announce(publisher, sequence, time, path, size=sum(sizes))
 
@@ -143,15 +144,18 @@ def with_value(
     publisher: str, sequence: int, time: float, path: Path, text: bytes, attachments: Sequence[EncodedAttachment]
 ) -> bytes:
     """Return a notice that carries the value if it is small and made of bytes."""
-    sizes = sizes_of_parts(text, attachments)
-    if sum(sizes) > LARGEST_INLINE or any(each.blob is None for each in attachments):
-        return announce(publisher, sequence, time, path, size=sum(sizes))
-    header = _header(publisher, sequence, time, path, "set", _named_parts(attachments, sizes), len(text))
-    return b"".join([header, text, *(piece for each in attachments for piece in each.blob or ())])
-
-
-def _named_parts(attachments: Sequence[EncodedAttachment], sizes: Sequence[int]) -> list[Any]:
-    return [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
+    size, travels = len(text), True
+    for each in attachments:
+        size += sum([len(piece) for piece in each.blob or ()])
+        travels = travels and each.blob is not None
+    if size > LARGEST_INLINE or not travels:
+        return announce(publisher, sequence, time, path, size=size)
+    parts: list[Any] = []
+    blobs: list[bytes] = []
+    for each in attachments:
+        blobs.append(b"".join(each.blob or ()))
+        parts.append([each.label, each.suffix, len(blobs[-1])])
+    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
 
 
 def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
