@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import socket
-import threading
 import time
 import weakref
 from collections.abc import Callable
@@ -107,9 +106,7 @@ class EmbeddedCluster(Startable):
         self._replicas = replicas
         self._node_timeout = node_timeout
         self._json = json
-        self._lock = threading.RLock()
-        self._owner: int | None = None
-        self._finalizer: weakref.finalize[[], EmbeddedCluster] | None = None
+        super().__init__()
         self.nodes: list[NodeProcess] = []
 
     def start(self) -> None:
@@ -144,16 +141,9 @@ class EmbeddedCluster(Startable):
             self.nodes, self._owner = nodes, os.getpid()
             self._finalizer = weakref.finalize(self, partial(stop_all, nodes))
 
-    def stop(self) -> None:
-        """Stop all nodes and wait until they are gone; nothing if they do not run."""
-        if not self._is_in_fork():
-            self._stop()
-
-    def _stop(self) -> None:
-        with self._lock:
-            if self._finalizer is not None:
-                self._finalizer()
-            self._finalizer, self._owner, self.nodes = None, None, []
+    def _clear(self) -> None:
+        super()._clear()
+        self.nodes = []
 
     @property
     def url(self) -> str:

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import socket
-import threading
 import weakref
 from pathlib import Path
 from typing import Any
@@ -87,10 +86,8 @@ class EmbeddedServer(Startable):
         self._snapshot = None if snapshot is None else Path(snapshot).absolute()
         self._json = json
         self._maxmemory = maxmemory
-        self._lock = threading.RLock()
-        self._owner: int | None = None
+        super().__init__()
         self._process: ServerProcess | None = None
-        self._finalizer: weakref.finalize[[], EmbeddedServer] | None = None
 
     def start(self) -> None:
         """Start the server and wait until it answers; nothing if it runs already.
@@ -115,19 +112,6 @@ class EmbeddedServer(Startable):
             self._process = self._begun()
             # At the program's end, and when this object is forgotten.
             self._finalizer = weakref.finalize(self, self._process.stop)
-
-    def stop(self) -> None:
-        """Stop the server and wait until it is gone; nothing if it does not run.
-
-        With a directory, everything written is on disk afterwards.
-        """
-        if not self._is_in_fork():
-            self._stop()
-
-    def _stop(self) -> None:
-        with self._lock:
-            self._clear()
-            self._owner = None
 
     @property
     def running(self) -> bool:
@@ -240,9 +224,7 @@ class EmbeddedServer(Startable):
                     raise
 
     def _clear(self) -> None:
-        if self._finalizer is not None:
-            self._finalizer()  # runs once, here or at exit
-        self._finalizer = None
+        super()._clear()
         self._process = None
 
     def _started(self) -> ServerProcess:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import threading
+import weakref
 from abc import ABC, abstractmethod
-from typing import Self
+from typing import Any, Self
 
 import anyio
 import anyio.to_thread
@@ -13,16 +15,26 @@ import anyio.to_thread
 class Startable(ABC):
     """A server, or several."""
 
-    _owner: int | None = None
-    """The process that has started it; None if none has."""
+    def __init__(self) -> None:
+        self._lock = threading.RLock()
+        self._owner: int | None = None  # the process that has started it; None if none has
+        self._finalizer: weakref.finalize[..., Any] | None = None
 
     @abstractmethod
     def start(self) -> None:
         """Start it, and wait until it answers."""
 
-    @abstractmethod
     def stop(self) -> None:
-        """End it. Idempotent."""
+        """Stop it and wait until it is gone; nothing if it does not run. Kept data is on disk afterwards."""
+        if not self._is_in_fork():
+            with self._lock:
+                self._clear()
+                self._owner = None
+
+    def _clear(self) -> None:
+        if self._finalizer is not None:
+            self._finalizer()  # runs once, here or at exit
+        self._finalizer = None
 
     @abstractmethod
     def _start(self) -> None:
