@@ -166,17 +166,11 @@ class HeldText:
 
 
 class _Lost(NamedTuple):
-    """A call that lost the server.
-
-    Attributes:
-        time: When.
-        took: For how many seconds it had tried.
-        error: What it raised, in words: the error itself would keep what its caller had.
-    """
+    """A call that lost the server."""
 
     time: float
-    took: float
-    error: str
+    took: float  # for how many seconds it had tried
+    error: str  # what it raised, in words: the error itself would keep what its caller had
 
 
 class _Attempt:

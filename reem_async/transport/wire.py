@@ -13,6 +13,7 @@ import contextlib
 import socket
 import sys
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import hiredis
@@ -48,31 +49,18 @@ _inherited: list[Any] = []
 event loop, since both share one epoll."""
 
 
+@dataclass(slots=True, eq=False)
 class _Due:
-    """The replies one caller waits for.
+    """The replies one caller waits for."""
 
-    Attributes:
-        count: How many they are.
-        done: Takes them, or an error.
-        limit: Seconds without a byte moving after which the call fails, and
-        since: the time from which this counts at the earliest: when they were asked for.
-        replies: Those that have come.
-        late: The limit has passed; it is given up if the next look at the socket brings nothing.
-        over: The caller was told; what still comes is dropped.
-        lenient: Errors are no reply.
-    """
-
-    __slots__ = ("count", "done", "late", "lenient", "limit", "over", "replies", "since")
-
-    def __init__(self, count: int, done: Callable[[list[Reply] | Exception], None], limit: float, since: float) -> None:
-        self.count = count
-        self.done = done
-        self.limit = limit
-        self.since = since
-        self.replies: list[Reply] = []
-        self.late = False
-        self.over = False
-        self.lenient = False
+    count: int
+    done: Callable[[list[Reply] | Exception], None]  # takes them, or an error
+    limit: float  # seconds without a byte moving after which the call fails, and
+    since: float  # the time from which this counts at the earliest: when they were asked for
+    replies: list[Reply] = field(default_factory=list)
+    late: bool = False  # the limit has passed: it is given up if the next look at the socket brings nothing
+    over: bool = False  # the caller was told; what still comes is dropped
+    lenient: bool = False  # errors are no reply
 
 
 class Wire(asyncio.BufferedProtocol):
@@ -195,9 +183,7 @@ class Wire(asyncio.BufferedProtocol):
         if not self.alive:
             return
         limit, now = time_limit(self._timeout), self._loop.time()
-        due = _Due(1, lambda _: None, limit, now)
-        due.lenient = True
-        self._due.append(due)
+        self._due.append(_Due(1, lambda _: None, limit, now, lenient=True))
         self._watch_until(now + limit)
         if not self._outbox:
             self._loop.call_soon(self._flush)
