@@ -102,15 +102,7 @@ class _Numbers:
 
 
 class Session:
-    """One server as one interface, whose arguments it takes, sees it.
-
-    Attributes:
-        interface: The interface this belongs to: pickled in its place.
-        subscriptions: The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
-        tasks: The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.
-        closing: Objects with a method `close`, to close with this.
-        closed: Whether it is closed, or about to be.
-    """
+    """One server as one interface, whose arguments it takes, sees it."""
 
     def __init__(
         self,
@@ -129,12 +121,14 @@ class Session:
         self.cache = ShapeCache()
         self.options, self.transport = _transport_to(host, timeout, options, new_transport)
         self.local = local
-        self.interface: Any = None
+        self.interface: Any = None  # the interface this belongs to: pickled in its place
         self._numbers = _Numbers()
+        # The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
         self.subscriptions: Any = None
+        # The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.
         self.tasks: Any = Tasks()
-        self.closing: weakref.WeakSet[Any] = weakref.WeakSet()
-        self.closed = False
+        self.closing: weakref.WeakSet[Any] = weakref.WeakSet()  # objects with a method `close`, to close with this
+        self.closed = False  # whether it is closed, or about to be
 
     def __reduce__(self) -> tuple[Any, ...]:
         return attrgetter("session"), (self.interface,)

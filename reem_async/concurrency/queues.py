@@ -80,10 +80,6 @@ class BoundedQueue:
     step that matters is one of C, which Python does not divide. Updates are numbered, so that the one dropped for
     another is named, and not the first at that moment. A loss is noted before the update after it is put in, so that
     the next one taken out reports it, however many were dropped in between.
-
-    Attributes:
-        dropped: How many updates were skipped and will never be taken out.
-        wake: Called after each change, from the putting thread.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -94,8 +90,8 @@ class BoundedQueue:
         self._sleepers: collections.deque[None] = collections.deque()  # one for each thread that waits for a wakeup
         self._wakeups: dict[int, Wakeups] = {}  # by process: a forked child must not take its parent's
         self._end: BaseException | None = None
-        self.dropped = 0
-        self.wake: Callable[[], None] = noop
+        self.dropped = 0  # how many updates were skipped and will never be taken out
+        self.wake: Callable[[], None] = noop  # called after each change, from the putting thread
 
     def put(self, update: Any) -> None:
         """Add an update, dropping or failing as the policy says."""

@@ -107,12 +107,7 @@ class _Look:
 
 
 class _Change:
-    """A batch, executed on the texts of its documents, and the commands that store the new texts.
-
-    Attributes:
-        is_whole: Whether the batch is a transaction.
-        end: The position of EXEC among what is sent; 0 if it is not.
-    """
+    """A batch, executed on the texts of its documents, and the commands that store the new texts."""
 
     def __init__(
         self, commands: Sequence[Command], documents: dict[bytes, TextDocument | Exception], error: MakeError
@@ -135,8 +130,8 @@ class _Change:
         self._last = {place: key for key, place in last.items() if key in changed}
         self._places: dict[int, int] = {}
         self._sent: list[Command] = []
-        self.end = 0
-        self.is_whole = bool(commands[-1][0] == "EXEC")
+        self.end = 0  # the position of EXEC among what is sent; 0 if it is not
+        self.is_whole = bool(commands[-1][0] == "EXEC")  # whether the batch is a transaction
 
     def commands(self, held: bool) -> list[Command]:
         """Return the commands: a transaction, and behind it those that were not in one."""

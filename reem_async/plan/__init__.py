@@ -25,26 +25,19 @@ _READS = frozenset(["GET", "JSON.GET", "SMEMBERS", "TYPE"])
 
 
 class Plan(NamedTuple):
-    """One round trip, and what to make of its replies.
+    """One round trip, and what to make of its replies."""
 
-    Attributes:
-        commands: What to send, in order.
-        decode: Takes one reply per command; returns the result, or the next plan. If a watched key changed, so that
-            the transaction was not executed, it gets None instead.
-        atomic: Send the commands as one MULTI/EXEC.
-        held: Keep the connection to this plan and its successors (WATCH belongs to a connection).
-        bulk: The replies are large: use a connection on which no other call waits.
-        without_refused: Called if the user lacks the right to some commands, so that nothing was executed: takes a
-            reply per command, and returns the plan for the rest; None if there is none.
-        unfinished: Earlier plans were applied and this one failed: makes the error to raise from that of this plan.
-    """
-
-    commands: Sequence[Command]
+    commands: Sequence[Command]  # what to send, in order
+    # Takes one reply per command; returns the result, or the next plan. If a watched key changed, so that the
+    # transaction was not executed, it gets None instead.
     decode: Callable[[Any], Any]
-    atomic: bool = False
-    held: bool = False
-    bulk: bool = False
+    atomic: bool = False  # send the commands as one MULTI/EXEC
+    held: bool = False  # keep the connection to this plan and its successors (WATCH belongs to a connection)
+    bulk: bool = False  # the replies are large: use a connection on which no other call waits
+    # Earlier plans were applied and this one failed: makes the error to raise from that of this plan.
     unfinished: Callable[[Exception], Exception] | None = None
+    # Called if the user lacks the right to some commands, so that nothing was executed: takes a reply per command,
+    # and returns the plan for the rest; None if there is none.
     without_refused: Callable[[Sequence[Any]], Plan | None] | None = None
 
 

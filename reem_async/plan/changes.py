@@ -15,19 +15,12 @@ REFUSED = object()
 
 
 class EncodedAttachment(NamedTuple):
-    """An attachment ready to be stored: the commands its ship recorded.
+    """An attachment ready to be stored: the commands its ship recorded."""
 
-    Attributes:
-        suffix: The key's name after the tag.
-        label: The ship's label.
-        commands: What stores it.
-        blob: Its bytes in pieces, if the ship is a `BlobShip`: a notice can carry them.
-    """
-
-    suffix: str
+    suffix: str  # the key's name after the tag
     label: str
-    commands: tuple[Command, ...]
-    blob: tuple[Any, ...] | None = None
+    commands: tuple[Command, ...]  # what stores it
+    blob: tuple[Any, ...] | None = None  # its bytes in pieces, if the ship is a `BlobShip`: a notice can carry them
 
 
 class Announcement:
@@ -67,27 +60,16 @@ SILENT = Announcement()
 
 
 class DocumentChange(NamedTuple):
-    """One change of a document.
-
-    Attributes:
-        keys: The document's names.
-        path: The place, below the top-level key. Where it counts from the end of a list, the document is watched.
-        command: The JSON command.
-        judge: Turns that command's reply into the result; raises, or returns `REFUSED`.
-        attachments: The values that ships store.
-        replaces: Whether the old value at `path` is gone afterwards.
-        gone: The suffixes of the attachments that it replaces, known since the document is watched: they are removed
-            in the transaction. None: unknown, so those left over are found in the registry and removed afterwards.
-        announcement: Notifies subscribers.
-        absent: The error if a list on the path has no such item from its end.
-    """
+    """One change of a document."""
 
     keys: Keys
-    path: Path
+    path: Path  # the place, below the top-level key. Where it counts from the end of a list, the document is watched
     command: Command
-    judge: Callable[[Reply], Any]
-    attachments: tuple[EncodedAttachment, ...] = ()
-    replaces: bool = True
+    judge: Callable[[Reply], Any]  # turns that command's reply into the result; raises, or returns `REFUSED`
+    attachments: tuple[EncodedAttachment, ...] = ()  # the values that ships store
+    replaces: bool = True  # whether the old value at `path` is gone afterwards
+    # The suffixes of the attachments that it replaces, known since the document is watched: they are removed in the
+    # transaction. None: unknown, so those left over are found in the registry and removed afterwards.
     gone: tuple[bytes, ...] | None = None
     announcement: Announcement = SILENT
-    absent: type[Exception] = MissingKey
+    absent: type[Exception] = MissingKey  # the error if a list on the path has no such item from its end

@@ -15,24 +15,15 @@ from . import Command, Plan, Reply
 
 
 class Keys(NamedTuple):
-    """The server-side names of one top-level key.
+    """The server-side names of one top-level key."""
 
-    Attributes:
-        name: The key as the user knows it.
-        document: The RedisJSON document, namespace included.
-        tag: The beginning of every attachment's key: `{foo}`.
-        registry: The set of the suffixes of all attachments.
-        channel: Where notices of updates are published.
-        last: The note: publisher and number of the last notice; kept for a minute.
-        publish: The command for notices: SPUBLISH in a cluster, where a channel belongs to the key's node.
-    """
-
-    name: str
-    document: str
-    tag: str
-    registry: str
-    channel: str
-    last: str
+    name: str  # the key as the user knows it
+    document: str  # the RedisJSON document, namespace included
+    tag: str  # the beginning of every attachment's key: `{foo}`
+    registry: str  # the set of the suffixes of all attachments
+    channel: str  # where notices of updates are published
+    last: str  # the note: publisher and number of the last notice; kept for a minute
+    # The command for notices: SPUBLISH in a cluster, where a channel belongs to the key's node.
     publish: str = "PUBLISH"
 
     @property

@@ -45,29 +45,17 @@ ANNOUNCED = object()
 
 
 class Notice(NamedTuple):
-    """One update, as a subscriber received it.
+    """One update, as a subscriber received it."""
 
-    Attributes:
-        publisher: An id that is unique per interface.
-        sequence: Counts this publisher's updates of this top-level key, from 1.
-        time: Seconds since 1970 on the publisher's clock.
-        path: The place that was updated, below the top-level key.
-        deleted: Whether the value was removed.
-        value: The value, or ANNOUNCED.
-        size: Bytes of the value, document text and arrays; 0 where only the server knows (arithmetic).
-        slot: The place of a large value in the publisher's shared memory, or None.
-        early: Whether it arrived before the server had the update.
-    """
-
-    publisher: str
-    sequence: int
-    time: float
-    path: Path
+    publisher: str  # an id that is unique per interface
+    sequence: int  # counts this publisher's updates of this top-level key, from 1
+    time: float  # seconds since 1970 on the publisher's clock
+    path: Path  # the place that was updated, below the top-level key
     deleted: bool
-    value: Any
-    size: int = 0
-    slot: Slot | None = None
-    early: bool = False
+    value: Any  # the value, or ANNOUNCED
+    size: int = 0  # bytes of the value, document text and arrays; 0 where only the server knows (arithmetic)
+    slot: Slot | None = None  # the place of a large value in the publisher's shared memory, or None
+    early: bool = False  # whether it arrived before the server had the update
 
 
 NOTE_KEPT = 60
@@ -288,23 +276,14 @@ _ALIGNED = 64
 
 
 class Slot(NamedTuple):
-    """A slot in the shared memory of a publisher, as a notice names it.
+    """A slot in the shared memory of a publisher, as a notice names it."""
 
-    Attributes:
-        host: Identifies the processes that can reach it: one user on one boot of a host or container.
-        process: The publisher's process id.
-        descriptor: Its file descriptor of the memory.
-        inode: The inode of that file: descriptors and process ids are reused.
-        number: The slot's number, from 0.
-        stamp: A random number that the slot has as long as it holds these bytes.
-    """
-
-    host: str
-    process: int
-    descriptor: int
-    inode: int
-    number: int
-    stamp: int
+    host: str  # identifies the processes that can reach it: one user on one boot of a host or container
+    process: int  # the publisher's process id
+    descriptor: int  # its file descriptor of the memory
+    inode: int  # the inode of that file: descriptors and process ids are reused
+    number: int  # the slot's number, from 0
+    stamp: int  # a random number that the slot has as long as it holds these bytes
 
 
 def starts(sizes: Iterable[int]) -> list[int]:

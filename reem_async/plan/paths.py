@@ -266,15 +266,10 @@ _LONGEST_TAIL = len("{}:notices@") + 10
 
 
 class Pattern(NamedTuple):
-    """A glob over paths, such as `arm`, `cam_*` or `robot.*.battery`.
+    """A glob over paths, such as `arm`, `cam_*` or `robot.*.battery`."""
 
-    Attributes:
-        top: The glob of the top-level key, with `*` and `?`.
-        rest: Globs of the elements below it; empty for all.
-    """
-
-    top: str
-    rest: Path = ()
+    top: str  # the glob of the top-level key, with `*` and `?`
+    rest: Path = ()  # globs of the elements below it; empty for all
 
     @property
     def glob(self) -> str:

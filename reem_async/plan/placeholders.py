@@ -30,19 +30,12 @@ INLINE_LABELS = frozenset({"text", "float"})
 
 
 class Placeholder(NamedTuple):
-    """The placeholder of an attachment, a value that a ship holds under a key of its own.
+    """The placeholder of an attachment, a value that a ship holds under a key of its own."""
 
-    Attributes:
-        label: The ship's label.
-        suffix: The key's name after the tag.
-        size: Bytes of the value, 0 where the ship does not say.
-        summary: What it is, for people: `float64[640,480,3]`.
-    """
-
-    label: str
-    suffix: str
-    size: int = 0
-    summary: str = ""
+    label: str  # the ship's label
+    suffix: str  # the key's name after the tag
+    size: int = 0  # bytes of the value, 0 where the ship does not say
+    summary: str = ""  # what it is, for people: `float64[640,480,3]`
 
     def __str__(self) -> str:
         return _written(self)

@@ -36,26 +36,18 @@ _NOTHING: HeldValues = {}
 
 
 class RawRead(NamedTuple):
-    """The result of a read, before ships interpret their replies.
+    """The result of a read, before ships interpret their replies."""
 
-    Attributes:
-        holder: A list of one: the tree, with placeholders where `slots` says.
-        name: The top-level key.
-        slots: Of each attachment, its place in the tree, the ship, and the reply to interpret.
-        commands: The last commands that were sent, and
-        raw: their replies: `exchange` compares with these.
-        also: The replies to the additional commands, if there were any.
-        left: The objects in the tree for attachments that were not fetched, by label and suffix.
-        unreadable: The objects in the tree for values that cannot be read; None if that is an error.
-    """
-
-    holder: list[Any]
-    name: str
+    holder: list[Any]  # a list of one: the tree, with placeholders where `slots` says
+    name: str  # the top-level key
+    # Of each attachment, its place in the tree, the ship, and the reply to interpret.
     slots: list[tuple[PlaceholderSlot, Registered, Reply]]
-    commands: tuple[Command, ...]
-    raw: tuple[Any, ...]
-    also: tuple[Any, ...] = ()
+    commands: tuple[Command, ...]  # the last commands that were sent, and
+    raw: tuple[Any, ...]  # their replies: `exchange` compares with these
+    also: tuple[Any, ...] = ()  # the replies to the additional commands, if there were any
+    # The objects in the tree for attachments that were not fetched, by label and suffix.
     left: Mapping[tuple[str, str], Unfetched] = {}
+    # The objects in the tree for values that cannot be read; None if that is an error.
     unreadable: list[Unreadable] | None = None
 
     def give_up(self, slot: PlaceholderSlot, error: Exception) -> Unreadable:

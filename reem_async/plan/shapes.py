@@ -20,21 +20,13 @@ _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 @dataclass(slots=True)
 class Shape:
-    """Guesses about one document. Threads may share it: entries are only ever replaced.
+    """Guesses about one document. Threads may share it: entries are only ever replaced."""
 
-    Attributes:
-        members: The suffixes of attachments that may exist.
-        interrupted: A change was interrupted: it may have left attachments that nothing refers to.
-        may_look: The user has the right to read the registry, see `writes._is_tried`.
-        is_new: The document was found not to be of REEM 0.1 (`legacy/olddata.py`), and
-        is_new_below: the same, where only places below the root were looked at.
-    """
-
-    members: frozenset[bytes] = _NO_MEMBERS
-    interrupted: bool = False
-    may_look: bool = False
-    is_new: bool = False
-    is_new_below: bool = False
+    members: frozenset[bytes] = _NO_MEMBERS  # the suffixes of attachments that may exist
+    interrupted: bool = False  # a change was interrupted: it may have left attachments that nothing refers to
+    may_look: bool = False  # the user has the right to read the registry, see `writes._is_tried`
+    is_new: bool = False  # the document was found not to be of REEM 0.1 (`legacy/olddata.py`), and
+    is_new_below: bool = False  # the same, where only places below the root were looked at
     _layouts: dict[Path, tuple[Placeholder, ...]] = field(default_factory=dict)
     _numbers: dict[Path, float] = field(default_factory=dict)
 

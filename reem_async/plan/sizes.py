@@ -16,15 +16,10 @@ LARGE = 1 << 16
 
 
 class Limits(NamedTuple):
-    """Limits of a server.
+    """Limits of a server."""
 
-    Attributes:
-        argument: Bytes of one argument, so of an array, or of the text of a document.
-        call: Bytes of all commands of a transaction.
-    """
-
-    argument: int
-    call: int
+    argument: int  # bytes of one argument, so of an array, or of the text of a document
+    call: int  # bytes of all commands of a transaction
 
 
 USUAL = Limits(512 << 20, 1 << 30)

@@ -22,18 +22,13 @@ JOIN_SECONDS = 30.0  # for all nodes to know of each other
 
 
 class NodeProcess(ServerProcess):
-    """One server of a cluster, up and not yet a member.
-
-    Attributes:
-        id: What the cluster calls it.
-        bus: The port on which the nodes talk to each other.
-    """
+    """One server of a cluster, up and not yet a member."""
 
     def __init__(self, program: ServerProgram, port: int, bus: int, node_timeout: float) -> None:
-        self.bus = bus
+        self.bus = bus  # the port on which the nodes talk to each other
         self._node_timeout = node_timeout
         super().__init__(program, port=port, directory=None, password=None)
-        self.id = self.say("CLUSTER", "MYID")
+        self.id = self.say("CLUSTER", "MYID")  # what the cluster calls it
 
     def _config(self, program: ServerProgram, keep: bool, password: str | None) -> str:
         lines = [

@@ -32,17 +32,11 @@ WATCHDOG = Path(__file__).with_name("watchdog.py")
 
 @dataclass(frozen=True)
 class ServerProgram:
-    """A server executable.
+    """A server executable."""
 
-    Attributes:
-        path: Where it is.
-        modules: What it has to load.
-        json: It understands JSON then.
-    """
-
-    path: str
-    modules: tuple[str, ...] = ()
-    json: bool = False
+    path: str  # where it is
+    modules: tuple[str, ...] = ()  # what it has to load
+    json: bool = False  # it understands JSON then
 
 
 class PortTaken(ServerFailed):

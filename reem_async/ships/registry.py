@@ -62,23 +62,17 @@ class Registered:
 
 
 class Ships:
-    """Chooses ships for values, the first that fits, and finds them by label.
-
-    Attributes:
-        new_recorder: Makes an object with redis-py's command methods and a list `commands`.
-        claimed: JSON types of which a ship takes some values.
-        asks_first: Whether there are such types, or asynchronous ships were not asked yet.
-    """
+    """Chooses ships for values, the first that fits, and finds them by label."""
 
     def __init__(self, ships: Iterable[SpecialDatatypeShip], new_recorder: Callable[[], Any]) -> None:
         self.given = list(ships)
-        self.new_recorder = new_recorder
+        self.new_recorder = new_recorder  # makes an object with redis-py's command methods and a list `commands`
         methods = [getattr(ship, name, None) for ship in self.given for name in _METHODS]
         self.asynchronous = any(map(inspect.iscoroutinefunction, methods))
         self._registered: list[Registered] = []
         self._by_label: dict[str, Registered] = {}
-        self.claimed: frozenset[type] = frozenset()
-        self.asks_first = True
+        self.claimed: frozenset[type] = frozenset()  # JSON types of which a ship takes some values
+        self.asks_first = True  # whether there are such types, or asynchronous ships were not asked yet
         # Ships that have to be awaited cannot be asked here; `ready` does it before the first call that needs them.
         if not self.asynchronous:
             self._claim(kind for ship in self.given for kind in _claims(ship))

@@ -45,19 +45,12 @@ Attachments = tuple[EncodedAttachment, ...]
 
 
 class Assignment(NamedTuple):
-    """One encoded value that a call stores, or a place that it removes.
+    """One encoded value that a call stores, or a place that it removes."""
 
-    Attributes:
-        path: The place, below the top-level key.
-        text: The JSON text; None to remove the value.
-        attachments: The values that ships store.
-        is_entry: Whether the dict above must exist: an array does not make its top-level key.
-    """
-
-    path: Path
-    text: bytes | None
-    attachments: Attachments = ()
-    is_entry: bool = False
+    path: Path  # the place, below the top-level key
+    text: bytes | None  # the JSON text; None to remove the value
+    attachments: Attachments = ()  # the values that ships store
+    is_entry: bool = False  # whether the dict above must exist: an array does not make its top-level key
 
 
 class Turn:

@@ -59,17 +59,11 @@ _Place = tuple[Path, int]
 
 
 class _Kept(NamedTuple):
-    """An assignment that is sent later.
+    """An assignment that is sent later."""
 
-    Attributes:
-        assignment: With bytes of its own.
-        size: Bytes.
-        time: Seconds since 1970 on which it was published.
-    """
-
-    assignment: Assignment
-    size: int
-    time: float
+    assignment: Assignment  # with bytes of its own
+    size: int  # bytes
+    time: float  # seconds since 1970 on which it was published
 
 
 class _Out:
@@ -78,16 +72,13 @@ class _Out:
     A newer value of a place replaces older ones of the same place and inside it. An index of a list names another item
     after a removal. So a removal is never replaced by another one, and updates of items before it are not replaced by
     those after it. Only a value of the whole list, or of a place above, replaces both.
-
-    Attributes:
-        sending: How many are being sent and not among those kept.
     """
 
     def __init__(self, writer: DocumentWriter) -> None:
         self.writer = writer
         self.kept: dict[_Place, _Kept] = {}
         self.size = 0
-        self.sending = 0
+        self.sending = 0  # how many are being sent and not among those kept
         self._removals: dict[Path, int] = {}  # of items, by the outermost list
 
     def put(self, it: _Kept) -> int:

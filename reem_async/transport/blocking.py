@@ -41,12 +41,7 @@ _NAP, _NAPS = 2e-5, 16
 
 
 class _Line:
-    """One blocking connection, used by one caller at a time.
-
-    Attributes:
-        broken: It is not to be used again; so it is while a call is under way.
-        waiting: A call is under way that has nothing large to send.
-    """
+    """One blocking connection, used by one caller at a time."""
 
     def __init__(self, options: Options, states: States, lines: WeakList[_Line]) -> None:
         self._states, self._lines = states, lines
@@ -75,7 +70,8 @@ class _Line:
         self._small = SmallReader(options.largest)
         self._largest = options.largest
         self._large: LargeReader | None = None
-        self.broken = self.waiting = False
+        self.broken = False  # it is not to be used again; so it is while a call is under way
+        self.waiting = False  # a call is under way that has nothing large to send
         known = lists_json(self._connection.handshake_metadata)
         try:
             self.introduction, *probed = self.exchange([INFO_SERVER] if known else [INFO_SERVER, PROBE])

@@ -62,14 +62,11 @@ class ClusterOptions(Options):
     Args:
         url: `redis+cluster://user:password@host:port,host:port`, or `rediss+cluster://`; some of the nodes.
         timeout, options: As for `Options`; the same for all nodes.
-
-    Attributes:
-        seeds: The nodes that the URL names.
     """
 
     def __init__(self, url: str, timeout: float, options: dict[str, Any]) -> None:
         urls = listed(url, _EXAMPLE)
-        self.seeds: list[Address] = [address_of(one, 6379) for one in urls]
+        self.seeds: list[Address] = [address_of(one, 6379) for one in urls]  # the nodes that the URL names
         super().__init__(urls[0], timeout, options)
         if self.database:
             raise BadValue(

@@ -73,22 +73,19 @@ class Options:
         BadValue: A URL that cannot be parsed, or an option that cannot be meant.
         BadType: An option that redis-py does not know.
 
-    Attributes:
-        largest: Bytes that a string in a reply may have.
-        nearby: What is known of a shorter way to the same server, if one is looked for; else None.
-
     Warns:
         InsecureConnection: Others can listen; once for each address.
     """
 
     def __init__(self, host: Any, timeout: float, options: dict[str, Any]) -> None:
+        # What is known of a shorter way to the same server, if one is looked for; else None.
         self.nearby: ServerSocket | None = None
         self.settings = {**settings_of(host), **options}
         limit = self.settings.pop("socket_timeout", timeout)  # redis-py's name for it; None is no limit there
         self.timeout = timeout = LONGEST if limit is None else check_timeout(limit)
         if self.settings.setdefault("protocol", 3) not in (3, "3"):
             raise BadValue("REEM speaks protocol 3 (notices and replies share a connection); leave protocol= out")
-        self.largest = _size(self.settings.pop("largest_value", LARGEST))
+        self.largest = _size(self.settings.pop("largest_value", LARGEST))  # bytes that a string in a reply may have
         # A login with TLS takes several round trips, which a time limit for single calls does not mean.
         self.handshake_timeout = max(timeout, 1.0)
         self.tls = bool(self.settings.pop("ssl", False))
@@ -400,15 +397,12 @@ def look_nearby(options: Options) -> None:
 
 
 class ServerSocket:
-    """The Unix socket of the server at an address, as far as it is known.
-
-    Attributes:
-        way: How to reach it through the socket; None as long as none is known, or of use.
-    """
+    """The Unix socket of the server at an address, as far as it is known."""
 
     def __init__(self, options: Options) -> None:
         self._options = options
         self._vain: str | None = None
+        # How to reach it through the socket; None as long as none is known, or of use.
         self.way: SocketOptions | None = None
 
     def learn(self, replies: Any) -> None:

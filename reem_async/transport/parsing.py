@@ -54,15 +54,10 @@ _parse_error: Any = BaseParser.parse_error
 
 
 class SmallReader:
-    """hiredis, handing out error replies as redis-py's exceptions.
-
-    Attributes:
-        fed: Bytes received of the reply that is under way; to be set to 0 when a reply is taken.
-        gets: Returns the next reply, or MORE; raises redis.exceptions.InvalidResponse for what is not the protocol.
-    """
+    """hiredis, handing out error replies as redis-py's exceptions."""
 
     def __init__(self, largest: int = LARGEST) -> None:
-        self.fed = 0
+        self.fed = 0  # bytes received of the reply that is under way; to be set to 0 when a reply is taken
         self._largest, self._in_all, self._look_at = largest, largest * _IN_ALL, _MUCH
         self._parser = hiredis.Reader(
             protocolError=redis.exceptions.InvalidResponse, replyError=error_of, notEnoughData=MORE
@@ -71,6 +66,7 @@ class SmallReader:
         self._view = memoryview(self._buffer)
         # Bound once: both are called for each reply.
         self._feed: Any = self._parser.feed
+        # Returns the next reply, or MORE; raises redis.exceptions.InvalidResponse for what is not the protocol.
         self.gets = self._parser.gets
 
     def target(self) -> memoryview:

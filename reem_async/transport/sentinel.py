@@ -50,11 +50,6 @@ class SentinelOptions(Options):
         timeout: As for `Options`.
         options: Those of the servers; besides, `sentinel_username` and `sentinel_password` for the sentinels.
 
-    Attributes:
-        service: What the sentinels call the primary.
-        found: Where it was when a connection was made last.
-        changed: Called when a connection is made elsewhere than the last one; may be called on any thread.
-
     Raises:
         BadValue: The URL names no service.
     """
@@ -64,14 +59,15 @@ class SentinelOptions(Options):
         login = {name: options.pop(f"sentinel_{name}", None) for name in ("username", "password")}
         urls = [each.partition("?") for each in listed(url, _EXAMPLE)]
         heads = [head.split("/") for head, _, _ in urls]  # scheme:, nothing, host, service, database
-        self.service = heads[0][3] if len(heads[0]) > 3 else ""
+        self.service = heads[0][3] if len(heads[0]) > 3 else ""  # what the sentinels call the primary
         if not self.service:
             raise BadValue(f"the URL names no service; write it like {_EXAMPLE}")
         plain = [
             f"{'/'.join([*parts[:3], *parts[4:]])}{mark}{query}"
             for parts, (_, mark, query) in zip(heads, urls, strict=True)
         ]
-        self.found: Address | None = None
+        self.found: Address | None = None  # where it was when a connection was made last
+        # Called when a connection is made elsewhere than the last one; may be called on any thread.
         self.changed: Callable[[], None] = lambda: None
         self._sentinels = [address_of(one, 26379) for one in plain]
         # When they were asked last, of those that have not answered since: they are asked behind all others.
@@ -322,14 +318,10 @@ class SentinelTransport(CompositeTransport):
 
 
 class _Lookout:
-    """A thread that asks the sentinels whether the primary is another one than that of the connections.
-
-    Attributes:
-        pid: The process it runs in.
-    """
+    """A thread that asks the sentinels whether the primary is another one than that of the connections."""
 
     def __init__(self, options: SentinelOptions, owner: SentinelTransport) -> None:
-        self.pid = os.getpid()
+        self.pid = os.getpid()  # the process it runs in
         self._options = options
         self._owner = weakref.ref(owner)
         self._stopped = threading.Event()

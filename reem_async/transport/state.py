@@ -71,13 +71,10 @@ class States:
 
     Or on one that is calling back already, so that changes are reported in order. No lock is held meanwhile: what is
     called back may call REEM, and wait for what another thread has.
-
-    Attributes:
-        unreadable: How many messages on followed channels could not be read.
     """
 
     def __init__(self) -> None:
-        self.unreadable = 0
+        self.unreadable = 0  # how many messages on followed channels could not be read
         self.last = StateChange("idle", "", time.time())
         self._lock = threading.RLock()
         self._queues: WeakList[BoundedQueue] = WeakList()

@@ -174,17 +174,12 @@ class _Lost(NamedTuple):
 
 
 class _Attempt:
-    """A batch that is retried until no other client writes in between.
-
-    Attributes:
-        given: The batch, which concerns the documents of `keys`.
-        begun: When it had its turn last.
-    """
+    """A batch that is retried until no other client writes in between."""
 
     def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
         self._keys = keys
-        self.given = self._commands = commands
-        self.begun = 0.0
+        self.given = self._commands = commands  # the batch, which concerns the documents of `keys`
+        self.begun = 0.0  # when it had its turn last
         self._coming: list[Staged] = []
         self._sent = -float(KEPT)
 

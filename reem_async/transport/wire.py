@@ -64,22 +64,17 @@ class _Due:
 
 
 class Wire(asyncio.BufferedProtocol):
-    """The protocol over a connection that has shaken hands.
-
-    Attributes:
-        on_push: Called with each message the server sends unasked.
-        on_lost: Called once when the connection is gone, with the reason.
-        pace: Seconds for which nothing more is read after something was, if much comes: it is taken together.
-        tracked: The server tells of keys that were read here and then changed (CLIENT TRACKING); None if not asked.
-        plain: The server has no JSON module; what reads documents is sent as what reads their text.
-    """
+    """The protocol over a connection that has shaken hands."""
 
     def __init__(self, timeout: float, reader: ReplyReader) -> None:
-        self.on_push: Callable[[list[Any]], None] | None = None
+        self.on_push: Callable[[list[Any]], None] | None = None  # called with each message the server sends unasked
+        # Called once when the connection is gone, with the reason.
         self.on_lost: Callable[[Wire, Exception], None] | None = None
+        # Seconds for which nothing more is read after something was, if much comes: it is taken together.
         self.pace = 0.0
+        # The server tells of keys that were read here and then changed (CLIENT TRACKING); None if not asked.
         self.tracked: bool | None = None
-        self.plain = False
+        self.plain = False  # the server has no JSON module; what reads documents is sent as what reads their text
         self._timeout = timeout
         self._reader = reader
         self._due: collections.deque[_Due] = collections.deque()
