@@ -9,15 +9,7 @@ They run on the interface's background event loop, where `progress` is called to
 from __future__ import annotations
 
 from reem_async.tools import snapshots as core
-from reem_async.tools.snapshots import (
-    Progress,
-    RdbUnavailable,
-    Restored,
-    SavedKey,
-    Snapshot,
-    describe,
-    described,
-)
+from reem_async.tools.snapshots import Progress, RdbUnavailable, Restored, SavedKey, Snapshot, described
 
 from .connection import blocking
 
@@ -34,4 +26,5 @@ __all__ = [
     "save_rdb",
 ]
 
+describe = described
 save, save_rdb, restore = blocking(core.save), blocking(core.save_rdb), blocking(core.restore)
