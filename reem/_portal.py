@@ -29,10 +29,8 @@ Result = TypeVar("Result")
 
 _LONGEST_LAST = 2.0
 """Seconds for what a loop runs before its end: more than the core waits for tasks that are slow to end."""
-_LONGEST_END = 1.0
-"""Seconds to wait for a thread, which ends at its next look at the interface that is closed."""
-_LONGEST_STOP = 3.0
-"""Seconds to wait for the loop's thread, in which a ship of a user's own may be at work."""
+_LONGEST_END = 1.0  # seconds to wait for a thread, which ends at its next look at the interface that is closed
+_LONGEST_STOP = 3.0  # seconds to wait for the loop's thread, in which a ship of a user's own may be at work
 
 
 def finish(coroutine: Coroutine[Any, Any, Result]) -> Result:

@@ -28,8 +28,7 @@ from .transport.composite import NewTransport
 from .transport.options import Options, look_nearby
 from .transport.packing import CommandRecorder
 
-_FRESH = 3.0
-"""Seconds for which the first notices of a publisher about a key go to all nodes of a cluster."""
+_FRESH = 3.0  # seconds for which the first notices of a publisher about a key go to all nodes of a cluster
 QUIET = 60.0
 """After this silence (seconds) a publisher's notices of a key go to all nodes again: clients that find keys by pattern
 have dropped the key by then."""
@@ -38,8 +37,7 @@ _IDLE, _LOOKS = 120.0, 10.0
 """Seconds after which the number of an idle top-level key is forgotten, and between searches for such keys.
 
 The first is longer than the server keeps the note of a key's last update."""
-_KEPT = 1000
-"""Top-level keys that are never forgotten, however idle."""
+_KEPT = 1000  # top-level keys that are never forgotten, however idle
 
 
 class _Numbers:

@@ -69,8 +69,7 @@ class Ended(Exception):
     """The queue was closed and all of it was taken."""
 
 
-EMPTY: Any = object()
-"""What `BoundedQueue.take` returns when nothing waits."""
+EMPTY: Any = object()  # what `BoundedQueue.take` returns when nothing waits
 
 
 class BoundedQueue:

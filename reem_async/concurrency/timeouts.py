@@ -15,8 +15,7 @@ from contextvars import ContextVar
 
 from ..errors import BadValue
 
-LONGEST = 1e6
-"""Seconds that a time limit may have: eleven days, which is as good as none."""
+LONGEST = 1e6  # seconds that a time limit may have: eleven days, which is as good as none
 
 LOOKS = 160
 """How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
@@ -27,14 +26,12 @@ _DELAYED = 0.04
 acknowledgement. Those before are confirmed at once."""
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
-_BYTES_ACKED = 120
-"""Where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits."""
+_BYTES_ACKED = 120  # where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits
 
 _given: ContextVar[float | None] = ContextVar("reem timeout", default=None)
 
 
-_TURNS = 100
-"""Turns of an event loop that a time limit for the server lasts at least: a handshake takes about thirty."""
+_TURNS = 100  # turns of an event loop that a time limit for the server lasts at least: a handshake takes about thirty
 
 
 @asynccontextmanager

@@ -58,8 +58,7 @@ class Pipe:
         os.read(self._read.number, 1)
 
 
-Wakeups = Pipe | queue.SimpleQueue[None]
-"""Each wakeup that is put wakes one thread that gets one."""
+Wakeups = Pipe | queue.SimpleQueue[None]  # each wakeup that is put wakes one thread that gets one
 
 
 def wakeups() -> Wakeups:

@@ -10,8 +10,7 @@ from ..plan.keys import DOCUMENT
 from .documents import READS, WRITES, TextDocument, is_document
 from .paths import Refusal
 
-MakeError = Callable[[str], Exception]
-"""Makes the error for an error reply of the server."""
+MakeError = Callable[[str], Exception]  # makes the error for an error reply of the server
 
 Steps = Generator[list[Command], list[Reply], list[Reply] | None]
 """A translation; it returns None if nothing was applied because another client was first."""
@@ -21,13 +20,10 @@ MULTI: Command = ("MULTI",)
 EXEC: Command = ("EXEC",)
 UNWATCH: Command = ("UNWATCH",)
 _WRONG_TYPE = "Existing key has wrong Redis type"
-OTHER_TYPE = ("WRONGTYPE", "Operation against a key")
-"""The beginnings of errors about a key that holds no string."""
+OTHER_TYPE = ("WRONGTYPE", "Operation against a key")  # the beginnings of errors about a key that holds no string
 _NAMES = READS | WRITES
-_FRESH = 10.0
-"""Seconds for which a key that held a document is known to hold one."""
-_MOST = 4096
-"""Known keys, so that a program that uses ever new ones does not fill its memory."""
+_FRESH = 10.0  # seconds for which a key that held a document is known to hold one
+_MOST = 4096  # known keys, so that a program that uses ever new ones does not fill its memory
 
 
 class Known:

@@ -35,8 +35,7 @@ def is_document(text: bytes | bytearray) -> bool:
     return text[:1] == MARK
 
 
-_DEEPEST = 128
-"""Levels of a document that the module accepts."""
+_DEEPEST = 128  # levels of a document that the module accepts
 
 
 class TextDocument:

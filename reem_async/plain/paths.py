@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 Step = str | int | slice
 Steps = tuple[Step, ...]
 
-ALL = slice(None)
-"""Every item of a list, every value of a dict."""
+ALL = slice(None)  # every item of a list, every value of a dict
 
 _STEP = re.compile(r"""\["(?P<double>[^"]*)"\]|\['(?P<single>[^']*)'\]|\[(?P<from>-?\d+)(?::(?P<to>-?\d+))?\]|\[\*\]""")
 

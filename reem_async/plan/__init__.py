@@ -12,11 +12,9 @@ from typing import Any, NamedTuple
 
 from ..errors import BadData, ClusterReply, PartialWrite, Refused, turned_down
 
-Command = tuple[Any, ...]
-"""One server command: its words as str, bytes, int, float or a flat buffer."""
+Command = tuple[Any, ...]  # one server command: its words as str, bytes, int, float or a flat buffer
 
-Reply = Any
-"""A reply of the server: bytes, int, None, a container of these, or an exception object."""
+Reply = Any  # a reply of the server: bytes, int, None, a container of these, or an exception object
 
 _MULTI: Command = ("MULTI",)
 _EXEC: Command = ("EXEC",)

@@ -29,8 +29,7 @@ Operation = Callable[[Any, Any], Any]
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1
 """The server calculates with signed 64-bit integers, though it stores unsigned ones too."""
 
-_FAR = 2**62
-"""The server calculates results that should be below this."""
+_FAR = 2**62  # the server calculates results that should be below this
 
 
 def calculate(

@@ -10,8 +10,7 @@ from . import Command, Reply
 from .keys import Keys
 from .paths import Path
 
-REFUSED = object()
-"""Result of `DocumentChange.judge`: the server did nothing and gave no reason."""
+REFUSED = object()  # result of `DocumentChange.judge`: the server did nothing and gave no reason
 
 
 class EncodedAttachment(NamedTuple):

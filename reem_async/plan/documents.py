@@ -24,14 +24,12 @@ from .floats import exact_list, exact_text, may_lose
 from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
-DEEPEST = 100
-"""Levels of nesting a document may have; RedisJSON parses up to 127."""
+DEEPEST = 100  # levels of nesting a document may have; RedisJSON parses up to 127
 
 PLAIN_ARRAYS = frozenset({np.ndarray, np.memmap, np.matrix, np.recarray})
 """Array classes that hold only items. Others may have a unit or a mask, which would be lost."""
 
-_MANY = 32
-"""Floats in a list from which converting them together is faster."""
+_MANY = 32  # floats in a list from which converting them together is faster
 
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"{}[]"))
 
@@ -53,8 +51,7 @@ class Carrier(Protocol):
         """Return bytes and a summary; raises BadType or BadValue."""
 
 
-Fits = Callable[[Any], Carrier | None]
-"""Returns the ship for a value that is not JSON, or None."""
+Fits = Callable[[Any], Carrier | None]  # returns the ship for a value that is not JSON, or None
 
 
 class Attachment(NamedTuple):

@@ -15,8 +15,7 @@ import numpy as np
 
 _POWERS = tuple(float(f"1e{k}") for k in range(309))
 _POWERS_ARRAY = np.array(_POWERS[:23])
-_EXACT_PLACES = 22
-"""The largest power of ten that is a float itself: up to there all parsers agree."""
+_EXACT_PLACES = 22  # the largest power of ten that is a float itself: up to there all parsers agree
 _LIMIT = 2**64
 _LOG2_OF_10 = math.log2(10.0)
 

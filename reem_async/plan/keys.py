@@ -40,8 +40,7 @@ def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = F
     return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last", publish)
 
 
-DOCUMENT = "ReJSON-RL"
-"""The reply of TYPE for a JSON document."""
+DOCUMENT = "ReJSON-RL"  # the reply of TYPE for a JSON document
 
 _PAGE = "1000"
 

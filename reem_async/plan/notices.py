@@ -24,24 +24,16 @@ from .paths import Path, check_element
 from .placeholders import Unreadable, find, marked
 
 VERSION = 1
-LARGEST_INLINE = 1 << 14
-"""Bytes of value up to which the notice carries it."""
+LARGEST_INLINE = 1 << 14  # bytes of value up to which the notice carries it
 
-_DEEPEST = 128
-"""Levels of a document that servers accept; path and value together have no more."""
-_LONGEST_PATH = 2048
-"""Characters; paths are cached, and a foreign program may publish any number of them."""
-_LONGEST_PUBLISHER = 64
-"""Characters; publishers are kept in memory too."""
-_MOST = 1 << 53
-"""No counter gets there, and every JSON parser has integers up to it."""
-_LATEST = 253_402_300_800
-"""Seconds from 1970 to the year 10000, the last that datetime has."""
-_LARGEST = 1 << 18
-"""Bytes of a notice: far more than LARGEST_INLINE bytes of value and the names of its arrays."""
+_DEEPEST = 128  # levels of a document that servers accept; path and value together have no more
+_LONGEST_PATH = 2048  # characters; paths are cached, and a foreign program may publish any number of them
+_LONGEST_PUBLISHER = 64  # characters; publishers are kept in memory too
+_MOST = 1 << 53  # no counter gets there, and every JSON parser has integers up to it
+_LATEST = 253_402_300_800  # seconds from 1970 to the year 10000, the last that datetime has
+_LARGEST = 1 << 18  # bytes of a notice: far more than LARGEST_INLINE bytes of value and the names of its arrays
 
-ANNOUNCED = object()
-"""In the place of a value that must be fetched."""
+ANNOUNCED = object()  # in the place of a value that must be fetched
 
 
 class Notice(NamedTuple):
@@ -58,8 +50,7 @@ class Notice(NamedTuple):
     early: bool = False  # whether it arrived before the server had the update
 
 
-NOTE_KEPT = 60
-"""Seconds for which the note of a last update is kept."""
+NOTE_KEPT = 60  # seconds for which the note of a last update is kept
 
 View = Callable[["Slot", int], "memoryview | None"]
 """Returns so many bytes of a slot, read-only; None if the slot cannot be read."""

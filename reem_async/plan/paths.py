@@ -20,13 +20,10 @@ from .keys import keys_of
 
 Path = tuple[str | int, ...]
 
-LONGEST_TOP_KEY = 512
-"""Bytes of UTF-8 in a top-level key and its namespace."""
+LONGEST_TOP_KEY = 512  # bytes of UTF-8 in a top-level key and its namespace
 
-_LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1
-"""Beyond, RedisJSON panics and the server exits."""
-_LONGEST_INDEX = 40
-"""Characters; Python refuses to read numbers of thousands of digits."""
+_LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1  # beyond, RedisJSON panics and the server exits
+_LONGEST_INDEX = 40  # characters; Python refuses to read numbers of thousands of digits
 
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
 # Three kinds of steps: `.key`, `[0]`, and `["any text"]`, quoted as in JSON. The dot before a key may be missing.
@@ -261,8 +258,7 @@ _SPECIAL = re.compile(r"([*?\[\]\\^])")
 _BRACKETS = re.compile(r"([\[\]\\^])")
 _PATTERN_TOKEN = re.compile(rb"\\.|.", re.DOTALL)
 _TAIL = "}:notices"
-_LONGEST_TAIL = len("{}:notices@") + 10
-"""Bytes of a channel without the key."""
+_LONGEST_TAIL = len("{}:notices@") + 10  # bytes of a channel without the key
 
 
 class Pattern(NamedTuple):

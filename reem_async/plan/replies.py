@@ -65,8 +65,7 @@ _REFUSALS: dict[str, tuple[type[Refused], str]] = {
 _NO_JSON = re.compile(r"ERR unknown command [`'\"]?JSON\.", re.IGNORECASE)
 # Characters of a server's message that an error quotes.
 _LONGEST_QUOTE = 120
-_DEEPEST = 130
-"""Levels of a reply: RedisJSON parses up to 127. Deeper ones would cause a RecursionError elsewhere."""
+_DEEPEST = 130  # levels of a reply: RedisJSON parses up to 127. Deeper ones would cause a RecursionError elsewhere.
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 

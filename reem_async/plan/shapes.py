@@ -13,8 +13,7 @@ from .placeholders import Placeholder
 
 _MOST = 10_000
 """Documents. All are forgotten at once: those in use come back with the next calls, and no order has to be kept."""
-_MOST_PLACES = 1000
-"""Places in one document with arrays, and with results of calculations."""
+_MOST_PLACES = 1000  # places in one document with arrays, and with results of calculations
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 
 

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from ..errors import BadValue
 from . import Command, Plan, Reply
 
-LARGE = 1 << 16
-"""Bytes from which other calls should not wait behind a value, in either direction."""
+LARGE = 1 << 16  # bytes from which other calls should not wait behind a value, in either direction
 
 
 class Limits(NamedTuple):
@@ -22,11 +21,9 @@ class Limits(NamedTuple):
     call: int  # bytes of all commands of a transaction
 
 
-USUAL = Limits(512 << 20, 1 << 30)
-"""The defaults of proto-max-bulk-len and client-query-buffer-limit."""
+USUAL = Limits(512 << 20, 1 << 30)  # the defaults of proto-max-bulk-len and client-query-buffer-limit
 
-_WORDS = 1 << 16
-"""Bytes of a call for its other words, and for what the server has read ahead."""
+_WORDS = 1 << 16  # bytes of a call for its other words, and for what the server has read ahead
 
 
 def has_large(commands: Sequence[Command]) -> bool:
@@ -88,11 +85,9 @@ def check_sizes(sizes: Sequence[tuple[str, int]], most: Limits) -> None:
 # sender dies in between, the key expires after a minute.
 
 
-STAGED = ":staged:"
-"""Follows the tag of a top-level key in the names of staged values."""
+STAGED = ":staged:"  # follows the tag of a top-level key in the names of staged values
 
-KEPT = 60
-"""Seconds until a staged value expires."""
+KEPT = 60  # seconds until a staged value expires
 
 
 class Staged(NamedTuple):

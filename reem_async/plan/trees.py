@@ -22,8 +22,7 @@ class _Missing:
         return "MISSING"
 
 
-MISSING: Final = _Missing()
-"""In the place of a tree or value that does not exist."""
+MISSING: Final = _Missing()  # in the place of a tree or value that does not exist
 
 _SHARED = frozenset({str, int, float, bool, type(None), bytes, np.ndarray})
 """Types of leaves that are never changed in place: arrays of a copy are read-only."""

@@ -23,8 +23,7 @@ REMEDY = (
 )
 
 
-PLAIN_VARIABLE = "REEM_SERVER_PLAIN"
-"""Set to 1, no server is started with its JSON module."""
+PLAIN_VARIABLE = "REEM_SERVER_PLAIN"  # set to 1, no server is started with its JSON module
 
 
 def find_program(*, json: bool = True) -> ServerProgram:

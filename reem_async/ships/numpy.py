@@ -44,8 +44,7 @@ _SHORT_ESCAPES = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\", "'": "'", '"': '"
 _PAIRS = {"(": ")", "[": "]", "{": "}"}
 _DEEPEST = 64  # brackets in brackets
 _SHORT = 1 << 9  # bytes of a header of which 1024 are cached; of longer ones 16, see below
-_SMALL = 1 << 12
-"""Bytes of data up to which copying them costs less than handling two pieces."""
+_SMALL = 1 << 12  # bytes of data up to which copying them costs less than handling two pieces
 
 
 class NumpyShip(BlobShip):

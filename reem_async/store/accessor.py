@@ -27,8 +27,7 @@ if TYPE_CHECKING:
 
 _NOTHING: Any = object()
 
-_TRIES = [False] * 49 + [True]
-"""Tries of a call that reads and then writes; whether one is the last."""
+_TRIES = [False] * 49 + [True]  # tries of a call that reads and then writes; whether one is the last
 
 
 def _cannot_calculate(sign: str, call: str, more: str = "") -> str:

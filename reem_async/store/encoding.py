@@ -16,8 +16,7 @@ from ..plan.paths import Path, has_index, show, suffix
 from ..plan.sizes import USUAL, check_sizes, limits, sizes_of
 from ..session import Session
 
-HUGE = 256 << 20
-"""Bytes from which the size of a value is checked exactly; a ship may need more than it says."""
+HUGE = 256 << 20  # bytes from which the size of a value is checked exactly; a ship may need more than it says
 
 Encoded = tuple[bytes, tuple[EncodedAttachment, ...]]
 

@@ -21,8 +21,7 @@ from .outage import Outage
 from .reader import DocumentReader
 from .store import KeyValueStore
 
-_Stamp = tuple[str, int]
-"""Publisher and number of an update."""
+_Stamp = tuple[str, int]  # publisher and number of an update
 
 
 class PublishTurn(Turn):

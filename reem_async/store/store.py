@@ -16,8 +16,7 @@ from .accessor import Accessor
 from .catalog import names
 from .document import DocumentWriter
 
-_MOST_TOPS = 1000
-"""Accessors of top-level keys that are cached."""
+_MOST_TOPS = 1000  # accessors of top-level keys that are cached
 
 Interface = TypeVar("Interface")
 

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from .options import Options
 
 _UNWATCH: Command = ("UNWATCH",)
-_UNAPPLIED = (Contended, NotConnected, Refused)
-"""Errors of a plan that the server did nothing for."""
+_UNAPPLIED = (Contended, NotConnected, Refused)  # errors of a plan that the server did nothing for
 
 
 class Held(Protocol):

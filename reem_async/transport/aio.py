@@ -27,8 +27,7 @@ _SPARE = 4
 _LENT = 32
 """Connections for WATCH that are lent at a time. More callers wait for one: a server has 10,000 for all its clients."""
 _PING: Command = ("PING",)
-_COURTESIES = 3
-"""How often a large value waits for calls that are under way: there may always be some."""
+_COURTESIES = 3  # how often a large value waits for calls that are under way: there may always be some
 _COMPANY, _PORTION = 0.1, 1 << 17
 """After a small call, for so many seconds, loopback TCP gets so many bytes of a large value at a time.
 

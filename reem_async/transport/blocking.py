@@ -30,10 +30,8 @@ from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallRead
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 
-_RECORD = 1 << 14
-"""Bytes in one record of TLS, at most."""
-_SLICE = 1 << 19
-"""Bytes of a large value that are sent before giving way."""
+_RECORD = 1 << 14  # bytes in one record of TLS, at most
+_SLICE = 1 << 19  # bytes of a large value that are sent before giving way
 _SMALL_SLICE = 1 << 18
 """The same once another call was seen under way: the server reads on for as long as it finds something."""
 _NAP, _NAPS = 2e-5, 16

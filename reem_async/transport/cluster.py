@@ -50,10 +50,8 @@ from .state import States
 SLOTS = 16384
 
 _EXAMPLE = "redis+cluster://user:password@host:7000,host:7001"
-_LOOK_PAUSE = 0.03
-"""Seconds for which a look at the cluster's layout is not repeated."""
-_PUBLISHING = 64
-"""How many publish at the same time, each over a connection of its own."""
+_LOOK_PAUSE = 0.03  # seconds for which a look at the cluster's layout is not repeated
+_PUBLISHING = 64  # how many publish at the same time, each over a connection of its own
 
 
 class ClusterOptions(Options):

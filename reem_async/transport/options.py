@@ -39,8 +39,7 @@ from .addresses import settings_of
 from .packing import Packer
 from .parsing import LARGEST
 
-Address = tuple[str, int]
-"""Host and port."""
+Address = tuple[str, int]  # host and port
 
 INFO_SERVER: Command = ("INFO", "server")
 """Asked once per connection. Restarts are not noticed without the right to it."""
@@ -56,8 +55,7 @@ for _codec in ("ascii", "idna", "latin-1"):
     # down, or in the middle of a fork.
     codecs.lookup(_codec)
 
-_LEAST = 1 << 20
-"""Bytes a string in a reply must be allowed: REEM itself asks for pages of names, and INFO."""
+_LEAST = 1 << 20  # bytes a string in a reply must be allowed: REEM itself asks for pages of names, and INFO
 _TLS_FILES = ("ssl_ca_certs", "ssl_certfile", "ssl_keyfile")
 
 

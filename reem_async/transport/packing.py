@@ -29,8 +29,7 @@ from ..ships.numpy import flat_buffer
 
 Piece = bytes | memoryview
 
-SLOW = 1 << 13
-"""Bytes that may take longer on a slow link than a call has: as long as they move, it is not given up."""
+SLOW = 1 << 13  # bytes that may take longer on a slow link than a call has: as long as they move, it is not given up
 
 
 def pack(commands: Sequence[Command]) -> list[Piece]:

@@ -20,25 +20,21 @@ from ..plan.replies import refusal
 NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError, TypeError, ValueError)
 """What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
 
-MORE: Any = object()
-"""What a parser says when it needs more bytes; False and None are replies."""
+MORE: Any = object()  # what a parser says when it needs more bytes; False and None are replies
 
 LARGEST = 1 << 29
 """Bytes a string in a reply may have unless a user says otherwise: a server takes no larger ones, as it comes."""
-_IN_ALL = 8
-"""How many times as much a whole reply may have: the arrays of a document come together."""
+_IN_ALL = 8  # how many times as much a whole reply may have: the arrays of a document come together
 # Bytes that are received at once, and from which a string is received in place.
 _BUFFER = 1 << 17
 _LARGE = 1 << 15
-_STEP = 1 << 24
-"""How much more memory a string may be given than has arrived of it: its length is only a claim."""
+_STEP = 1 << 24  # how much more memory a string may be given than has arrived of it: its length is only a claim
 # Levels of lists in lists, and elements of one list. No reply to REEM's commands comes near.
 _DEEPEST = 128
 _MOST_ELEMENTS = 1 << 24
 _LONG, _DIGITS = 8, b"0123456789"
 """Where a digit stands in the first line of a reply if it announces much: at least ten million of anything."""
-_MUCH = 1 << 24
-"""Bytes after which is asked, again and again, how many of them wait for the end of one string."""
+_MUCH = 1 << 24  # bytes after which is asked, again and again, how many of them wait for the end of one string
 _BULK = b"$="
 
 

@@ -39,14 +39,11 @@ from ..errors import ConnectionLost, NotConnected, TlsRefused
 from ..plan import Command, Reply, blamed
 from . import Held, Transport
 
-key_slot: Callable[[bytes], int] = redis.crc.key_slot
-"""Return the number of the slot that a key or channel belongs to."""
+key_slot: Callable[[bytes], int] = redis.crc.key_slot  # the number of the slot that a key or channel belongs to
 
-Moved = redis.exceptions.MovedError
-"""Another node has the slot."""
+Moved = redis.exceptions.MovedError  # another node has the slot
 
-Ask = redis.exceptions.AskError
-"""The slot is moving and this key is not here any more, or is nowhere: ask there."""
+Ask = redis.exceptions.AskError  # the slot is moving and this key is not here any more, or is nowhere: ask there
 
 Unapplied = (
     redis.exceptions.AskError,  # MovedError is one of them

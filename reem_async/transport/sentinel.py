@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from .aio import AsyncTransport
     from .wire import Wire
 
-_LOOK_PAUSE = 1.0
-"""Seconds between questions to the sentinels."""
+_LOOK_PAUSE = 1.0  # seconds between questions to the sentinels
 _ROLE: Command = ("ROLE",)
 _MASTERS: Command = ("SENTINEL", "MASTERS")
 _UNFIT = (b"down", b"disconnected")

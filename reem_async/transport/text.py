@@ -30,8 +30,7 @@ _AT_A_TIME = 8
 _AS_LONG = 0.9
 """Fraction of the time limit after which a failure counts as "server down" for queued calls: uploads fail early."""
 
-_MODULES = (b"ReJSON", "ReJSON", b"json", "json")
-"""What HELLO calls the modules of Redis and of Valkey."""
+_MODULES = (b"ReJSON", "ReJSON", b"json", "json")  # what HELLO calls the modules of Redis and of Valkey
 
 
 def lists_json(greeting: Any) -> bool:
@@ -47,8 +46,7 @@ def is_plain(reply: Reply) -> bool:
     return isinstance(reply, NoJsonSupport)
 
 
-Send = Callable[..., Awaitable[list[Reply]]]
-"""Sends commands that any server takes: `send(commands, bulk=...)`."""
+Send = Callable[..., Awaitable[list[Reply]]]  # sends commands that any server takes: `send(commands, bulk=...)`
 
 
 class Text:
