@@ -42,11 +42,7 @@ class Announcement:
         return ()
 
     async def share(self, path: Path) -> None:
-        """Put a large value that is about to be set into shared memory.
-
-        Raises:
-            NotConnected: The server cannot be reached; nothing was set.
-        """
+        """Put a large value that is about to be set into shared memory. Raises NotConnected; then nothing was set."""
 
     def release(self) -> None:
         """Give back a number that was not used; the change is over."""

@@ -69,16 +69,10 @@ class EncodedValue(NamedTuple):
 
 
 def encode(value: Any, place: Path, fits: Fits, name: Callable[[Path], str]) -> EncodedValue:
-    """Encode `value` for the full path `place`.
+    """Encode `value` for the full path `place`, top-level key first, which messages name, and whose depth counts.
 
-    Args:
-        value: The value.
-        place: Top-level key first; for messages, and it counts for the depth.
-        fits: Chooses ships.
-        name: Turns a path below `place` into the suffix of an attachment's key.
-
-    Raises:
-        BadType, BadValue, BadKey, TooDeep: It cannot be stored; with the path and what to do.
+    `fits` chooses ships; `name` turns a path below `place` into the suffix of an attachment's key. Raises BadType,
+    BadValue, BadKey or TooDeep, with the path and what to do.
     """
     text = plain(value, len(place) - 1)
     return EncodedValue(text) if text is not None else walk(value, place, fits, name)

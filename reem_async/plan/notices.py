@@ -144,8 +144,7 @@ def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, p
 def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
     """Return the notice in `payload`, with a value in shared memory if there is a `view`.
 
-    Raises:
-        BadData: Not a notice of REEM, or one of a version this program does not know.
+    Raises BadData for what is not a notice of REEM, or of a version this program does not know.
     """
     if len(payload) > _LARGEST:
         raise BadData(f"a notice has {len(payload)} bytes, REEM's have at most {_LARGEST}; it was not written by REEM")

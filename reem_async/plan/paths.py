@@ -190,11 +190,7 @@ def _element(token: re.Match[str]) -> str | int:
 
 
 def parse(text: str) -> Path:
-    """Return the path a user typed: `foo.bar`, `foo.tiles[2]`, `.a.b`; "." and "" are the root.
-
-    Raises:
-        BadKey: Not a path, or with a key that cannot be addressed.
-    """
+    """Return the path a user typed: `foo.bar`, `foo.tiles[2]`, `.a.b`; "." and "" are the root. Raises BadKey."""
     if not isinstance(text, str):
         raise BadType(f"a path is a str like 'foo.bar', not {shorten(text)}")
     path = parse_shown(text)

@@ -83,11 +83,7 @@ def refusal(text: str) -> Refused | None:
 
 
 def decoded(plan: Plan, replies: list[Reply]) -> Any:
-    """Return what `plan` makes of its replies: the result, or the next plan.
-
-    Raises:
-        BadData: The replies are of a shape that no server sends to these commands.
-    """
+    """Return what `plan` makes of its replies: the result, or the next plan. Raises BadData if no server sends such."""
     try:
         return plan.decode(unwrap(plan, replies))
     except NotAllowed:

@@ -321,10 +321,8 @@ def expiry(keys: Keys, milliseconds: int | None) -> Plan:
 def together(changes: Sequence[DocumentChange], cache: ShapeCache) -> Plan:
     """Plan changes of entries of one dict in one transaction, then the plans that follow from each.
 
-    All or none are applied: the server refuses one if the dict is missing, and then it refuses all.
-
-    Raises:
-        BadType: A change must be watched, and watched changes cannot share one transaction.
+    All or none are applied: the server refuses one if the dict is missing, and then it refuses all. Raises BadType if a
+    change must be watched: such changes cannot share one transaction.
     """
     for each in changes:
         if is_watched(each, cache):

@@ -101,10 +101,9 @@ class Contention:
         self._deadline = 0.0
 
     def given_up(self, commands: Sequence[Command]) -> None:
-        """Note that an attempt to apply `commands` was given up: so there are two at least, however long they take.
+        """Note that an attempt to apply `commands` was given up; raises Contended after the limit from the first on.
 
-        Raises:
-            Contended: The first one was given up longer ago than the limit.
+        So there are two attempts at least, however long they take.
         """
         now = time.monotonic()
         if not self._deadline:
@@ -134,12 +133,9 @@ def document_of(commands: Sequence[Command]) -> str:
 
 
 async def drive(transport: Transport, plan: Plan) -> Any:
-    """Run `plan` and what follows from it; return the result.
+    """Run `plan` and what follows from it; return the result. Raises Contended, see `Contention`.
 
     Suspends only where `transport` does: over a blocking transport it runs through at the first step.
-
-    Raises:
-        Contended: Others kept writing to the same top-level key; nothing was applied.
     """
     contention: Contention | None = None
     while True:

@@ -58,8 +58,7 @@ def _host_and_port(host: str) -> dict[str, Any]:
 def _check_url(url: str) -> None:
     """Refuse the parts of a server's URL that redis-py drops in silence: another server would be meant.
 
-    Raises:
-        BadValue: There is one. The message never quotes user and password.
+    Raises BadValue, whose message never quotes user and password.
     """
     parts = _split(url)
     login, _, place = parts.netloc.rpartition("@")

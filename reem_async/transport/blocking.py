@@ -126,11 +126,7 @@ class _Line:
             raise
 
     def _replies(self, reader: ReplyReader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
-        """Read `count` replies. Nothing is left over: nothing else was asked.
-
-        Raises:
-            redis.exceptions.InvalidResponse: Something is.
-        """
+        """Read `count` replies; raises InvalidResponse if anything is left over, since nothing else was asked."""
         replies: list[Reply] = []
         gets = reader.gets
         while True:

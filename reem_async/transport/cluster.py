@@ -153,11 +153,7 @@ class ClusterTransport(CompositeTransport):
         return list(self._nodes.values())
 
     async def nodes(self) -> Sequence[Transport]:
-        """Return the primaries, which together hold all keys.
-
-        Raises:
-            NotConnected: No node answers, or slots have none.
-        """
+        """Return the primaries, which together hold all keys; raises NotConnected if slots have none."""
         await self.look()
         if missing := self._owners.count(None):
             raise NotConnected(
@@ -167,11 +163,7 @@ class ClusterTransport(CompositeTransport):
         return [self._node(address) for address in self._primaries]
 
     async def owner(self, key: str | bytes, *, refresh: bool = False) -> Transport:
-        """Return the node that has `key`; `refresh` if what is known of the cluster is in doubt.
-
-        Raises:
-            NotConnected: No node answers, or none has it.
-        """
+        """Return the node that has `key`; `refresh` if what is known is in doubt. Raises NotConnected."""
         return await self.owner_of(key_slot(key if isinstance(key, bytes) else key.encode()), refresh=refresh)
 
     async def owner_of(self, slot: int, *, refresh: bool = False) -> Transport:
@@ -284,10 +276,7 @@ class ClusterTransport(CompositeTransport):
         """Send `commands` until a node has applied them all, each once; what was not in time is answered by an error.
 
         The `problem` is why they, or some of them, were not applied by the node that was `asked` already, and which
-        gave these `replies`.
-
-        Raises:
-            NotConnected: Nothing was applied in time.
+        gave these `replies`. Raises NotConnected if nothing was applied in time.
         """
         route = Route(self, slot_of(commands), asked)
         whole = commands[-1][0] == "EXEC"

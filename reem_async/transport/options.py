@@ -419,8 +419,7 @@ class ServerSocket:
     def give_up(self, way: SocketOptions, error: Exception) -> None:
         """Note that `way` could not be gone. As long as the same process is at the address, it is not tried again.
 
-        Raises:
-            The error, if it says that the server does not answer in time: it will not at its address either.
+        Raises the error if it says that the server does not answer in time: it will not at its address either.
         """
         if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
             raise error

@@ -225,11 +225,7 @@ class SentinelTransport(CompositeTransport):
         self._moved = False
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        """Send `commands` to the primary and return their replies.
-
-        Raises:
-            NotConnected: It is no primary any more; nothing was applied.
-        """
+        """Send `commands` to the primary; raises NotConnected, with nothing applied, if it is none any more."""
         now = self._current()
         return self._checked(now, await now.roundtrip(commands, bulk=bulk))
 

@@ -79,14 +79,11 @@ class Text:
     async def _after_look(
         self, lending: Any, keys: Sequence[bytes], commands: Sequence[Command], bulk: bool
     ) -> list[Reply]:
-        """Look, then change; retry if another client wrote in between. Two round trips.
+        """Look, then change; retry if another client wrote in between. Two round trips. Raises Contended.
 
         Callers of one transport go one after the other for each key, since they would only be in each other's way, and
         no more than a few at a time, since each has a connection. Cancelled, or broken off, it was applied once or not
         at all; the connection is closed.
-
-        Raises:
-            Contended: Others were first each time; nothing was applied.
         """
         # Locks by a few numbers rather than by key, which bounds the connections as well. Sorted, so that two callers
         # that need the same two locks never wait for each other.
@@ -146,8 +143,7 @@ class HeldText:
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` and return their replies; a change of what was not read before takes two round trips.
 
-        Raises:
-            Contended: Others were first each time; nothing was applied.
+        Raises Contended if others were first each time; then nothing was applied.
         """
         contention: Contention | None = None
         while True:

@@ -416,11 +416,7 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
 
 
 async def first_answer(wire: Wire, question: Command, options: Options) -> list[Reply]:
-    """Ask something over a new connection; if that does not go well, close it.
-
-    Raises:
-        NotConnected: It broke.
-    """
+    """Ask something over a new connection, which is closed if that goes wrong. Raises NotConnected if it breaks."""
     try:
         return await wire.roundtrip([question])
     except BaseException as error:
