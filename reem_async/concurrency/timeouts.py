@@ -16,7 +16,6 @@ from contextvars import ContextVar
 from ..errors import BadValue
 
 LONGEST = 1e6  # seconds that a time limit may have: eleven days, which is as good as none
-
 LOOKS = 160
 """How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
 move."""

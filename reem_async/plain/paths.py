@@ -10,7 +10,6 @@ Step = str | int | slice
 Steps = tuple[Step, ...]
 
 ALL = slice(None)  # every item of a list, every value of a dict
-
 _STEP = re.compile(r"""\["(?P<double>[^"]*)"\]|\['(?P<single>[^']*)'\]|\[(?P<from>-?\d+)(?::(?P<to>-?\d+))?\]|\[\*\]""")
 
 

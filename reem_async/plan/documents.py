@@ -25,12 +25,10 @@ from .paths import Path, shorten, show
 from .placeholders import Placeholder
 
 DEEPEST = 100  # levels of nesting a document may have; RedisJSON parses up to 127
-
 PLAIN_ARRAYS = frozenset({np.ndarray, np.memmap, np.matrix, np.recarray})
 """Array classes that hold only items. Others may have a unit or a mask, which would be lost."""
 
 _MANY = 32  # floats in a list from which converting them together is faster
-
 _NOT_BRACKETS = bytes(set(range(256)) - set(b"{}[]"))
 
 _PLAIN: dict[type, Callable[[Any], Any]] = {str: str.__str__, int: int.__index__, float: float.__float__}

@@ -41,7 +41,6 @@ def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = F
 
 
 DOCUMENT = "ReJSON-RL"  # the reply of TYPE for a JSON document
-
 _PAGE = "1000"
 
 

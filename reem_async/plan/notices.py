@@ -25,14 +25,12 @@ from .placeholders import Unreadable, find, marked
 
 VERSION = 1
 LARGEST_INLINE = 1 << 14  # bytes of value up to which the notice carries it
-
 _DEEPEST = 128  # levels of a document that servers accept; path and value together have no more
 _LONGEST_PATH = 2048  # characters; paths are cached, and a foreign program may publish any number of them
 _LONGEST_PUBLISHER = 64  # characters; publishers are kept in memory too
 _MOST = 1 << 53  # no counter gets there, and every JSON parser has integers up to it
 _LATEST = 253_402_300_800  # seconds from 1970 to the year 10000, the last that datetime has
 _LARGEST = 1 << 18  # bytes of a notice: far more than LARGEST_INLINE bytes of value and the names of its arrays
-
 ANNOUNCED = object()  # in the place of a value that must be fetched
 
 

@@ -21,10 +21,8 @@ from .keys import keys_of
 Path = tuple[str | int, ...]
 
 LONGEST_TOP_KEY = 512  # bytes of UTF-8 in a top-level key and its namespace
-
 _LOWEST_INDEX, _HIGHEST_INDEX = -(2**63), 2**63 - 1  # beyond, RedisJSON panics and the server exits
 _LONGEST_INDEX = 40  # characters; Python refuses to read numbers of thousands of digits
-
 _PLAIN = re.compile(r"[^\s.\[\]\"'\\~%\x00-\x1f]+")
 # Three kinds of steps: `.key`, `[0]`, and `["any text"]`, quoted as in JSON. The dot before a key may be missing.
 _TOKEN = re.compile(r"""\.?(?P<plain>[^.\[\]"~]+)|\[(?P<index>-?\d+)\]|\[(?P<quoted>"(?:[^"\\]|\\.)*")\]""", re.DOTALL)

@@ -22,7 +22,6 @@ class Limits(NamedTuple):
 
 
 USUAL = Limits(512 << 20, 1 << 30)  # the defaults of proto-max-bulk-len and client-query-buffer-limit
-
 _WORDS = 1 << 16  # bytes of a call for its other words, and for what the server has read ahead
 
 
@@ -86,7 +85,6 @@ def check_sizes(sizes: Sequence[tuple[str, int]], most: Limits) -> None:
 
 
 STAGED = ":staged:"  # follows the tag of a top-level key in the names of staged values
-
 KEPT = 60  # seconds until a staged value expires
 
 

@@ -23,7 +23,6 @@ class _Missing:
 
 
 MISSING: Final = _Missing()  # in the place of a tree or value that does not exist
-
 _SHARED = frozenset({str, int, float, bool, type(None), bytes, np.ndarray})
 """Types of leaves that are never changed in place: arrays of a copy are read-only."""
 

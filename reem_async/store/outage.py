@@ -43,11 +43,8 @@ logger = logging.getLogger("reem.publish")
 _POLICIES = ("raise", "drop", "newest")
 
 _PAUSES = (0.02, 0.05, 0.1, 0.2, 0.25)  # seconds between two attempts to reach the server; the last one repeats
-
 _MOST = 256 << 20  # bytes of kept values, of all keys together
-
 _OVERHEAD = 500  # bytes that a kept value needs besides its content, about
-
 _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
 """Errors of an outage; except TlsRefused, a NotConnected that does not end by waiting."""
 

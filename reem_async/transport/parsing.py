@@ -21,7 +21,6 @@ NOT_THE_PROTOCOL = (redis.exceptions.InvalidResponse, MemoryError, OverflowError
 """What parsers raise over bytes that no server sends: keys of a map that are lists, counts beyond all memory, ..."""
 
 MORE: Any = object()  # what a parser says when it needs more bytes; False and None are replies
-
 LARGEST = 1 << 29
 """Bytes a string in a reply may have unless a user says otherwise: a server takes no larger ones, as it comes."""
 _IN_ALL = 8  # how many times as much a whole reply may have: the arrays of a document come together

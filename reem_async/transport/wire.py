@@ -30,13 +30,9 @@ from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallRead
 from .text import PROBE, is_plain, lists_json, over_wire
 
 _BUSY = 2.5  # the connection is busy if three reads come within so many times `pace`
-
 _BATCHING = 0.005  # seconds of `pace` from which on updates may be read together: no listener needs them at once
-
 BUFFER = 1 << 22  # bytes of a send buffer that Linux grants with its default limits (net.ipv4.tcp_wmem)
-
 _FAREWELL = 1.0  # seconds for which what was to be sent is waited for when a connection is closed
-
 _CONFIRMATIONS = (b"subscribe", b"unsubscribe", b"psubscribe", b"punsubscribe", b"ssubscribe")
 
 
