@@ -390,22 +390,22 @@ def test_lines_of_complex_numbers_say_what_they_are(visit, kvs, key):
     expect(page.locator("#view")).to_contain_text("The magnitude of complex numbers.")
 
 
-@pytest.mark.parametrize(
-    ("value", "step", "text"),
-    [
-        (-4e17, 1e17, "-4e+17"),
-        (5_000_020, 20, "5000020"),
-        (1.795424e9, 10, "1795424000"),
-        (-123456.7, 0.1, "-123456.7"),
-        (-122.4194, 0.0001, "-122.4194"),
-        (1.23e-9, 1e-11, "1.23e-9"),
-        (1e-20, 0.1, "0"),
-        (-9.1e18, 1e16, "-9.10e+18"),
-    ],
-)
-def test_ticks_tell_themselves_from_each_other(visit, value, step, text):
+TICKS = [
+    (-4e17, 1e17, "-4e+17"),
+    (5_000_020, 20, "5000020"),
+    (1.795424e9, 10, "1795424000"),
+    (-123456.7, 0.1, "-123456.7"),
+    (-122.4194, 0.0001, "-122.4194"),
+    (1.23e-9, 1e-11, "1.23e-9"),
+    (1e-20, 0.1, "0"),
+    (-9.1e18, 1e16, "-9.10e+18"),
+]
+
+
+def test_ticks_tell_themselves_from_each_other(visit):
     page = visit.open("/")
-    assert page.evaluate(f"import('/static/plot.js').then(it => it.tickText({value!r}, {step!r}))") == text
+    for value, step, text in TICKS:
+        assert page.evaluate(f"import('/static/plot.js').then(it => it.tickText({value!r}, {step!r}))") == text
 
 
 def test_the_labels_of_an_axis_have_room(visit, kvs, key):

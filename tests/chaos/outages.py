@@ -7,7 +7,7 @@ import concurrent.futures
 import contextlib
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import numpy as np
@@ -200,76 +200,66 @@ def _judge_tokens(run: Run, victims: list[_Victims], items: list[str]) -> None:
 @row(11, "black hole: no byte, no FIN", "a call's error <= 1.1 s, subscription's loss flagged <= 3.5 s")
 def black_hole(run: Run) -> None:
     """20 of them; nobody says anything on the subscription, so only REEM itself can notice."""
-    asyncio.run(_black_hole(run))
-
-
-async def _black_hole(run: Run) -> None:
     rounds, beside = run.size((4, 5), (1, 2))
-    asyncio.get_running_loop().set_default_executor(concurrent.futures.ThreadPoolExecutor(4 * beside))  # none waits
-    victims: list[_Victims] = []
-    with PrivateServer() as server, contextlib.ExitStack() as outer:
-        direct = await _prepared(outer, server)
-        async with contextlib.AsyncExitStack() as stack:
-            kvs = reem_async.KeyValueStore(await stack.enter_async_context(reem_async.RedisInterface(server.url)))
-            proxies = [outer.enter_context(Proxy(server.port)) for _ in range(beside)]
+    with PrivateServer() as server, contextlib.ExitStack() as stack:
+        proxies = [stack.enter_context(Proxy(server.port)) for _ in range(beside)]
+        direct = reem.PublishSpace(stack.enter_context(reem.RedisInterface(server.url)))
+
+        @contextlib.asynccontextmanager
+        async def silent() -> AsyncIterator[None]:
             for proxy in proxies:
-                victims.append(_Victims(stack, proxy.url))
-                await victims[-1].begin()
-            async with background(*(it.log.follow() for it in victims)):
-                for number in range(rounds):
-                    gaps = [it.log.gaps for it in victims]
-                    for proxy in proxies:
-                        proxy.black_hole()
-                    suffering = [asyncio.ensure_future(it.suffer(3.5)) for it in victims]
-                    await asyncio.sleep(0.5)
-                    direct[TOP]["unheard"] = number
-                    await asyncio.gather(*suffering)
-                    for proxy in proxies:
-                        proxy.heal()
-                    await asyncio.gather(*(it.recover(kvs, n) for it, n in zip(victims, gaps, strict=True)))
-                    for it in victims:
-                        await it.work()
-                    tell(f"{(number + 1) * beside} black holes")
-            items = (await kvs[TOP].read())["list"]
-    _judge(run, victims, rounds * beside)
-    _judge_tokens(run, victims, items)
+                proxy.black_hole()
+            async with background(publish()):
+                yield
+            for proxy in proxies:
+                proxy.heal()
 
+        async def publish() -> None:
+            await asyncio.sleep(0.5)
+            direct[TOP]["unheard"] = asyncio.get_running_loop().time()
 
-async def _prepared(stack: contextlib.ExitStack, server: PrivateServer) -> reem.PublishSpace:
-    direct = reem.PublishSpace(stack.enter_context(contextlib.closing(reem.RedisInterface(server.url))))
-    direct[TOP] = {"list": [], "unheard": -1}
-    return direct
+        asyncio.run(_silence(run, server, [proxy.url for proxy in proxies], rounds, 3.5, silent))
 
 
 @row(12, "SIGSTOP of the server for 5 s", "as row 11; nothing applied twice after SIGCONT")
 def stopped_server(run: Run) -> None:
     """Its kernel still accepts everything; what was sent meanwhile is applied when it goes on."""
-    asyncio.run(_stopped_server(run))
+    with PrivateServer() as server:
+
+        @contextlib.asynccontextmanager
+        async def silent() -> AsyncIterator[None]:
+            server.pause()
+            try:
+                yield
+            finally:
+                server.resume()
+
+        asyncio.run(_silence(run, server, [server.url], run.size(5, 1), run.size(5.0, 4.0), silent))
 
 
-async def _stopped_server(run: Run) -> None:
-    times = run.size(5, 1)
-    with PrivateServer() as server, contextlib.ExitStack() as outer:
-        await _prepared(outer, server)
-        async with contextlib.AsyncExitStack() as stack:
-            victim = _Victims(stack, server.url)
-            await victim.begin()
-            async with background(victim.log.follow()):
-                for number in range(times):
-                    gaps = victim.log.gaps
-                    server.pause()
-                    try:
-                        await victim.suffer(run.size(5.0, 4.0))
-                    finally:
-                        server.resume()
-                    kvs = reem_async.KeyValueStore(reem_async.RedisInterface(server.url))
-                    async with kvs.interface:
-                        await victim.recover(kvs, gaps)
-                        await victim.work()
-                        items = (await kvs[TOP].read())["list"]
-                    tell(f"{number + 1} stops")
-    _judge(run, [victim], times)
-    _judge_tokens(run, [victim], items)
+async def _silence(
+    run: Run, server: PrivateServer, urls: list[str], rounds: int, seconds: float, silent: Callable[[], Any]
+) -> None:
+    """Have clients of each address call and listen while it is silent, round by round; none waits for another."""
+    asyncio.get_running_loop().set_default_executor(concurrent.futures.ThreadPoolExecutor(4 * len(urls)))
+    async with contextlib.AsyncExitStack() as stack:
+        kvs = reem_async.KeyValueStore(await stack.enter_async_context(reem_async.RedisInterface(server.url)))
+        await kvs[TOP].write({"list": [], "unheard": -1})
+        victims = [_Victims(stack, url) for url in urls]
+        for it in victims:
+            await it.begin()
+        async with background(*(it.log.follow() for it in victims)):
+            for number in range(rounds):
+                gaps = [it.log.gaps for it in victims]
+                async with silent():
+                    await asyncio.gather(*(it.suffer(seconds) for it in victims))
+                await asyncio.gather(*(it.recover(kvs, n) for it, n in zip(victims, gaps, strict=True)))
+                for it in victims:
+                    await it.work()
+                tell(f"{(number + 1) * len(urls)} times silent")
+        items = (await kvs[TOP].read())["list"]
+    _judge(run, victims, rounds * len(urls))
+    _judge_tokens(run, victims, items)
 
 
 # --- 20: resets without end ------------------------------------------------------------------------
