@@ -58,7 +58,7 @@ def _record(url: str, seed: int, seconds: float, folder: Path) -> tuple[str, lis
     try:
         while any(writer.poll() is None for writer in writers):
             memory.append(_megabytes(recorder.pid))
-            time.sleep(1.0)
+            time.sleep(min(1.0, seconds / 10))
     finally:
         for writer in writers:
             writer.kill()
