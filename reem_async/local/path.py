@@ -42,13 +42,9 @@ _KEYS = 1000
 
 
 class LocalPath:
-    """The shared memory of one interface.
+    """The shared memory of one interface, `memory` bytes at most. Raises BadValue.
 
-    Args:
-        mode: "auto", "off", or "early": subscribers on this host are notified before the server has the update.
-
-    Raises:
-        BadValue: Another mode, or no number of bytes.
+    If `mode` is "early", subscribers on this host are notified before the server has the update.
     """
 
     def __init__(self, mode: Any = "auto", memory: Any = MEMORY) -> None:
@@ -103,12 +99,9 @@ class LocalPath:
         return self._audiences.get(keys.channel, (0, 0.0))[0] > 0
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:
-        """Copy an update into shared memory; None if there is no room for it now, or memory is not to be had.
+        """Copy an update of a key into shared memory; None if there is no room for it now, or memory is not to be had.
 
-        Args:
-            keys: Of the top-level key. Not called twice at a time for the same.
-            pieces: Flat buffers of bytes.
-            sizes: Of the parts that they make up.
+        It is not called twice at a time for the same key. See `Segment.put`.
         """
         try:
             segment = self._segment(keys.channel, starts(sizes)[-1])

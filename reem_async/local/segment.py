@@ -114,13 +114,7 @@ class _Writing:
 
 
 class Segment:
-    """The shared memory of one publisher and top-level key.
-
-    Args:
-        room: Bytes that a slot has to hold.
-
-    Raises:
-        OSError: There is no memory, or no descriptor, to be had.
+    """The shared memory of one publisher and top-level key. Raises OSError if there is no memory, or no descriptor.
 
     Dropping it frees the memory; mapped slots stay valid.
     """

@@ -36,14 +36,7 @@ def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callabl
     """Return what calls `function` with data and path by name, where its signature has these names, else in this order.
 
     REEM 0.1 gave both by name, the manual says that they come first: so a function may name them in any order, take
-    them as `**kwargs`, or call them what it likes.
-
-    Args:
-        function: The callback.
-        kwargs: What each call gives besides.
-
-    Raises:
-        BadType: It cannot be called in any of these ways.
+    them as `**kwargs`, or call them what it likes. Raises BadType if it cannot be called so, with `kwargs` besides.
     """
     try:
         signature = inspect.signature(function)
@@ -90,9 +83,7 @@ class Caller:
     def call(self, update: Update, dropped: int) -> Any:
         """Call the function, unless the update is only the value that was there already; what it raises is logged.
 
-        Args:
-            update: What to tell.
-            dropped: How many updates were skipped until now; if they are more than at the last call, that is logged.
+        So is the number of updates that were `dropped` until now, if it has grown.
         """
         # Before the call, so that the log has the loss ahead of what it may cause.
         if dropped > self._dropped:

@@ -103,11 +103,9 @@ class Division(Generic[U]):
         self.phase = Phase.IN_ORDER if in_order else Phase.ASIDE
 
     def answered(self, note: Reply, *, fence: bool = False) -> bool:
-        """Return whether all that is in what was read has been heard of; if not, a fence must pass first.
+        """Return whether all that is in what was read, by its note, has been heard of; if not, a fence must pass first.
 
-        Args:
-            note: The server's note of the last update that is in it; none if nothing was published of late.
-            fence: There must be one anyway, if what was read is not in order.
+        It must pass anyway if what was read is not in order, and `fence` is set.
         """
         unheard = isinstance(note, bytes) and not self.gaps.has(note)
         if self.phase is Phase.ASIDE and (fence or unheard):

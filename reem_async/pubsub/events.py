@@ -166,13 +166,9 @@ class EventMaker:
         self._outputs.append(Updated(notice, data, value, missed))
 
     def snapshot(self, before: Any, tree: Any, covered: Sequence[Heard[Notice]], *, stored: bool) -> None:
-        """Tell of a snapshot, or of the updates that it has and of what is only stored.
+        """Report the copy from now on, or the updates that it has (`covered`) and what is only stored.
 
-        Args:
-            before: The copy until now.
-            tree: The copy from now on.
-            covered: The updates that it has.
-            stored: It is known to differ from what was published only in what is stored.
+        If `stored`, it is known to differ from what was published only in what is stored.
         """
         report, self.report = self.report, Report.UPDATES
         if report is Report.UPDATES:

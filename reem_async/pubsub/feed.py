@@ -85,9 +85,7 @@ class HeldAttachments:
     def change(self, key: str | None, *, covered: bool) -> bool:
         """Forget what was changed; return whether this copy has it, or reads it.
 
-        Args:
-            key: Its name on the server, the document's or an attachment's; None for every key.
-            covered: What is being read has the change.
+        The key is a document's or an attachment's, None for every key. If `covered`, what is being read has the change.
         """
         if key is None:
             self.values.clear()
@@ -128,23 +126,15 @@ class HeldAttachments:
 
 
 class KeyFeed(Generic[U]):
-    """The updates of one top-level key and the read that is under way.
-
-    Args:
-        keys: The key's names.
-        division: Which updates are in what is read; a new one if not given.
-
-    Attributes:
-        tracked: The server reports when what is read is changed.
-        dirty: Something was changed that no read which was asked for may have.
-    """
+    """The updates of one top-level key and the read that is under way; see the module."""
 
     def __init__(self, keys: Keys, division: Division[U] | None = None, *, aside: bool = False) -> None:
         self._aside = aside
         self.division: Division[U] = division or Division(GapDetector())
         self.number = 0  # Of the last read. Answers to others are too late.
         self.reads_all = True  # the read that is under way has all that is followed of the key
-        self.tracked = self.dirty = False
+        self.tracked = False  # the server reports when what is read is changed
+        self.dirty = False  # something was changed that no read which was asked for may have
         self.attachments = HeldAttachments(keys)  # those that need not be read again
         self._plan: Plan | None = None  # on its way
         self._outcome: list[Reply] = []  # of the plan, while its fence is on its way

@@ -74,16 +74,9 @@ class Numbers:
 class GapDetector:
     """Counts the updates of each publisher of one top-level key, and says how many were lost before each.
 
-    The server keeps a note of the last update of each top-level key, `publisher number`. Asked for on
-    the connection that notices come on, it must have been heard of when the answer is here.
-
-    A number of lost updates is 0 if none were, and None if unknown.
-
-    What no numbers show: a loss before the first update that is heard of a publisher. It might as well have been
-    published before following began.
-
-    Args:
-        recent: How many updates are known again if they come twice; 120 bytes each.
+    The server keeps a note of the last update of each top-level key, `publisher number`. Asked for on the connection
+    that notices come on, it must have been heard of when the answer is here. If it is unknown how many were lost, that
+    is None. No number shows a loss before the first update that is heard of a publisher.
     """
 
     def __init__(self, recent: int = _RECENT) -> None:

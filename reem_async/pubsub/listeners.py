@@ -59,11 +59,7 @@ def contained(method: Callable[Concatenate[Any, Arguments], None]) -> Callable[C
 
 
 class Listener:
-    """What is notified of updates. Its methods do nothing unless a listener needs them.
-
-    Args:
-        queues: What is closed when it is followed no more.
-    """
+    """What is notified of updates. Its methods do nothing unless a listener needs them."""
 
     def __init__(self, topic: Topic, max_batch_delay: float = 0.0, queues: Iterable[BoundedQueue] = ()) -> None:
         self.topic = topic
@@ -159,11 +155,7 @@ def is_message(message: list[Any]) -> bool:
 
 
 class Inbox:
-    """Tells each listener what is pushed for him.
-
-    Args:
-        local: How values in the memory of publishers of the same host are looked at.
-    """
+    """Tells each listener what is pushed for him."""
 
     def __init__(
         self,

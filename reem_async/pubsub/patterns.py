@@ -18,12 +18,7 @@ Item = TypeVar("Item")
 
 
 class PatternStream(Stream[Item]):
-    """Subscribes to the channels of all keys that some patterns name.
-
-    Attributes:
-        patterns: What it follows; all keys if none was given.
-        tops: Globs of the top-level keys that these name.
-    """
+    """Subscribes to the channels of all keys that some patterns name."""
 
     def __init__(self, session: Session, patterns: Sequence[Pattern], policy: Policy) -> None:
         super().__init__(policy)

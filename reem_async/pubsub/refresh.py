@@ -11,17 +11,11 @@ Owner = TypeVar("Owner")
 
 
 class Pace(NamedTuple):
-    """How soon a change is read that no notice explains.
+    """How soon a change is read that no notice explains; in seconds."""
 
-    Attributes:
-        quickest: Seconds until it is read where notices come too, after a read that found something.
-        slowest: The same, at most: each read that finds nothing doubles the time.
-        notice_delay: Seconds in which the notice of a change may come behind the report of it.
-    """
-
-    quickest: float
-    slowest: float
-    notice_delay: float = 0.0
+    quickest: float  # until it is read where notices come too, after a read that found something
+    slowest: float  # the same, at most: each read that finds nothing doubles the time
+    notice_delay: float = 0.0  # in which the notice of a change may come behind the report of it
 
 
 LIVE = Pace(0.001, 0.02)
@@ -37,19 +31,11 @@ class RefreshTimer(Generic[Owner]):
 
     A published update is a change too, which its notice explains. So most looks at what is published find nothing:
     where a notice has come with the change the look waits, after each look that found nothing twice as long.
-
-    Args:
-        owner: Whose looks they are; held weakly, since a follower ends by being dropped.
-        look: Called with the owner when a look is due.
-
-    Attributes:
-        heard: Counts the notices; the owner adds them.
-        earliest: When the next look may be at the earliest, on the loop's clock.
     """
 
     def __init__(self, owner: Owner, look: Callable[[Owner], None], pace: Pace) -> None:
-        self.heard = 0
-        self.earliest = 0.0
+        self.heard = 0  # counts the notices; the owner adds them
+        self.earliest = 0.0  # when the next look may be, on the loop's clock
         # Not a WeakMethod, which runs some Python when its owner goes: the exception of a signal handler in it would be
         # lost.
         self._owner, self._function = weakref.ref(owner), look

@@ -220,8 +220,7 @@ class Replica:
     def changed(self, key: str | None) -> None:
         """A key was changed after it had been read over this connection: told once, in order with notices.
 
-        Args:
-            key: Its name on the server, the document's or an attachment's; None for every key.
+        It is the document's or an attachment's, None for every key.
         """
         feed = self._feed
         was_dirty = feed.dirty

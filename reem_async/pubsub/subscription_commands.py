@@ -94,11 +94,7 @@ class Invalidations:
         self._warned = False
 
     async def turn_on(self, wire: Wire) -> None:
-        """Have the server tell of changes of what is read over a connection; at most one round trip.
-
-        Raises:
-            ServerNotReady: It answers no client now; to be tried again.
-        """
+        """Have the server tell of changes of what is read over a connection; at most one round trip."""
         if wire.tracked is not None:
             return
         (reply,) = await wire.roundtrip([_TRACK])

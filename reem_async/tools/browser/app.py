@@ -87,13 +87,8 @@ class Guard:
     """Wraps an ASGI application; refuses before anything is read or done.
 
     A page of another site can make a browser send requests here. With a name of its own that leads to
-    this address (DNS rebinding) it could read the answers too: hence the check of the Host header.
-
-    Args:
-        app: What is guarded.
-        hosts: The names that a Host header may have.
-        addresses: Any IP address may be in the Host header as well: no other site can have one as its name.
-        token: What the first URL must carry and a cookie thereafter; None for no token.
+    this address (DNS rebinding) it could read the answers too: hence the check of the Host header. No other site can
+    have an IP address as its name. The first URL must carry the token, and a cookie thereafter; None for no token.
     """
 
     def __init__(self, app: ASGIApp, hosts: Collection[str], addresses: bool, token: str | None) -> None:
@@ -188,12 +183,7 @@ _GRACE_SECONDS = 2
 
 
 class PageServer(uvicorn.Server):
-    """Answers requests on a bound socket.
-
-    Args:
-        app: What `create_app` returned.
-        sock: What `listen` returned; closed at the end.
-    """
+    """Answers requests on a bound socket: what `listen` returned, closed at the end."""
 
     def __init__(self, app: Starlette, sock: socket.socket) -> None:
         config = uvicorn.Config(

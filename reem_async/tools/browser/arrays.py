@@ -156,17 +156,10 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
 
 def file_of(value: Any, path: Path, kind: str, chosen: str | None) -> tuple[bytes, str]:
-    """Return a value as a file, and its media type.
+    """Return a value as a file of one of the `FORMATS`, and its media type.
 
-    Args:
-        value: The value, arrays included.
-        path: Where it is.
-        kind: One of `FORMATS`.
-        chosen: The part of an array that is wanted, such as "0,:,:"; None for what a view shows first.
-
-    Raises:
-        BadType: The value cannot be such a file.
-        BadValue: There is no such format.
+    Of an array, the part that is `chosen`, such as "0,:,:"; if that is None, what a view shows first. Raises BadType
+    for a value that cannot be such a file, BadValue for another format.
     """
     if kind not in FORMATS:
         raise BadValue(f"format={kind[:20]!r} is none of {', '.join(FORMATS)}")

@@ -239,13 +239,8 @@ class History:
     def difference(self, name: str, tree: Any, text: Text | None, when: float) -> Path | None:
         """Return the deepest place with all that differs from what the changes led to, None if nothing does.
 
-        Of a long document nothing is known at first: it differs from when on it was `remember`ed.
-
-        Args:
-            name: The key.
-            tree: What is there; MISSING if there is nothing.
-            text: The text it was made of; None if there is none, or it is newer than that.
-            when: The present.
+        Of a long document nothing is known at first: it differs from when on it was `remember`ed. The tree was made of
+        the text, which is None if there is none, or if the tree is newer.
         """
         line = self._lines.get(name)
         if line is None:

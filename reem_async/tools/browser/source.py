@@ -271,11 +271,7 @@ _SHORTEST_RATE = 1.0
 def rate_span(at: float, start: float, end: float, over: float = _RATE_SECONDS) -> tuple[float, float] | None:
     """Return the span in which updates are counted for the rate at an instant; None if too little is known.
 
-    Args:
-        at: The instant.
-        start: From when on the past is known.
-        end: Until when.
-        over: How long the span is where it can be.
+    The past is known from `start` to `end`. The span is `over` seconds long where it can be.
     """
     since = max(at - over, start)
     until = max(at, since + min(over, _SHORTEST_RATE))

@@ -152,13 +152,8 @@ def weight(tree: Any) -> int:
 def differing(paths: Iterable[Path], before: Callable[[str], Any], after: Callable[[str], Any], most: int) -> set[Path]:
     """Return which paths at and below those that were published have another value, at most so many.
 
-    An array whose items are not known at both instants counts as changed, since it was published.
-
-    Args:
-        paths: What was published between two instants.
-        before: Returns the tree of a top-level key at the first instant.
-        after: The same for the second.
-        most: How many paths are returned at most.
+    An array whose items are not known at both instants counts as changed, since it was published. `before` and `after`
+    return the tree of a top-level key at one instant and at the other.
     """
     trees: dict[str, tuple[Any, Any]] = {}
     found: set[Path] = set()
