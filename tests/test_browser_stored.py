@@ -151,6 +151,22 @@ async def test_an_array_that_is_stored_right_behind_a_published_one_is_seen(
         await seen(source, np.full(size, 2), key(), "new")
 
 
+async def test_of_a_key_only_the_arrays_that_changed_are_read_again(server_url, key, akvs, nobody_looks):
+    """The others once, when the key is first seen to change: the slider has pictures of them, too."""
+    await akvs[key()].write({"n": 0, "a": np.zeros(5), "b": np.zeros(6)})
+    async with past_of(server_url, key()) as source:
+        assert not list(source.history.frames.concerning((key(),)))
+        for number in range(1, 4):
+            await akvs[key()]["a"].write(np.full(5, float(number)))
+            await akvs[key()]["n"].write(number)
+            await seen(source, np.full(5, float(number)), key(), "a")
+            await seen(source, number, key(), "n")
+        await seen(source, np.zeros(6), key(), "b")
+        await told(source, key())
+        assert len(list(source.history.frames.concerning((key(), "a")))) >= 3
+        assert len(list(source.history.frames.concerning((key(), "b")))) == 1
+
+
 async def test_what_is_stored_anew_as_it_was_is_no_change(server_url, key, akvs, nobody_looks):
     await akvs[key()].write({"array": np.zeros(5)})
     async with past_of(server_url, key()) as source:

@@ -37,45 +37,30 @@ async def _ask(session: Session, commands: Sequence[Command]) -> list[Reply]:
 async def peek(session: Session, paths: Sequence[Path]) -> list[Node | None]:
     """Return the node at each path, None where nothing is. Three round trips at most."""
     nodes: list[Node | None] = [None] * len(paths)
-    # Round trips: types and lengths of texts; then lengths of containers and values; then items of short lists.
-    where = {index: _place(session, path) for index, path in enumerate(paths) if all(map(is_addressable, path[1:]))}
-    reach = list(where)
-    for index in set(range(len(paths))) - set(reach):
-        nodes[index] = Node(paths[index], "unreachable", "its key cannot be addressed; read the dict that holds it")
-    replies = await _ask(
-        session, [(command, *where[index]) for index in reach for command in ("JSON.TYPE", "JSON.STRLEN")]
-    )
+    where: dict[int, tuple[str, str]] = {}
+    for index, path in enumerate(paths):
+        if all(map(is_addressable, path[1:])):
+            where[index] = _place(session, path)
+        else:
+            nodes[index] = Node(path, "unreachable", "its key cannot be addressed; read the dict that holds it")
+    # First the types, and the lengths of texts, which are 0 for all else. A long text is not fetched.
+    replies = await _ask(session, [(name, *where[index]) for index in where for name in ("JSON.TYPE", "JSON.STRLEN")])
     kinds: dict[int, str] = {}
-    texts: dict[int, int] = {}
-    for number, index in enumerate(reach):
-        kind = _kind(replies[2 * number])
-        if kind is not None:
-            kinds[index] = kind
-            texts[index] = _number(replies[2 * number + 1])
-    await _fill(session, paths, where, kinds, texts, nodes)
-    return nodes
-
-
-async def _fill(
-    session: Session,
-    paths: Sequence[Path],
-    where: Mapping[int, tuple[str, str]],
-    kinds: dict[int, str],
-    texts: dict[int, int],
-    nodes: list[Node | None],
-) -> None:
-    # A long text is described by its length and not fetched; texts[index] is 0 for all other types.
-    asked = [(index, kind) for index, kind in kinds.items() if texts[index] <= _LONGEST]
-    replies = await _ask(session, [_question(kind)(*where[index]) for index, kind in asked])
-    for (index, kind), reply in zip(asked, replies, strict=True):
-        path = paths[index]
+    for index, kind, length in zip(where, replies[::2], replies[1::2], strict=True):
+        name, size = None if isinstance(kind, Exception) else type_name(kind), _number(length)
+        if name is not None and size <= _LONGEST:
+            kinds[index] = name
+        elif name is not None:
+            nodes[index] = Node(paths[index], "str", f"{size} bytes of text", size)
+    # Then the lengths of containers, and the values of all else.
+    replies = await _ask(session, [_question(kind)(*where[index]) for index, kind in kinds.items()])
+    for (index, kind), reply in zip(kinds.items(), replies, strict=True):
         if kind in _CONTAINERS:
-            nodes[index] = Node(path, _CONTAINERS[kind], "", None, count_in(reply) or 0)
+            nodes[index] = Node(paths[index], _CONTAINERS[kind], "", None, count_in(reply) or 0)
         elif isinstance(reply, bytes | bytearray):
-            nodes[index] = _scalar(path, bytes(reply))
-    for index in kinds.keys() - dict(asked).keys():
-        nodes[index] = Node(paths[index], "str", f"{texts[index]} bytes of text", texts[index])
+            nodes[index] = _scalar(paths[index], bytes(reply))
     await _preview(session, where, nodes)
+    return nodes
 
 
 def _question(kind: str) -> Callable[[str, str], Command]:
@@ -131,10 +116,6 @@ async def keys_at(session: Session, path: Path) -> list[str] | int | None:
 
 def _place(session: Session, path: Path) -> tuple[str, str]:
     return session.keys(path[0]).document, to_jsonpath(path[1:])
-
-
-def _kind(reply: Reply) -> str | None:
-    return None if isinstance(reply, Exception) else type_name(reply)
 
 
 def _number(reply: Any) -> int:

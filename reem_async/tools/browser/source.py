@@ -89,29 +89,17 @@ def shown_text(text: str, most: int = LONGEST_TEXT) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Node:
-    """What is at one path, without what is below.
+    """What is at one path, without what is below."""
 
-    Attributes:
-        path: Where, top-level key first.
-        kind: "dict", "list", "str", "int", "float", "bool", "NoneType", or the label of a ship.
-        text: What to show of it: the value, shortened, or the summary of an array.
-        size: Bytes; None for dicts and lists.
-        count: How many items a dict or list has; None for anything else.
-        value: A number, bool or None as it is; else None.
-        time: When it was last seen to change, in seconds since 1970; None if that is not known.
-        rate: Updates per second of late; None if that is not known.
-        shared: What is published there goes through shared memory, too, to programs on the publisher's host.
-    """
-
-    path: Path
-    kind: str
-    text: str = ""
-    size: int | None = None
-    count: int | None = None
-    value: Any = None
-    time: float | None = None
-    rate: float | None = None
-    shared: bool = False
+    path: Path  # where, top-level key first
+    kind: str  # "dict", "list", "str", "int", "float", "bool", "NoneType", or the label of a ship
+    text: str = ""  # what to show of it: the value, shortened, or the summary of an array
+    size: int | None = None  # bytes; None for dicts and lists
+    count: int | None = None  # how many items a dict or list has; None for anything else
+    value: Any = None  # a number, bool or None as it is; else None
+    time: float | None = None  # when it was last seen to change, in seconds since 1970; None if that is not known
+    rate: float | None = None  # updates per second of late; None if that is not known
+    shared: bool = False  # what is published there goes through shared memory, too, to programs on the publisher's host
 
     def stamped(self, when: float | None, rate: float | None, *, shared: bool = False) -> Node:
         return replace(self, time=when, rate=rate, shared=shared)
@@ -189,19 +177,12 @@ class NotKept(ReemError):
 
 
 class Status(NamedTuple):
-    """How things are with a source.
+    """How things are with a source."""
 
-    Attributes:
-        start: From when on its past can be shown, in seconds since 1970.
-        end: The newest instant.
-        lost: Why nothing can be read at the moment; empty if all is well.
-        note: What else is to be said of the past that is shown; usually empty.
-    """
-
-    start: float
-    end: float
-    lost: str = ""
-    note: str = ""
+    start: float  # from when on its past can be shown, in seconds since 1970
+    end: float  # the newest instant
+    lost: str = ""  # why nothing can be read at the moment; empty if all is well
+    note: str = ""  # what else is to be said of the past that is shown; usually empty
 
 
 class Sample(NamedTuple):
