@@ -165,6 +165,7 @@ async def test_of_a_key_only_the_arrays_that_changed_are_read_again(server_url, 
         await told(source, key())
         assert len(list(source.history.frames.concerning((key(), "a")))) >= 3
         assert len(list(source.history.frames.concerning((key(), "b")))) == 1
+        assert source.history.times((key(), "b")) == [], "it did not change"
 
 
 async def test_what_is_stored_anew_as_it_was_is_no_change(server_url, key, akvs, nobody_looks):

@@ -192,7 +192,7 @@ class Follower(Listener):
         return self._replica.is_current and self._replica.at() is MISSING
 
     def at(self, inner: Path = ()) -> Any:
-        """Return what is at `inner`, or MISSING; not to be changed. Any thread may; raises Stale if an exception has ended it."""
+        """Return what is at `inner`, or MISSING; not to be changed. Any thread may; raises Stale after an exception."""
         if self.failure is not None:
             where = show((self.keys.name, *self._replica.path))
             raise Stale(

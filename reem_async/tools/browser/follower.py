@@ -101,6 +101,7 @@ class FollowedKey:
         # The arrays that were changed and not read yet, by label and suffix
         self.owed: dict[Attachment, Unfetched] = {}
         self._answers: set[Attachment] = set()  # of these, the buffer has already that they were changed
+        self._unchanged: set[Attachment] = set()  # these were there when following began, and were not changed since
         self.busy = False
 
     def _look(self) -> None:
@@ -252,6 +253,10 @@ class FollowedKey:
         first, owed, answers = self.name in self._follower.unread, self.owed, self._answers
         places = {id(it): place for place, it in {**self.feed.attachments.values, **found}.items()}
         before = self._history.tree((self.name,), when)
+        if first:
+            self._unchanged.update(found)
+        else:
+            self._unchanged.difference_update(place for place, it in found.items() if isinstance(it, Unfetched))
         self.owed = {}
         for path, it in walk(tree, (self.name,)):
             place, is_unreadable = places.get(id(it)), type(it) is Unreadable
@@ -266,6 +271,8 @@ class FollowedKey:
                     self.owed[place], is_news = it, False
             if is_noted and place is not None:
                 answers.add(place)
+            elif is_news and place in self._unchanged:
+                self._history.frames.add(path, it, when)
             elif is_news:
                 self._history.add_read(path, it, when, answer=place in answers)
         answers.intersection_update(self.owed)

@@ -344,9 +344,11 @@ class History:
         frame = self.frames.before(path, at, line.moved(path, at))
         if frame is None:
             return Kept(kept.value.described if isinstance(kept.value, Frame) else kept.value, kept.late)
+        newest = line.newest(path, at)
+        if frame is kept.value or newest < frame.time:
+            return Kept(frame, kept.late)
         # A millisecond at least: the picture is older than the last change, if only just.
-        late = kept.late if frame is kept.value else max(line.newest(path, at) - frame.time, 1e-3)
-        return Kept(frame, late)
+        return Kept(frame, max(newest - frame.time, 1e-3))
 
     def last(self, paths: Sequence[Path], at: float) -> dict[Path, float]:
         """Return when each path last changed before `at`, as far as that is known."""
