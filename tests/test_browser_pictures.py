@@ -95,6 +95,15 @@ def test_pictures_are_thinned_evenly_as_room_runs_short(seconds):
     assert gaps.max() <= 4 * np.median(gaps)
 
 
+def test_a_frame_whose_content_is_gone_comes_back_as_no_picture():
+    """An array that did not change stands in each tree that is read."""
+    frames, frame = Frames(10.0), framed(np.zeros((4, 4)))
+    for when in (1.0, 2.0):
+        frames.add(("a",), frame, when)
+        frames.thin(0, when)
+        assert (list(frames.concerning(("a",))), frames.bytes) == ([], 0)
+
+
 def test_the_last_frame_is_shown_with_its_age_where_the_newest_is_not_kept():
     history = History(1000.0, 1 << 24)
     history.start = 0.0

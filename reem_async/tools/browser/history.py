@@ -65,7 +65,7 @@ class Frames:
     def add(self, path: Path, tree: Any, when: float) -> None:
         """Note the frames in a tree, which is at a path since an instant that is after all others."""
         for where, it in walk(tree, path):
-            if isinstance(it, Frame):
+            if isinstance(it, Frame) and it.size:
                 line = self._lines.setdefault(where, [])
                 if line and line[-1] is it:
                     continue
