@@ -161,6 +161,15 @@ def test_a_document_that_differs_from_what_was_heard_is_noticed_once(history):
     assert differs(history, "j", b'{"a":1}', 9.0), "the text that was there before the published change"
 
 
+def test_what_is_beside_a_change_is_as_it_was(history):
+    history.begin("k", b'{"a": 1, "b": 2, "l": [1, 2]}')
+    history.add(("k", "a"), 3, 8, 2.0)
+    assert [history.unchanged(path, 1.0) for path in (("k",), ("k", "a"), ("k", "b"))] == [False, False, True]
+    history.add(("k", "l", 0), MISSING, 8, 3.0)
+    assert not history.unchanged(("k", "l", 1), 2.5)
+    assert history.unchanged(("k",), 3.0)
+
+
 def test_steps_and_series(history):
     history.begin("k", b'{"x": 0, "q": [1, 2]}')
     for when, path, value in ((1, "x", 1.5), (2, "q", [3, 4]), (3, "x", 2.5), (4, "x", "text"), (5, "x", 3)):

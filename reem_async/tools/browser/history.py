@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import heapq
+import math
 import time
 from bisect import bisect_right
 from collections import Counter, deque
@@ -317,10 +318,12 @@ class History:
     def knows(self, name: str) -> bool:
         return name in self._lines
 
-    def unchanged(self, name: str, since: float) -> bool:
-        """Return whether a key is known not to have changed since an instant: it is as it is now."""
-        line = self._lines.get(name)
-        return line is None or line.upto(since) == len(line.changes)
+    def unchanged(self, path: Path, since: float) -> bool:
+        """Return whether nothing is known to have changed at a path since an instant: it is as it is now."""
+        line, now = self._lines.get(str(path[0])), math.inf
+        if line is None or line.upto(since) == len(line.changes):
+            return True
+        return len(path) > 1 and max(line.newest(path, now), line.moved(path, now)) <= since
 
     def existed(self, name: str, at: float) -> bool | None:
         """Return whether there was such a key, None if that is not known."""

@@ -107,7 +107,7 @@ class LiveSource:
         """Return what is at each path: three round trips at most."""
         when = self.history.clock.now() if at is None else at
         # What has not changed since an instant is still there: it is asked of the server, and costs no memory here.
-        now = [path for path in paths if at is None or self.history.unchanged(str(path[0]), at)]
+        now = [path for path in paths if at is None or self.history.unchanged(path[:1], at)]
         try:
             found = dict(zip(now, await self._peek(now), strict=True))
         except _AWAY:
@@ -155,7 +155,7 @@ class LiveSource:
         return sorted(present | {name for name, existed in known.items() if existed})
 
     async def _keys(self, path: Path, at: float | None) -> Sequence[str | int]:
-        if at is None or self.history.unchanged(str(path[0]), at):
+        if at is None or self.history.unchanged(path[:1], at):
             try:
                 keys = await keys_at(self.interface.session, path)
                 if keys is None:
@@ -177,7 +177,7 @@ class LiveSource:
         """Return the value at a path, arrays included; readings of the same moment are shared."""
         name = str(path[0])
         # Of arrays that the server does not tell of, the present does not speak for the past.
-        if at is None or (self.history.unchanged(name, at) and self._follower.is_settled(name)):
+        if at is None or (self.history.unchanged(path, at) and self._follower.is_settled(name)):
             try:
                 return Sample(await self._read(path), 0.0, self._age(path, at))
             except _AWAY:
