@@ -8,6 +8,7 @@ import contextlib
 import math
 import weakref
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple, NoReturn
 
 from ..concurrency.streams import Following
@@ -84,15 +85,17 @@ class Mirror(Following):
         self.channel = show((keys.name, *path))
         self.max_age = max_age
         self._full_path: Path = (keys.name, *path)
-        self._link = Link(
-            session,
+        make = partial(
+            Follower,
             keys,
             path,
-            [],
+            session.ships,
+            session.cache,
             stored=True,
             largest=checked_largest(largest),
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
         )
+        self._link = Link(session, make, [])
         self._link.on_state = _waking(self)
         self._waiting: set[Wait] = set()
 

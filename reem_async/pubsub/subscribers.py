@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import weakref
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NoReturn
 
 from ..concurrency.queues import BoundedQueue, Last, Newest, PlaceQueue, Policy, chosen
@@ -29,23 +29,11 @@ class Link:
     """A follower and the manager it is at: made by the first `follow`, and again after a fork or in another loop."""
 
     def __init__(
-        self,
-        session: Session,
-        keys: Keys,
-        path: Path,
-        queues: list[BoundedQueue],
-        *,
-        stored: bool,
-        largest: float = math.inf,
-        heartbeat: float = math.inf,
+        self, session: Session, make: Callable[[SubscriptionManager], Follower], queues: list[BoundedQueue]
     ) -> None:
         self._session = session
-        self._keys = keys
-        self._path = path
+        self._make = make
         self._queues = queues
-        self._stored = stored
-        self._largest = largest
-        self._heartbeat = heartbeat
         self.on_state: Callable[[Any], None] = unnoticed  # called with each state of the copy; see `Follower`
         self._manager: SubscriptionManager | None = None
         self._following: asyncio.Lock | None = None
@@ -76,17 +64,7 @@ class Link:
         # Two callers that begin at once share one follower.
         async with self._following:
             if self.follower is None:
-                session = self._session
-                self.follower = Follower(
-                    self._keys,
-                    self._path,
-                    session.ships,
-                    session.cache,
-                    manager,
-                    stored=self._stored,
-                    largest=self._largest,
-                    heartbeat=self._heartbeat,
-                )
+                self.follower = self._make(manager)
                 self.follower.on_state = self.on_state
                 self.follower.queues = self._queues
                 try:
@@ -134,7 +112,8 @@ class Watch(Stream[Update]):
         stored: bool = True,
     ) -> None:
         super().__init__(policy, queue)
-        self._link = Link(session, keys, path, [self.queue], stored=stored)
+        make = partial(Follower, keys, path, session.ships, session.cache, stored=stored)
+        self._link = Link(session, make, [self.queue])
 
     @property
     def _following(self) -> bool:
@@ -177,7 +156,9 @@ class SilentSubscriber(Following):
         self.full_path: Path = (self._keys.name, *rest)
         self.policy = chosen(policy, Newest())
         self.stored = stored
-        self._link = Link(self.interface.session, self._keys, self._path, [], stored=stored)
+        session = self.interface.session
+        make = partial(Follower, self._keys, self._path, session.ships, session.cache, stored=stored)
+        self._link = Link(session, make, [])
         # By identity, held weakly: a loop that was left by `break` drops its own. Any thread may add one meanwhile.
         self._watches: weakref.WeakValueDictionary[int, Watch] = weakref.WeakValueDictionary()
 
