@@ -98,9 +98,11 @@ class Guard:
         self._token = token
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        # There are no websockets here.
-        if scope["type"] != "http":
-            await (self._app(scope, receive, send) if scope["type"] == "lifespan" else _close(send))
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        if scope["type"] != "http":  # there are no websockets here
+            await send({"type": "websocket.close", "code": 1008})
             return
 
         async def send_safely(message: Message) -> None:
@@ -169,10 +171,6 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-async def _close(send: Send) -> None:
-    await send({"type": "websocket.close", "code": 1008})
 
 
 # Running the application on a port.
