@@ -219,45 +219,52 @@ async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pai
         assert [event.value for event in waiting if event.name == name][-100:] == list(range(1, 101))
 
 
-def delay(monkeypatch, seconds, first=0):
-    """Have the notices that all nodes get come late, after the `first` of them."""
+def delay(monkeypatch, first, others):
+    """Have the notices that all nodes get come late by so many seconds."""
     take, count = key_watcher._NewKeysListener.on_notice, itertools.count()
 
     def on_notice(self, *arguments):
-        is_late = next(count) >= first
-        asyncio.get_running_loop().call_later(is_late * seconds, take, self, *arguments)
+        asyncio.get_running_loop().call_later(others if next(count) else first, take, self, *arguments)
 
     monkeypatch.setattr(key_watcher._NewKeysListener, "on_notice", on_notice)
 
 
-@pytest.mark.parametrize("first", [1, 0], ids=["of a key that was heard of", "of a key that a search found"])
+@pytest.mark.parametrize("first", [0.1, 0.4], ids=["of a key that was heard of", "of a key that a search found"])
 async def test_what_a_recorder_reads_is_behind_updates_that_come_late_over_other_nodes(
     cluster, pair, key, file, monkeypatch, first
 ):
     """The value that was read stood in front of the updates that it has."""
     space, other = pair
-    delay(monkeypatch, 0.25, first)
+    delay(monkeypatch, first, 0.4)
     async with Recorder(other, [key("*")], file) as recorder:
         for number in range(1, 21):
             await space[key("n")].write(number)
-        await recorder._search()
-        await asyncio.sleep(0.1)
-        assert (key("n") in recorder._keys._recorders, recorder.status.messages) == (True, first)
+        if first == 0.4:
+            await recorder._search()
+        await aeventually(lambda: key("n") in recorder._keys._recorders)
     with open_log(file) as log:
         assert [update.value for update in log.updates(patterns=[key("n")])] == list(range(1, 21))
         assert log.metadata["gaps"] == "0"
 
 
-async def test_a_key_that_was_there_is_not_heard_of_by_what_was_published_before(cluster, pair, key, monkeypatch):
-    """Whether the late notice comes while the keys are looked for or after that."""
+@pytest.mark.parametrize("seconds", [0.0, 0.1])
+async def test_what_was_published_before_a_monitor_listens_does_not_come_late(cluster, pair, key, monkeypatch, seconds):
+    """Whether its notice comes while the keys are looked for or after that."""
     space, other = pair
-    for seconds in (0.0, 0.1):
-        delay(monkeypatch, seconds)
-        await space[key(f"k{seconds}")].write(0)
-        async with hearing(other, key("*")) as events:
-            await asyncio.sleep(0.2)
-            await space[key(f"k{seconds}")].write(1)
-            await aeventually(lambda events=events: [event.value for event in events] == [1])
+    delay(monkeypatch, seconds, seconds)
+    look = key_watcher.KeyWatcher._look
+
+    async def looking(self, listener, *, late):
+        await space[key()].write(0)
+        monkeypatch.undo()
+        await look(self, listener, late=late)
+
+    monkeypatch.setattr(key_watcher.KeyWatcher, "_look", looking)
+    async with hearing(other, key("*")) as events:
+        await asyncio.sleep(0.2)
+        await space[key()].write(1)
+        await aeventually(lambda: events and events[-1].value == 1)
+    assert [event.value for event in events] == [1]
 
 
 @pytest.mark.parametrize("spelled_out", [False, True], ids=["a pattern", "names"])
