@@ -18,7 +18,7 @@ test: $(VENV)/ready  ## the fast run, about six minutes: every promise, on an em
 test-all: $(VENV)/ready  ## the long run: every test at full size, then those that measure time, alone, and all variants
 	$(BIN)/python -m pytest -q --long $(TOGETHER) -m "not alone"
 	$(BIN)/python -m pytest -q --long -m alone
-	$(MAKE) test-plain modes
+	$(MAKE) test-plain test-cluster modes
 
 test-plain: $(VENV)/ready  ## the fast run on servers without the JSON module
 	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q $(TOGETHER)
