@@ -100,7 +100,7 @@ class _Numbers:
 
 
 class Session:
-    """One server as one interface, whose arguments it takes, sees it."""
+    """A server as one interface sees it; the arguments are those of the interface."""
 
     def __init__(
         self,
