@@ -49,11 +49,6 @@ class Locks(Generic[Lock]):
         older = (reference() for reference in self._older.valuerefs())
         return [*list(self._recent.values()), *(lock for lock in older if lock is not None)]
 
-    def clear(self) -> None:
-        """Forget them: they belong to another event loop."""
-        self._recent.clear()
-        self._older.clear()
-
 
 class WeakList(Generic[Item]):
     """Those of some objects that still live. Threads may share it.

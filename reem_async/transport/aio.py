@@ -44,20 +44,9 @@ class AsyncTransport:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = 0
         self._closed = False
-        # Two shared connections: False for small calls, True for large values, which no small call waits behind.
-        self._lanes: dict[bool, Wire] = {}
-        self._opening: dict[bool, asyncio.Task[Wire]] = {}
-        self._spare: list[Wire] = []
-        self._lendable = asyncio.Semaphore(_LENT)
-        self._borrowers = 0  # callers that have a lent connection or wait for one
+        self._begin()
         self._failed_attempt: tuple[float, NotConnected] | None = None  # the last one for a lent connection, and when
-        self._open: set[Wire] = set()
-        # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
-        self._leaving: set[Wire] = set()
-        self._orders = Locks(asyncio.Lock)
         self._text = Text(options.timeout)
-        # By document: what cancelled callers have left on its way. A later write to the same document waits for it.
-        self._left: dict[str, set[asyncio.Future[Any]]] = {}
         # Not cancelled by `close`: callers share an attempt to connect, which ends by itself, within its time limit.
         self._tasks = Tasks()
         self.states = States()
@@ -223,7 +212,7 @@ class AsyncTransport:
         loop = asyncio.get_running_loop()
         if self._pid != os.getpid():
             # After a fork the sockets belong to the parent: forget them without closing.
-            self._forget()
+            self._begin()
             self._pid, self._loop = os.getpid(), None
         if self._loop is not loop:
             if self._loop is not None and not self._loop.is_closed():
@@ -231,7 +220,7 @@ class AsyncTransport:
                     "this RedisInterface is in use in another event loop; "
                     "make one interface per loop (or per asyncio.run)"
                 )
-            self._forget()
+            self._begin()
             self._loop = loop
             self._farewell = self._end_with_loop()
             with contextlib.suppress(StopIteration):
@@ -248,15 +237,20 @@ class AsyncTransport:
             if not self._closed:
                 await self.at_end()
 
-    def _forget(self) -> None:
-        self._lanes.clear()
-        self._opening.clear()
-        self._spare.clear()
-        self._lendable, self._borrowers = asyncio.Semaphore(_LENT), 0  # the others belong to another event loop
-        self._open.clear()
-        self._leaving.clear()
-        self._orders.clear()
-        self._left.clear()
+    def _begin(self) -> None:
+        """Begin without connections and locks; those there are belong to another event loop, or are let go of."""
+        # Two shared connections: False for small calls, True for large values, which no small call waits behind.
+        self._lanes: dict[bool, Wire] = {}
+        self._opening: dict[bool, asyncio.Task[Wire]] = {}
+        self._spare: list[Wire] = []
+        self._lendable = asyncio.Semaphore(_LENT)
+        self._borrowers = 0  # callers that have a lent connection or wait for one
+        self._open: set[Wire] = set()
+        # Lent connections whose caller was cancelled while something large was on its way; closed once it has arrived.
+        self._leaving: set[Wire] = set()
+        self._orders = Locks(asyncio.Lock)
+        # By document: what cancelled callers have left on its way. A later write to the same document waits for it.
+        self._left: dict[str, set[asyncio.Future[Any]]] = {}
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[Held]:
@@ -378,7 +372,7 @@ class AsyncTransport:
             finally:
                 if farewell is not None:
                     await farewell.aclose()
-        self._forget()
+        self._begin()
 
     def retire(self) -> bool:
         if self._loop is asyncio.get_running_loop():
@@ -389,7 +383,7 @@ class AsyncTransport:
 
     async def release(self) -> None:
         wires = [*self._lanes.values(), *self._spare, *self._leaving]
-        self._forget()
+        self._begin()
         await close_all(wires)
 
 
