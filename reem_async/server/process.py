@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from reem_async.concurrency.locks import Inherited
 from reem_async.errors import ServerFailed
@@ -76,7 +77,7 @@ class ServerProcess:
         self.log = self.directory / "server.log"
         self.socket_path = str(self.scratch / "redis.sock")
         self.pid = 0
-        self._watchdog: subprocess.Popen[bytes] | None = None
+        self._watchdog: Any = None  # a `subprocess.Popen`, once it runs
         self._planted: Path | None = None
         self._ended = False
         self._owner = os.getpid()
@@ -110,8 +111,6 @@ class ServerProcess:
         if os.getpid() != self._owner:
             return not os.path.exists(self.socket_path)  # the server removes it as it ends
         if not self._ended:
-            assert self._watchdog is not None
-            assert self._watchdog.stdout is not None
             try:  # None: nothing to read, so nothing has happened
                 self._ended = self._watchdog.stdout.read(64) is not None
             except ValueError:  # closed by `stop`
@@ -213,16 +212,12 @@ class ServerProcess:
         return offset
 
     def _send(self, line: str) -> None:
-        assert self._watchdog is not None
-        assert self._watchdog.stdin is not None
         rest = memoryview(f"{line}\n".encode())
         with suppress(BrokenPipeError):  # it ended at once: noticed when its answer does not come
             while rest:  # unbuffered: one write may take a part only
                 rest = rest[self._watchdog.stdin.write(rest) :]
 
     def _hear_pid(self, offset: int) -> None:
-        assert self._watchdog is not None
-        assert self._watchdog.stdout is not None
         word, _, rest = self._watchdog.stdout.readline().decode().strip().partition(" ")
         if word == "busy":
             raise ServerFailed(f"another server keeps its data in {self.directory}: stop that one first")
