@@ -61,7 +61,7 @@ def topic_of(path: Path) -> str:
 def to_json(tree: Any) -> JsonMessage:
     """Return a tree, arrays already replaced by `Reference` where they are long, as a JSON object with its notes."""
     notes: list[Any] = []
-    shown = _shown(tree, None, notes)
+    shown = _shown(tree, (), notes)
     # A root with a "$ship" of its own would be taken for one with notes.
     wrapped = type(shown) is not dict or type(tree) is not dict or NOTES in tree
     root: dict[str, Any] = {WRAPPER: shown} if wrapped else shown
@@ -70,11 +70,7 @@ def to_json(tree: Any) -> JsonMessage:
     return JsonMessage(root, wrapped)
 
 
-_Place = Any
-"""A path as nested pairs (parent, key), None for the root: cheaper to extend than a tuple."""
-
-
-def _shown(value: Any, place: _Place, notes: list[Any]) -> Any:
+def _shown(value: Any, place: Path, notes: list[Any]) -> Any:
     kind = type(value)
     if kind is float or kind is str or kind is bool or value is None:
         return value
@@ -82,25 +78,25 @@ def _shown(value: Any, place: _Place, notes: list[Any]) -> Any:
         if -_LARGEST_EXACT <= value <= _LARGEST_EXACT:
             return value
         # As text in its place: a viewer that reads it as a number would show another one.
-        notes.append([_flat(place), "int"])
+        notes.append([place, "int"])
         return str(value)
     if kind is dict:
-        return {key: _shown(item, (place, key), notes) for key, item in value.items()}
+        return {key: _shown(item, (*place, key), notes) for key, item in value.items()}
     if kind is list:
-        return [_shown(item, (place, index), notes) for index, item in enumerate(value)]
+        return [_shown(item, (*place, index), notes) for index, item in enumerate(value)]
     if kind is Reference:
         return _shown_stored(value, place, notes)
     return _shown_array(value, place, notes)
 
 
-def _shown_stored(it: Reference, place: _Place, notes: list[Any]) -> dict[str, Any]:
-    note = [_flat(place), "stored", it.label, it.path, it.at, it.size, it.summary, it.dtype, it.shape]
+def _shown_stored(it: Reference, place: Path, notes: list[Any]) -> dict[str, Any]:
+    note = [place, "stored", it.label, it.path, it.at, it.size, it.summary, it.dtype, it.shape]
     notes.append(note)
     shape = {} if it.shape is None else {"dtype": it.dtype, "shape": it.shape}
     return {NOTES: it.label, "topic": topic_of(it.path), "size": it.size, **shape}
 
 
-def _shown_array(array: np.ndarray[Any, Any], place: _Place, notes: list[Any]) -> Any:
+def _shown_array(array: np.ndarray[Any, Any], place: Path, notes: list[Any]) -> Any:
     exact = array.tolist()
     data = None
     if array.dtype.kind == "f" and not np.isfinite(array).all():
@@ -115,20 +111,12 @@ def _shown_array(array: np.ndarray[Any, Any], place: _Place, notes: list[Any]) -
         data = base64.b64encode(array.tobytes()).decode()
     else:
         shown = exact
-    notes.append([_flat(place), "array", array.dtype.str, array.shape, data])
+    notes.append([place, "array", array.dtype.str, array.shape, data])
     return shown
 
 
 def _is_large(array: np.ndarray[Any, Any]) -> bool:
     return bool(array.size) and (int(array.max()) > _LARGEST_EXACT or int(array.min()) < -_LARGEST_EXACT)
-
-
-def _flat(place: _Place) -> list[str | int]:
-    path = []
-    while place is not None:
-        place, key = place
-        path.append(key)
-    return path[::-1]
 
 
 def from_json(text: bytes, *, wrapped: bool) -> Any:
