@@ -137,6 +137,7 @@ class KeyRecorder:
     def keyframe(self, number: int) -> None:
         """Write the whole key as the recording has it."""
         self._add(self._item(Role.KEYFRAME, None, number))
+        self.news = False
 
     def sampled(self, path: Path, value: Any, size: int) -> None:
         """Take what was read at a path: MISSING if there was nothing."""
@@ -272,9 +273,9 @@ class RecordedKeys:
                 self.of(name).follow()
 
     def be_due(self) -> None:
-        """Let the next look read every key, however much was read of it of late."""
+        """Let the next look read every key, whatever was published or read of it of late."""
         for recorder in self._recorders.values():
-            recorder.looks.earliest = 0.0
+            recorder.news, recorder.looks.earliest = False, 0.0
 
     def look_at_once(self) -> None:
         for recorder in self._recorders.values():
@@ -310,15 +311,10 @@ class RecordedKeys:
                 reads += 1
                 recorder.read()
 
-    def forget_news(self) -> None:
-        for recorder in self._recorders.values():
-            recorder.news = False
-
     def keyframe(self, number: int) -> None:
         self._let_go()
         for recorder in self._recorders.values():
             recorder.keyframe(number)
-        self.forget_news()
 
     def _let_go(self) -> None:
         """Keep nothing of keys that were gone at the last keyframe, too. One that comes again is a new one.

@@ -374,7 +374,7 @@ class Recorder:
 
     async def _look_once_more(self) -> None:
         """Read what is there at the end: keys may have been stored since the last keyframe."""
-        self._keys.forget_news()
+        self._keys.be_due()
         if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
                 if self.hears_of_changes:
@@ -382,7 +382,6 @@ class Recorder:
                     self._keys.look_at_once()
                     await self._keys.settled(_PATIENCE)
                 else:
-                    self._keys.be_due()
                     await self._look()
 
     async def _look(self) -> None:
