@@ -14,7 +14,7 @@ import threading
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
@@ -61,12 +61,9 @@ Progress = Callable[[int, int], None]
 """Called with how much of something is done, and how much there is."""
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message: its channel, when it was received and published (ns), its number, its bytes."""
+class Message(NamedTuple):
+    """One message: when it was published (ns), its number, its bytes."""
 
-    channel: int
-    log_time: int
     publish_time: int
     sequence: int
     data: bytes
@@ -319,17 +316,17 @@ class Container:
             index = parse_index(text, starts, info.start, info.end)
         return index if index is not None and np.isin(index.channels, info.channels).all() else None
 
-    def message(self, info: ChunkInfo, channel: int, offset: int, log_time: int) -> Message | None:
-        """Return a message that the index of a chunk names; None, and the chunk is left out, if that is damaged."""
-        content = self.content(info)
+    def message(self, ref: Ref) -> Message | None:
+        """Return a message; None, and its chunk is left out, if it is damaged. Then find again what it was part of."""
+        content, start = self.content(ref.chunk), ref.offset + MESSAGE.size
         if content is None:
             return None
-        if offset + MESSAGE.size <= len(content):
-            opcode, length, found, sequence, time, published = MESSAGE.unpack_from(content, offset)
-            end = offset + HEAD.size + length
-            if opcode == Opcode.MESSAGE and (found, time) == (channel, log_time) and end <= len(content):
-                return Message(found, time, published, sequence, content[offset + MESSAGE.size : end])
-        self._discard(info)
+        if start <= len(content):
+            opcode, length, channel, sequence, time, published = MESSAGE.unpack_from(content, ref.offset)
+            end = ref.offset + HEAD.size + length
+            if opcode == Opcode.MESSAGE and (channel, time) == (ref.channel, ref.time) and end <= len(content):
+                return Message(published, sequence, content[start:end])
+        self._discard(ref.chunk)
         return None
 
     def unpacked_size(self, info: ChunkInfo) -> int:
@@ -518,10 +515,6 @@ class Timeline:
         sizes = np.empty(len(offsets), np.int64)
         sizes[order] = np.diff(offsets[order], append=self._container.unpacked_size(info))
         return np.maximum(sizes, 0)
-
-    def message(self, ref: Ref) -> Message | None:
-        """Return a message; None, and its chunk is left out, if it is damaged. Then find again what it was part of."""
-        return self._container.message(ref.chunk, ref.channel, ref.offset, ref.time)
 
 
 _END = 2**63 - 1

@@ -177,7 +177,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
         if stream.role == Role.DELETE:
             return [MISSING]
-        message = self._timeline.message(ref)
+        message = self._container.message(ref)
         if message is None:
             return None
         channel = self._container.channels[ref.channel]
@@ -215,7 +215,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             raise DamagedRecording(f"{it.shown}: {it.summary}")
         for channel in self._parts.get(it.path, ()):
             ref = self._timeline.exactly(channel, it.at)
-            message = None if ref is None else self._timeline.message(ref)
+            message = None if ref is None else self._container.message(ref)
             if message is not None and self._container.channels[channel].message_encoding == "protobuf":
                 return self._decoded(self._container.channels[channel], message.data)
         raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
@@ -295,7 +295,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def gaps(self) -> Iterator[tuple[Ref, RecordedStream, int | None]]:
         # A gap says how many were lost if their publisher's numbers told it.
         for ref, stream in self.of_role(Role.GAP):
-            message, missed = self._timeline.message(ref), None
+            message, missed = self._container.message(ref), None
             with contextlib.suppress(ValueError, TypeError, KeyError):
                 missed = orjson.loads(message.data)["missed"] if message is not None else None
             yield ref, stream, missed if type(missed) is int else None
@@ -307,7 +307,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
 
     def stamp(self, ref: Ref) -> tuple[int, int]:
         """Return when a message was published (ns), and its number."""
-        message = self._timeline.message(ref)
+        message = self._container.message(ref)
         return (message.publish_time, message.sequence) if message is not None else (0, 0)
 
     def channels(self, progress: Progress | None) -> Iterator[tuple[Channel, RecordedStream | None, str, Totals]]:
