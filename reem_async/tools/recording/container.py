@@ -486,10 +486,6 @@ class Timeline:
                 found[index.entries()[_between(index.times, after, until)]] = True
         return set(np.flatnonzero(found).tolist())
 
-    def exactly(self, channel: int, time: int) -> Ref | None:
-        found = self.latest(channel, time)
-        return found if found is not None and found.time == time else None
-
     def totals(self, progress: Progress | None = None) -> dict[int, Totals]:
         messages, sizes, lasts = np.zeros((3, _CHANNELS), np.int64)
         firsts = np.full(_CHANNELS, _END)

@@ -40,6 +40,10 @@ class _FoundDamage(Exception):
     """A part of the file turned out to be damaged and was left out: what needs it is to be found again."""
 
 
+_DAMAGED = object()
+"""In the place of a value that cannot be read."""
+
+
 class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     """The contents of a recording. Positions of changes are log times, in ns."""
 
@@ -102,15 +106,12 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         """
         ref, stream = change
         try:
-            loaded = self._load(ref, stream)
+            return self._load(ref, stream)
         except BadData:
             label = self._container.channels[ref.channel].metadata.get("reem.ship", "")
             if label in ("", "list"):  # it has places of its own: whether something was there is unknown
                 raise
             return Reference(label, stream.path, ref.time, 0, label)
-        if loaded is None:
-            raise _FoundDamage
-        return loaded[0]
 
     def _anchor(self, path: Path) -> Path:
         return _anchor(path, self._streams_of(path))
@@ -134,7 +135,8 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
 
     def _inner(self, path: Path, after: int, until: int) -> Iterable[tuple[Ref, RecordedStream]]:
         channels = [channel for stream in self._streams_inside(path) for channel in stream.channels]
-        return [(ref, self._of_channel[ref.channel]) for ref in self._between(channels, after, until)]
+        refs = itertools.chain.from_iterable(self._instants(channels, after, until))
+        return [(ref, self._of_channel[ref.channel]) for ref in refs]
 
     def _inner_lasts(self, path: Path, after: int, until: int) -> Iterable[tuple[int, tuple[Ref, RecordedStream]]]:
         lasts = [self._newest([stream], until, after) for stream in self._streams_inside(path)]
@@ -164,36 +166,31 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                     best = ref, stream
         return best
 
-    def _between(self, channels: Iterable[int], after: int, until: int) -> Iterator[Ref]:
-        for refs in self._instants(channels, after, until):
-            yield from refs
-
     def _instants(self, channels: Iterable[int], after: int, until: int) -> Iterator[list[Ref]]:
         """Yield the messages of each instant: what was published comes before what a read found behind it."""
         for _, refs in itertools.groupby(self._timeline.between(channels, after, until), key=lambda ref: ref.time):
             yield sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
 
-    def _load(self, ref: Ref, stream: RecordedStream) -> list[Any] | None:
-        """Return a list of the value of a message, MISSING for a deletion; None if it is damaged."""
+    def _load(self, ref: Ref, stream: RecordedStream) -> Any:
+        """Return the value of a message, MISSING for a deletion; raises _FoundDamage, BadData."""
         if stream.role == Role.DELETE:
-            return [MISSING]
+            return MISSING
         message = self._container.message(ref)
         if message is None:
-            return None
+            raise _FoundDamage
         channel = self._container.channels[ref.channel]
         if channel.message_encoding == "json":
-            return [from_json(message.data, wrapped="reem.wrapped" in channel.metadata)]
-        return [self._stored(channel, ref.time, stream.path, message.data)]
+            return from_json(message.data, wrapped="reem.wrapped" in channel.metadata)
+        return self._stored(channel, ref.time, stream.path, message.data)
 
-    def _readable(self, ref: Ref, stream: RecordedStream) -> list[Any] | None:
-        """Return a list of the value of a message; None, and it is counted, if it is damaged."""
-        with contextlib.suppress(BadData):
-            loaded = self._load(ref, stream)
-            if loaded is not None:
-                return loaded
-        self.unreadable += 1
-        self._has_skipped = True
-        return None
+    def _readable(self, ref: Ref, stream: RecordedStream) -> Any:
+        """Return the value of a message; _DAMAGED, and it is counted, if it cannot be read."""
+        try:
+            return self._load(ref, stream)
+        except (_FoundDamage, BadData):
+            self.unreadable += 1
+            self._has_skipped = True
+            return _DAMAGED
 
     def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Reference:
         """Return what stands for a value that is a message of its own and not a part of another."""
@@ -214,7 +211,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
         for channel in self._parts.get(it.path, ()):
-            ref = self._timeline.exactly(channel, it.at)
+            ref = self._timeline.latest(channel, it.at, it.at - 1)
             message = None if ref is None else self._container.message(ref)
             if message is not None and self._container.channels[channel].message_encoding == "protobuf":
                 return self._decoded(self._container.channels[channel], message.data)
@@ -254,11 +251,11 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             it for it in self.streams if it.role in NEWS and any(pattern.concerns(it.path) for pattern in patterns)
         ]
         channels = [channel for stream in streams for channel in stream.channels]
-        for ref in self._between(channels, after, until):
+        for ref in itertools.chain.from_iterable(self._instants(channels, after, until)):
             stream = self._of_channel[ref.channel]
-            loaded = self._readable(ref, stream)
-            if loaded is not None:
-                yield ref, stream, loaded[0]
+            value = self._readable(ref, stream)
+            if value is not _DAMAGED:
+                yield ref, stream, value
 
     @property
     def is_damaged(self) -> bool:
@@ -281,11 +278,11 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 # Keyframes repeat what is known, unless something is damaged: then they bring what is missing.
                 if stream.role == Role.KEYFRAME and not self.is_damaged:
                     continue
-                loaded = self._readable(ref, stream)
-                if loaded is None:
+                value = self._readable(ref, stream)
+                if value is _DAMAGED:
                     continue
                 is_read, is_whole = True, is_whole and stream.role in (Role.STATE, Role.KEYFRAME)
-                tree = self.after(tree, anchor, (ref, stream), loaded[0])
+                tree = self.after(tree, anchor, (ref, stream), value)
             if is_read:
                 value = self._inside(tree, path[len(anchor) :])
                 repeats = is_whole and value is not MISSING and last is not MISSING and same(value, last)
