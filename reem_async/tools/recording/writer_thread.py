@@ -216,10 +216,10 @@ class WriterThread:
                 case Role.KEYFRAME:
                     self._write_keyframe(it)
                 case Role.SKIP:
-                    self._event(it, {"op": "skip", "path": show(it.path)})
+                    self._event(it)
                 case Role.GAP:
                     self.counts.gaps += 1
-                    self._event(it, {"op": "gap", "path": show(it.path), "missed": it.value})
+                    self._event(it, missed=it.value)
                 case Role.STATISTICS:
                     self._sink.statistics(it.value, it.stamp)
                 case Role.FLUSH:
@@ -279,9 +279,10 @@ class WriterThread:
         if it.kind == Kind.READ and get(before, rest) is MISSING:
             return
         self._keep(name, without(before, rest, it.kind))
-        self._event(it, {"op": "delete", "path": show(it.path)})
+        self._event(it)
 
-    def _event(self, it: Operation, text: dict[str, Any]) -> None:
+    def _event(self, it: Operation, **more: Any) -> None:
+        text = {"op": it.role.value, "path": show(it.path), **more}
         self._count(self._sink.json(it.path, it.role, it.kind, JsonMessage(text, wrapped=False), it.stamp))
 
     def _write_state(self, it: Operation) -> None:
@@ -305,10 +306,9 @@ class WriterThread:
         if name in self._lacking:  # it may differ in what was published
             self._write_state(_as_state(it))
             return
-        before = self._trees.get(name, MISSING)
-        before = before if before is MISSING else self._settled(it, before)
+        before = self._settled(it, self._trees.get(name, MISSING))
         tree = it.value if it.value is MISSING else self._extracted(it, before)
-        known = before if before is MISSING else pruned(before, it.path, self._patterns)  # without what is sampled
+        known = pruned(before, it.path, self._patterns)  # without what is sampled
         for inner in differing(known, tree, before):
             self.stored.add(name)
             value, place = get(tree, inner), it.path + inner
