@@ -202,8 +202,9 @@ class _Converter:
         if put or rooted:
             await self._write(root[0], raw_read, second, gone, dry_run=dry_run)
         removed_with_it = (put or rooted) and not self.session.transport.sharded
-        if gone and not dry_run and not removed_with_it:
-            await self._remove(gone)
+        if not dry_run and not removed_with_it:
+            for key in gone:  # they may be on several nodes
+                await self._replies([("UNLINK", key)])
         return Migrated(self.name, tuple(put), rooted, tuple(gone), tuple(self._key.lost))
 
     def _deletion(self, entry: str, in_document: bool, places: Iterable[str]) -> str:
@@ -292,14 +293,6 @@ class _Converter:
             await self.session.run(exchange(it, reads, seen, self.session.cache))
 
         await self._writer.in_turn(send, *encoded)
-
-    async def _remove(self, gone: list[str]) -> None:
-        """Remove old keys that were not removed with the write; in a cluster one by one."""
-        if not self.session.transport.sharded:
-            await self._replies([("UNLINK", *gone)])
-            return
-        for key in gone:
-            await self._replies([("UNLINK", key)])
 
 
 # Documents that are text on a server with JSON: an RDB file of a server without JSON has moved there.
