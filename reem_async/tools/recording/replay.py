@@ -136,9 +136,9 @@ class Replayer:
         once or not at all; what was published stays.
         """
         while True:
-            await self._begin()
+            self._updates = updates = await self._begin()
             begun = time.monotonic()
-            for update in self._remaining():
+            for update in updates:
                 # From the beginning and not from the last update: delays do not add up.
                 due = begun + (update.time - self.start) / self._rate
                 wait = due - time.monotonic()
@@ -162,9 +162,9 @@ class Replayer:
         """
         while True:
             if self._updates is None:
-                await self._begin()
+                self._updates = await self._begin()
                 self._stepped = False
-            update = next(self._remaining(), None)
+            update = next(self._updates, None)
             if update is not None:
                 await self._publish(update)
                 self._stepped = True
@@ -174,12 +174,8 @@ class Replayer:
             if not (self._loop and self._stepped):
                 return None
 
-    def _remaining(self) -> Iterator[LogUpdate]:
-        assert self._updates is not None
-        return self._updates
-
-    async def _begin(self) -> None:
-        """Publish all that was there at the start; what this replay has added since is deleted."""
+    async def _begin(self) -> Iterator[LogUpdate]:
+        """Publish all that was there at the start, delete what this replay has added since, and return the updates."""
         there = {name: await asyncio.to_thread(self._whole, name) for name in self._log.names()}
         now = {str(self._renamed((name,))[0]): tree for name, tree in there.items() if tree is not MISSING}
         # From the second round on: keys that the recording has only made later.
@@ -192,7 +188,7 @@ class Replayer:
         # A microsecond later: what happened at the start is in the trees already, and times of floats are exact to
         # that.
         after = seconds(nanoseconds(self.start) + 1000)
-        self._updates = iter(self._log.updates(after, self.end, self._texts, partial=True))
+        return self._log.updates(after, self.end, self._texts, partial=True)
 
     def _whole(self, name: str) -> Any:
         if not self._is_chosen(name):
