@@ -104,7 +104,7 @@ class _MinusCommand(TyperCommand):
         for word in takewhile(lambda each: each != "--", args):
             name = word.partition("=")[0]
             if name.startswith("--") and name not in known and name != "--help":
-                close = get_close_matches(name, known, 1)
+                close = get_close_matches(name, known, 1, 0.7)
                 ctx.fail(f"there is no option {name}" + (f"; did you mean {close[0]}?" if close else ""))
         return super().parse_args(ctx, args)
 
