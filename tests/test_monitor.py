@@ -1,9 +1,7 @@
 """What tools build on: which keys there are, what is in them, and every update of all of them."""
 
 import asyncio
-import itertools
 import re
-import time
 
 import numpy as np
 import pytest
@@ -179,29 +177,6 @@ def test_what_cannot_be_a_pattern_is_refused():
 
 def test_escaping_leaves_no_pattern():
     assert re.sub(r"\\(.)", r"\1", escaped("a*?[b]\\^")) == "a*?[b]\\^"
-
-
-@pytest.mark.alone
-async def test_a_patient_monitor_is_woken_seldom_unless_somebody_else_is_in_a_hurry(key, server_url, apspace):
-    async def batches(*, hurried):
-        async with reem_async.RedisInterface(server_url) as own, Monitor(own, [key("n")], patience=0.05) as monitor:
-            if hurried:
-                mirror = reem_async.SilentSubscriber(key("n"), own)
-                await mirror.listen()
-            begun = time.monotonic()
-            await apspace[key("n")].write(-1)
-            for number in range(40):
-                await apspace[key("n")].write(number)
-                await asyncio.sleep(0.005)
-            periods = (time.monotonic() - begun) / monitor.patience
-            events = [await anext(monitor) for _ in range(41)]
-            assert [event.value for event in events] == list(range(-1, 40))
-            assert not any(event.gap for event in events)
-            return 1 + sum(b.received - a.received > 0.003 for a, b in itertools.pairwise(events)), periods
-
-    many, periods = await batches(hurried=False)
-    assert many <= periods + 5  # one in each time that they may wait
-    assert (await batches(hurried=True))[0] > 15
 
 
 @pytest.mark.parametrize(("patience", "gives_way"), [(0.0, False), (0.002, False), (0.01, True)])
