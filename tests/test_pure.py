@@ -15,9 +15,14 @@ from reem_async.errors import BadData, BadKey, BadValue, TooDeep
 from reem_async.plan import placeholders, trees
 from reem_async.plan.documents import encode
 from reem_async.plan.floats import _as_parsed, exact_text, may_lose
+from reem_async.plan.keys import keys_of
 from reem_async.plan.paths import below, may_hold, parse, parse_shown, parse_suffix, show, suffix, to_jsonpath
+from reem_async.plan.reads import read
+from reem_async.plan.replies import decoded
+from reem_async.plan.shapes import ShapeCache
 from reem_async.ships import NumpyShip
-from reem_async.transport.packing import pack
+from reem_async.ships.registry import Ships, default_ships
+from reem_async.transport.packing import CommandRecorder, pack
 from reem_async.transport.parsing import MORE, LargeReader, SmallReader
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
@@ -282,3 +287,12 @@ def test_a_tree_is_replaced_as_the_server_would_and_never_changed():
             trees.replaced(tree, path, 0)
     assert tree == before
     assert math.isclose(trees.get(tree, ("l", 1, "x")), 2)
+
+
+def test_a_document_and_its_arrays_are_asked_for_in_one_transaction():
+    """A server that executes short pipelines at once would not show the difference."""
+    keys, ships = keys_of("k"), Ships(default_ships(), CommandRecorder)
+    plan = read(keys, (), ships, ShapeCache())
+    assert not plan.atomic
+    plan = decoded(plan, [orjson.dumps([str(placeholders.Placeholder("bytes", ".a", 5))])])
+    assert (len(plan.commands), plan.atomic) == (2, True)
