@@ -8,6 +8,7 @@ import io
 import json
 import os
 import random
+import struct
 import zlib
 
 import mcap.reader
@@ -23,6 +24,7 @@ import reem.recording
 from reem_async.errors import BadData, MissingKey
 from reem_async.tools.browser.logsource import LogSource
 from reem_async.tools.recording import DamagedRecording, Replayer, open_log
+from reem_async.tools.recording.container import Container, Ref
 from reem_async.tools.recording.export import export
 
 IMAGE = np.arange(40 * 30 * 3, dtype=np.uint8).reshape(40, 30, 3)
@@ -363,3 +365,59 @@ def test_messages_outside_of_chunks(file):
         with open_log(file) as log:
             assert [it.value["n"] for it in log.updates()] == numbers
             assert (log.verify(), log.verify()) == (damaged, damaged)
+
+
+# --- what a container notices by itself -------------------------------------------------------------
+
+
+def two_channels(path, **options):
+    """A file with one message in each of two channels, both in one chunk unless the options say otherwise."""
+    options = {"compression": mcap.writer.CompressionType.NONE, "enable_crcs": False, **options}
+    with path.open("wb") as stream:
+        writer = mcap.writer.Writer(stream, **options)
+        writer.start("", "another tool")
+        for number in (1, 2):
+            channel = writer.register_channel(f"/topic{number}", "json", 0)
+            writer.add_message(channel, number, b'{"value": %d}' % number, number)
+        writer.finish()
+    return path.read_bytes()
+
+
+def test_a_channel_number_with_two_meanings_is_damage(file):
+    data = bytearray(two_channels(file, use_chunking=False))
+    places = starts(data)
+    seconds = [[place for place in places if data[place] == opcode][1] for opcode in (4, 5)]  # channel and message
+    end = next(place for place in places if data[place] == 15)  # without a summary it is read from record to record
+    for number, damaged in ((2, 0), (1, 1)):
+        for place in seconds:
+            data[place + 9] = number
+        file.write_bytes(data[:end])
+        with contextlib.closing(Container(file)) as container:
+            assert container.damaged == damaged
+
+
+def test_fewer_messages_than_the_file_says_are_damage(file):
+    data = two_channels(file, use_chunking=False, index_types=mcap.writer.IndexType.NONE, use_summary_offsets=False)
+    places = starts(data)
+    at = next(place for place in places if data[place] == 5)
+    length = places[places.index(at) + 1] - at
+    footer = places[-1] if data[places[-1]] == 2 else next(place for place in places if data[place] == 2)
+    (summary,) = struct.unpack_from("<Q", data, footer + 9)
+    for lost, damaged in ((b"", 0), (data[at : at + length], 1)):
+        cut = data[:at] + data[at + len(lost) :]
+        moved = bytearray(cut)
+        struct.pack_into("<Q", moved, footer - len(lost) + 9, summary - len(lost))
+        file.write_bytes(moved)
+        with contextlib.closing(Container(file)) as container:
+            assert container.damaged == damaged
+
+
+def test_an_index_that_names_another_message_is_damage(file):
+    two_channels(file)
+    with contextlib.closing(Container(file)) as container:
+        (info,) = container.every_chunk
+        index = container.index(info)
+        channel, time, offset = (int(each[0]) for each in (index.channels, index.times, index.offsets))
+        assert container.message(Ref(time, info, offset, channel)).data == b'{"value": 1}'
+        assert container.message(Ref(time, info, offset, channel + 1)) is None
+        assert container.damaged == 1
