@@ -480,8 +480,8 @@ class AsyncFront(Front):
     wait = run
 
     def until(self, condition):
-        """Wait, and have the event loop go on meanwhile."""
-        self.run(aeventually(condition))
+        """Wait, and have the event loop go on meanwhile; the condition may use it, too."""
+        eventually(lambda: condition() or self.run(asyncio.sleep(0.005)))
 
     def take(self, updates, count=1):
         async def taken():
