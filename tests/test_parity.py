@@ -146,6 +146,26 @@ def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():
             assert not inspect.iscoroutinefunction(getattr(kind, name, None))
 
 
+@pytest.mark.parametrize("module", ["recording", "snapshots"])
+def test_tools_have_the_same_names_and_parameters(module):
+    ours, theirs = (importlib.import_module(f"{front}.{module}") for front in ("reem", "reem_async"))
+    assert set(ours.__all__) == set(theirs.__all__)
+    for name in ours.__all__:
+        mine, core = getattr(ours, name), getattr(theirs, name)
+        if mine is core:
+            continue
+        shapes = [
+            [(each.name, each.kind, each.default) for each in inspect.signature(it).parameters.values()]
+            for it in (mine, core)
+        ]
+        assert shapes[0] == shapes[1], name
+        if inspect.isclass(mine):
+            used = {"start", "stop", "wait", "status"} if name == "Recorder" else {*vars(core)}
+            assert {each for each in used if not each.startswith("_")} <= {*dir(mine)}, name
+        elif name != "describe":  # its blocking form says whose result it returns
+            assert mine.__doc__ == core.__doc__, name
+
+
 def test_errors_policies_and_ships_are_the_very_same_objects():
     """So that an error raised by one front is caught by the other's name."""
     for name in reem.__all__:

@@ -210,18 +210,3 @@ def test_the_blocking_front(key, server_url, pspace, kvs, interface, file):
             assert replayer.play().published == 3 - 1
             assert_same(kvs[key("b")].read(), {"image": IMAGE, "n": 2})
             assert replayer.step().path == (key("a"), "n")
-
-
-def test_both_fronts_promise_the_same():
-    import inspect
-
-    from reem_async.tools import recording as core
-
-    for name in ("Recorder", "Replayer"):
-        ours, theirs = getattr(reem.recording, name), getattr(core, name)
-        assert list(inspect.signature(ours).parameters) == list(inspect.signature(theirs).parameters)
-        for method in [name for name in vars(theirs) if not name.startswith("_")]:
-            if name != "Recorder" or method in ("start", "stop", "wait", "status"):
-                assert hasattr(ours, method), method
-    assert reem.recording.__all__ == core.__all__
-    assert reem.recording.open_log is core.open_log

@@ -1,6 +1,5 @@
 """Restoring beside what is there, with few rights; RDB files."""
 
-import inspect
 import json
 import math
 import shutil
@@ -100,7 +99,7 @@ async def test_subscribers_are_told(here, servers, raws, tmp_path):
             await aeventually(lambda: updates == [("arm", 1.5), ("arm.joint", 3.5)])
 
 
-async def test_progress_and_the_twins(servers, raws, tmp_path):
+async def test_progress_of_the_blocking_front(servers, raws, tmp_path):
     with reem.RedisInterface(servers[0]) as here, reem.RedisInterface(servers[1]) as there:
         reem.KeyValueStore(here)["foo"] = {"x": np.arange(3)}
         told = []
@@ -115,15 +114,6 @@ async def test_progress_and_the_twins(servers, raws, tmp_path):
         ]
         assert ("verify", saved.size) in {(each.doing, each.total) for each in told}
         assert reem.snapshots.save_rdb(here, tmp_path / "a.rdb").kind == "rdb"
-    for name in ("save", "restore", "save_rdb"):
-        ours, theirs = getattr(reem.snapshots, name), getattr(reem_async.snapshots, name)
-        shapes = [
-            [(each.name, each.kind, each.default) for each in inspect.signature(function).parameters.values()]
-            for function in (ours, theirs)
-        ]
-        assert shapes[0] == shapes[1]
-        assert ours.__doc__ == theirs.__doc__
-    assert set(reem.snapshots.__all__) == set(reem_async.snapshots.__all__)
 
 
 # --- rights -------------------------------------------------
