@@ -6,12 +6,16 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
-from conftest import ROOT, sized
+from conftest import ROOT, assert_same, sized
 
+from reem_async import transport
 from reem_async.concurrency.locks import Locks
 from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Every, Last, Newest
 from reem_async.errors import QueueFull
+from reem_async.plan.keys import keys_of
+from reem_async.plan.replies import decoded
 from reem_async.pubsub.events import Update
 from reem_async.transport.options import Options
 from reem_async.transport.packing import Packer
@@ -45,6 +49,24 @@ def test_signals_at_random_instants_in_every_blocking_call(server_url, key, mode
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0, f"{' '.join(words)}\n{done.stdout[-3000:]}\n{done.stderr[-6000:]}"
+
+
+def test_ctrl_c_between_the_steps_of_a_call_leaves_nothing_watched(kvs, key, raw, monkeypatch):
+    """The transaction of the next call over the same connection would fail."""
+    first, second = key("a"), key("b")
+    kvs[first], kvs[second] = {"n": 1}, {"image": np.zeros(3)}
+
+    def interrupted(plan, replies):
+        if plan.held:
+            raise KeyboardInterrupt
+        return decoded(plan, replies)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(transport, "decoded", interrupted)
+        kvs[first]["n"].divide(2)
+    raw.delete(keys_of(first).document)
+    kvs[second]["image"] = np.ones(3)
+    assert_same(kvs[second].read(), {"image": np.ones(3)})
 
 
 def test_ctrl_c_in_the_first_call_of_a_program_keeps_no_import_lock(server_url, key):

@@ -329,7 +329,6 @@ def test_what_somebody_else_makes_as_a_publisher_does_is_a_segment():
         os.close(descriptor)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("what", OPENED)
 def test_what_is_no_segment_is_not_looked_into(what, tmp_path):
     before, descriptor = descriptors(), OPENED[what](tmp_path)
