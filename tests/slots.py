@@ -7,8 +7,6 @@ checksum, which is compared when it is seen and again before it is let go. A par
 few milliseconds, and another takes its place.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import gc
@@ -22,9 +20,7 @@ import signal
 import socket
 import sys
 import time
-import traceback
 import zlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -42,70 +38,42 @@ LARGEST = 1 << 16
 """Bytes of a frame; most are shorter, so that a processor makes many."""
 PATIENCE = 60.0
 """Seconds in which something must come about that takes some milliseconds on a machine with nothing else to do."""
-COUNTED = "written", "full", "seen", "gone", "torn", "left"
+COUNTED = WRITTEN, FULL, SEEN, GONE, TORN, LEFT = range(6)
 
 
-class Party:
-    """A process of the test, and another one in its place when it is killed.
-
-    Args:
-        work: What it does, with its end of a pipe.
-    """
-
-    def __init__(self, work: Callable[[Any], None]) -> None:
-        self._work = work
-        self._begin()
-
-    def _begin(self) -> None:
-        self.pipe, end = FORK.Pipe()
-        self._process = FORK.Process(target=self._run, args=(end,), daemon=True)
-        self._process.start()
-        end.close()
-
-    def _run(self, end: Any) -> None:
-        try:
-            self._work(end)
-        except (EOFError, BrokenPipeError):  # the test is over
-            pass
-        except BaseException:
-            traceback.print_exc()
-            os._exit(1)
-        os._exit(0)
-
-    def kill(self) -> None:
-        self._process.kill()
-        self.end()
-        self._begin()
-
-    def ask(self, what: Any) -> Any:
-        self.pipe.send(what)
-        assert self.pipe.poll(PATIENCE), "a party does not answer"
-        return self.pipe.recv()
-
-    def stop(self, signal_number: int) -> None:
-        os.kill(self._process.pid or 0, signal_number)
-
-    def end(self) -> int | None:
-        """Wait until it has ended by itself."""
-        self.pipe.close()
-        self._process.join(PATIENCE)
-        code = self._process.exitcode
-        self._process.close()
-        return code
-
-
-class Count:
-    """What all parties have counted, those that were killed included."""
+class Work:
+    """What the processes share: where readers are told, what each has counted, killed ones included, and the end."""
 
     def __init__(self) -> None:
-        self._rows = [FORK.RawArray("q", len(COUNTED)) for _ in range(PUBLISHERS + READERS)]
+        tag = secrets.token_hex(8)
+        self.names = [f"\0reem-slots-{tag}-{reader}" for reader in range(READERS)]
+        shared = FORK.RawArray("q", (PUBLISHERS + READERS) * len(COUNTED))
+        self.counts = np.frombuffer(shared, np.int64).reshape(-1, len(COUNTED))
+        self._over = FORK.RawArray("b", PUBLISHERS + READERS)
+        self._parent = os.getpid()
 
-    def add(self, party: int, what: str, number: int = 1) -> None:
-        """Count for a party; only this one does."""
-        self._rows[party][COUNTED.index(what)] += number
+    def is_over(self, place: int) -> bool:
+        return bool(self._over[place]) or os.getppid() != self._parent
 
-    def __getitem__(self, what: str) -> int:
-        return sum(row[COUNTED.index(what)] for row in self._rows)
+    def total(self, what: int) -> int:
+        return int(self.counts[:, what].sum())
+
+    def started(self, place: int) -> Any:
+        process = FORK.Process(target=publish if place < PUBLISHERS else read, args=(self, place), daemon=True)
+        process.start()
+        return process
+
+    def end(self, place: int, process: Any) -> int | None:
+        """Have a process end by itself."""
+        self._over[place] = True
+        return ended(process)
+
+
+def ended(process: Any) -> int | None:
+    process.join(PATIENCE)
+    code: int | None = process.exitcode
+    process.close()
+    return code
 
 
 def frame(rng: random.Random, source: np.ndarray) -> list[Any]:
@@ -131,35 +99,33 @@ def shared_memory() -> int:
         return next(int(line.split()[1]) for line in file if line.startswith("Shmem:")) >> 10
 
 
-def publish(end: Any, place: int, names: list[str], count: Count) -> None:
+def publish(work: Work, place: int) -> None:
     """Put frames into slots and say where, until told to stop; then see to it that all slots are free."""
-    rng, local = random.Random(secrets.randbits(64)), LocalPath()
+    rng, local, count = random.Random(secrets.randbits(64)), LocalPath(), work.counts[place]
     source = np.frombuffer(rng.randbytes(4 * LARGEST), np.uint8)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as told:
         before = open_files()
-        while not end.poll():
+        while not work.is_over(place):
             pieces = frame(rng, source)
-            slot = local.put(KEYS, pieces, [sum(len(piece) for piece in pieces)])
-            count.add(place, "full" if slot is None else "written")
+            size = sum(len(piece) for piece in pieces)
+            slot = local.put(KEYS, pieces, [size])
+            count[FULL if slot is None else WRITTEN] += 1
             taken = False
-            for name in names if slot is not None else ():
+            for name in work.names if slot is not None else ():
                 with contextlib.suppress(OSError):  # it was killed, or is behind
-                    told.sendto(json.dumps([*slot, sum(len(piece) for piece in pieces)]).encode(), name)
+                    told.sendto(json.dumps([*slot, size]).encode(), name)
                     taken = True
             if not taken:
                 time.sleep(0.0005)
             elif rng.random() < 0.001:  # it is dropped while others look into it
                 local._segments.clear()
-        end.recv()
         wanted = SLOTS
         while wanted:  # readers are gone
             views = [local.view(slot, 1) if (slot := local.put(KEYS, [b"x"], [1])) else None for _ in range(3)]
             wanted = wanted - 3 if None not in views else wanted
             del views
         local.close()
-        left = open_files() - before
-        count.add(place, "left", left)
-        end.send(left)
+        count[LEFT] += open_files() - before
 
 
 def newest(told: socket.socket) -> list[Any]:
@@ -172,80 +138,66 @@ def newest(told: socket.socket) -> list[Any]:
     return [json.loads(each) for each in said[-5:]]
 
 
-def read(end: Any, place: int, name: str, slowness: float, count: Count) -> None:
+def read(work: Work, place: int) -> None:
     """See what is said, and keep some of it for a while, until told to stop."""
-    rng, local, kept = random.Random(secrets.randbits(64)), LocalPath(), []
+    rng, local, count = random.Random(secrets.randbits(64)), LocalPath(), work.counts[place]
+    reader, kept = place - PUBLISHERS, []
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as told:
         with contextlib.suppress(OSError):
-            told.bind(name)
+            told.bind(work.names[reader])
         local.reader  # noqa: B018 - what is imported is imported
         before = open_files()
-        while not end.poll():
+        while not work.is_over(place):
             for *where, size in newest(told):
                 view = local.view(Slot(*where), size)
-                count.add(place, "gone" if view is None else "seen")
+                count[GONE if view is None else SEEN] += 1
                 if view is not None:
-                    count.add(place, "torn", not is_whole(view))
+                    count[TORN] += not is_whole(view)
                     kept.append(view)
             view = None
             if len(kept) > rng.randrange(1, 20):
-                time.sleep(rng.random() * slowness)
-                count.add(place, "torn", sum(not is_whole(each) for each in kept))
+                time.sleep(rng.random() * reader * 0.004)
+                count[TORN] += sum(not is_whole(each) for each in kept)
                 kept.clear()
             if rng.random() < 0.001:
                 local.reader.close()
-        end.recv()
         kept.clear()
         local.close()
-        left = open_files() - before
-        count.add(place, "left", left)
-        end.send(left)
+        count[LEFT] += open_files() - before
 
 
 def hunt(seed: int, uses: int) -> None:
     """Have slots written and looked into so many times."""
-    rng, count, memory = random.Random(seed), Count(), shared_memory()
+    rng, work, memory = random.Random(seed), Work(), shared_memory()
     before, begun = open_files(), time.monotonic()
-    tag = secrets.token_hex(8)
-
-    def name(generation: int, reader: int) -> str:
-        return f"\0reem-slots-{tag}-{generation}-{reader}"
-
-    names = [name(0, reader) for reader in range(READERS)]
-    parties = [
-        *(Party(lambda end, it=it: publish(end, it, names, count)) for it in range(PUBLISHERS)),
-        *(Party(lambda end, it=it: read(end, PUBLISHERS + it, names[it], it * 0.004, count)) for it in range(READERS)),
-    ]
+    processes = [work.started(place) for place in range(PUBLISHERS + READERS)]
     kills, said = 0, begun
-    while count["seen"] + count["written"] < uses:
+    while work.total(SEEN) + work.total(WRITTEN) < uses:
         time.sleep(rng.uniform(0.0, 0.2))
-        victim = rng.choice(parties)
+        victim = rng.randrange(len(processes))
+        process = processes[victim]
         if rng.random() < 0.2:  # one that stands still has its slots, and keeps nobody from anything
-            victim.stop(signal.SIGSTOP)
+            os.kill(process.pid, signal.SIGSTOP)
             time.sleep(rng.uniform(0.0, 0.1))
-            victim.stop(signal.SIGCONT)
+            os.kill(process.pid, signal.SIGCONT)
         else:
-            victim.kill()
+            process.kill()
+            code = ended(process)
+            assert code == -signal.SIGKILL, f"a process has ended with {code}"
+            processes[victim] = work.started(victim)
             kills += 1
         if time.monotonic() > said + 20:
             said = time.monotonic()
-            print(
-                f"{count['written']:,} written, {count['seen']:,} seen, {kills} killed, {count['torn']} torn",
-                flush=True,
-            )
-    for party in parties[PUBLISHERS:] + parties[:PUBLISHERS]:
-        party.ask("stop")
-    ended = [party.end() for party in parties]
-    assert ended == [0] * len(parties), f"parties have ended with {ended}"
-    seconds = time.monotonic() - begun
+            print(f"{work.total(WRITTEN):,} written, {work.total(SEEN):,} seen, {kills} killed", flush=True)
+    codes = [work.end(place, process) for place, process in reversed([*enumerate(processes)])]  # publishers last
+    assert not any(codes), f"processes have ended with {codes}"
     print(
-        f"{count['written']:,} frames written and {count['seen']:,} seen in {seconds:.0f} s; {count['gone']:,} gone, "
-        f"{count['full']:,} found no slot; {kills} parties killed; {count['torn']} torn; "
-        f"{count['left']} descriptors left in the parties, {open_files() - before} here; "
+        f"{work.total(WRITTEN):,} frames written and {work.total(SEEN):,} seen in {time.monotonic() - begun:.0f} s; "
+        f"{work.total(GONE):,} gone, {work.total(FULL):,} found no slot; {kills} processes killed; "
+        f"{work.total(TORN)} torn; {work.total(LEFT)} descriptors left in them, {open_files() - before} here; "
         f"shared memory of the machine {memory} MB before, {shared_memory()} MB after"
     )
-    assert count["torn"] == 0
-    assert count["left"] == 0
+    assert (work.total(TORN), work.total(LEFT)) == (0, 0)
     assert open_files() == before
     deadline = time.monotonic() + PATIENCE
     while shared_memory() > memory + 64:  # others have some, too

@@ -238,17 +238,11 @@ def test_threads_are_named_daemons_and_gone_after_close(server_url, key):
 
 LEAVING = {
     "closed": "interface.close()",
-    "not closed": "pass",
-    "sys.exit": "sys.exit(0)",
-    "an accessor kept in a global cycle": "loop = [kvs]; loop.append(loop)",
-    "a subscriber listening": "sub = reem.SilentSubscriber(key, interface); sub.listen()",
     "a callback running": (
         "import time\n"
         "sub = reem.CallbackSubscriber(key, interface, lambda data, updated_path: time.sleep(0.3), {})\n"
         "sub.listen(); reem.PublishSpace(interface)[key] = 2; time.sleep(0.05)"
     ),
-    "a watch half read": "it = iter(kvs[key].watch()); next(it)",
-    "a write in an atexit function": "import atexit; atexit.register(lambda: kvs[key].write(5))",
     "a thread still working": (
         "import threading\n"
         "def work():\n"
