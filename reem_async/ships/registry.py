@@ -72,42 +72,29 @@ class Ships:
         self._registered: list[Registered] = []
         self._by_label: dict[str, Registered] = {}
         self.claimed: frozenset[type] = frozenset()  # JSON types of which a ship takes some values
-        self.asks_first = True  # whether there are such types, or asynchronous ships were not asked yet
-        # Ships that have to be awaited cannot be asked here; `ready` does it before the first call that needs them.
+        self.asks_first = bool(self.given)  # whether there are such types, or the ships were not asked yet
+        # Ships that have to be awaited cannot be asked here; `ready` is called before the first call that needs them.
         if not self.asynchronous:
-            self._claim(kind for ship in self.given for kind in _claims(ship))
-            for ship in self.given:
-                recorder = new_recorder()
-                ship.read(_STAND_IN, recorder)
-                label: Any = ship.get_label()
-                self._register(Registered(ship, label, _only(recorder.commands, ship)))
+            with suppress(StopIteration):  # which says that it is done: it waits for nothing
+                self.ready().send(None)
 
     async def ready(self) -> None:
-        """Ask asynchronous ships for their labels and read commands; does nothing the second time."""
+        """Ask the ships for their labels and read commands; does nothing the second time."""
         # Not a flag: several tasks may run this at once, and the list is complete only at the end.
         if len(self._registered) == len(self.given):
             return
         found: list[Registered] = []
         claimed: set[type] = set()
         for ship in self.given:
-            claimed.update(await _asked_claims(ship))
+            claimed.update(await _claims(ship))
             recorder = self.new_recorder()
             await _settled(ship.read(_STAND_IN, recorder))
             found.append(Registered(ship, await _settled(ship.get_label()), _only(recorder.commands, ship)))
         # Another task may have done the same in between: its equal result is replaced.
-        self._registered, self._by_label = [], {}
-        self._claim(claimed)
-        for registered in found:
-            self._register(registered)
-
-    def _claim(self, kinds: Iterable[type]) -> None:
-        self.claimed = frozenset(kinds)
-        self.asks_first = bool(self.claimed)
-
-    def _register(self, registered: Registered) -> None:
-        self._registered.append(registered)
-        # The first ship with a label reads, as it also writes.
-        self._by_label.setdefault(registered.label, registered)
+        self._registered, self._by_label = found, {}
+        self.claimed, self.asks_first = frozenset(claimed), bool(claimed)
+        for each in found:  # the first ship with a label reads, as it also writes
+            self._by_label.setdefault(each.label, each)
 
     def fits(self, value: Any) -> Registered | None:
         for each in self._registered:
@@ -157,22 +144,12 @@ async def _settled(result: Any) -> Any:
     return await result if inspect.isawaitable(result) else result
 
 
-def _claims(ship: SpecialDatatypeShip) -> Iterator[type]:
-    """Yield the JSON types that the ship names, or takes samples of."""
-    yield from getattr(ship, "claims", ())
-    # They take none; asking them would cost each new interface 40 calls.
-    if type(ship) in (NumpyShip, BytesShip):
-        return
-    for sample in _SAMPLES:
-        with suppress(Exception):  # it may expect other types
-            if ship.check_fit(sample):
-                yield type(sample)
-
-
-async def _asked_claims(ship: SpecialDatatypeShip) -> set[type]:
+async def _claims(ship: SpecialDatatypeShip) -> set[type]:
+    """Return the JSON types that the ship names, or takes samples of."""
     found: set[type] = set(getattr(ship, "claims", ()))
-    for sample in _SAMPLES:
-        with suppress(Exception):
+    # These take none; asking them would cost each new interface 40 calls.
+    for sample in () if type(ship) in (NumpyShip, BytesShip) else _SAMPLES:
+        with suppress(Exception):  # it may expect other types
             if await _settled(ship.check_fit(sample)):
                 found.add(type(sample))
     return found
