@@ -12,11 +12,11 @@ from typing import Any
 
 from ..concurrency.locks import Locks
 from ..concurrency.tasks import Tasks
-from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Held, document_of
+from .composite import OneServer
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .state import States
 from .text import HeldText, Text
@@ -34,13 +34,11 @@ _COMPANY, _PORTION = 0.1, 1 << 17
 It would take megabytes at once, and the event loop stands still meanwhile."""
 
 
-class AsyncTransport:
+class AsyncTransport(OneServer):
     """Connections of one interface in one event loop, made when first needed."""
 
-    sharded = False
-
     def __init__(self, options: Options) -> None:
-        self._options = options
+        super().__init__(options)
         self._loop: asyncio.AbstractEventLoop | None = None
         self._pid = 0
         self._closed = False
@@ -307,20 +305,6 @@ class AsyncTransport:
             await wire.roundtrip([_PING])
         self._leaving.discard(wire)
         await wire.close()
-
-    @property
-    def options(self) -> Options:
-        return self._options
-
-    @property
-    def timeout(self) -> float:
-        return time_limit(self._options.timeout)
-
-    async def owner(self, key: bytes, *, refresh: bool = False) -> AsyncTransport:
-        return self
-
-    async def nodes(self) -> Sequence[AsyncTransport]:
-        return (self,)
 
     async def pause(self, seconds: float) -> None:
         await asyncio.sleep(seconds)

@@ -24,6 +24,7 @@ from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
 from . import Held
+from .composite import OneServer
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
@@ -217,13 +218,11 @@ def keep_open_at_exit() -> None:
     _kept.set([line.kept_open() for transport in _all for line in list(transport._idle)])
 
 
-class BlockingTransport:
+class BlockingTransport(OneServer):
     """Connections for the threads of one process: as many as there are calls at the same time."""
 
-    sharded = False
-
     def __init__(self, options: Options) -> None:
-        self._options = options
+        super().__init__(options)
         self._closed = False
         self._keeps = True  # connections, for the next call
         self._text = Text(options.timeout)
@@ -324,20 +323,6 @@ class BlockingTransport:
             raise
         finally:
             self._give(line)
-
-    @property
-    def options(self) -> Options:
-        return self._options
-
-    @property
-    def timeout(self) -> float:
-        return time_limit(self._options.timeout)
-
-    async def owner(self, key: bytes, *, refresh: bool = False) -> BlockingTransport:
-        return self
-
-    async def nodes(self) -> Sequence[BlockingTransport]:
-        return (self,)
 
     async def pause(self, seconds: float) -> None:
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread

@@ -1,12 +1,13 @@
-"""What the ways to several servers have in common: one of them lends its locks and its event loop to all."""
+"""What the transports to one server have in common, and those to several: one lends its locks to the others."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import Protocol
+from typing import Protocol, Self
 
+from ..concurrency.timeouts import time_limit
 from . import Transport
 from .options import Options
 
@@ -23,6 +24,29 @@ class ToOneServer(Transport, Protocol):
 
 NewTransport = Callable[[Options], ToOneServer]
 """Makes the transport to one server: on an event loop, or for plain threads."""
+
+
+class OneServer:
+    """What the transports to one server have in common."""
+
+    sharded = False
+
+    def __init__(self, options: Options) -> None:
+        self._options = options
+
+    @property
+    def options(self) -> Options:
+        return self._options
+
+    @property
+    def timeout(self) -> float:
+        return time_limit(self._options.timeout)
+
+    async def owner(self, key: bytes, *, refresh: bool = False) -> Self:
+        return self
+
+    async def nodes(self) -> Sequence[Self]:
+        return (self,)
 
 
 class CompositeTransport(ABC):
