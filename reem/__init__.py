@@ -17,12 +17,12 @@ from reem_async.concurrency.queues import Every, Last, Newest
 from reem_async.plan.placeholders import Unreadable
 from reem_async.pubsub.events import Origin, Update
 
-from .accessor import Accessor
+from .accessor import Accessor, Publisher, Reader, Writer
 from .connection import RedisInterface
 from .errors import *
-from .publish import Publisher, PublishSpace
+from .publish import PublishSpace
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
-from .store import KeyValueStore, Reader, Writer
+from .store import KeyValueStore
 from .subscribe import CallbackSubscriber, SilentSubscriber
 
 if clash := original_reem():

@@ -20,8 +20,6 @@ from .connection import RedisInterface
 from .mirror import Mirror
 from .subscribe import Watch
 
-__all__ = ["Accessor", "Edit", "PublishAccessor", "Publisher", "Reader", "Writer"]
-
 
 @documented_by(core.Reader)
 class Reader:

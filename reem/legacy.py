@@ -21,8 +21,7 @@ from reem_async.store.document import DocumentWriter
 from reem_async.store.store import _NOTHING
 from reem_async.store.store import KeyValueStore as CoreStore
 
-from .accessor import Accessor, PublishAccessor
-from .publish import Publisher
+from .accessor import Accessor, PublishAccessor, Publisher
 from .store import KeyValueStore
 
 __all__ = [

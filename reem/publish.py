@@ -7,10 +7,8 @@ from typing import Any
 from reem_async.store import publish as core
 
 from ._twin import documented_by
-from .accessor import PublishAccessor, Publisher
+from .accessor import PublishAccessor
 from .store import KeyValueStore
-
-__all__ = ["PublishSpace", "Publisher"]
 
 
 @documented_by(core.PublishSpace)

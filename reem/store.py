@@ -10,11 +10,9 @@ from reem_async.errors import RedisError, ReemError
 from reem_async.store import store as core
 
 from ._twin import documented_by
-from .accessor import Accessor, Reader, Writer
+from .accessor import Accessor
 from .connection import RedisInterface
 from .subscribe import PatternWatch
-
-__all__ = ["KeyValueStore", "Reader", "Writer"]
 
 
 @documented_by(core.KeyValueStore)
