@@ -14,11 +14,9 @@ from ..plan.keys import Keys
 from ..plan.paths import Path, shorten
 from ..plan.shapes import ShapeCache
 
-METADATA = "&&&&metadata"
-"""The end of the name of a key's second document."""
+METADATA = "&&&&metadata"  # the end of the name of a key's second document
 
-ROOT = "%%%%ROOT%%%%"
-"""The entry of a value that is no dict."""
+ROOT = "%%%%ROOT%%%%"  # the entry of a value that is no dict
 
 _ROOT = ROOT.encode()
 

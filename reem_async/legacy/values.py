@@ -13,8 +13,7 @@ from ..plan.paths import Path, shorten
 from ..ships.numpy import NumpyShip
 from .olddata import ROOT, candidates
 
-ARRAY_LABEL = "default_numpy_handler"
-"""The label of the ship for arrays."""
+ARRAY_LABEL = "default_numpy_handler"  # the label of the ship for arrays
 
 ARRAY_FIELDS = frozenset({b"arr", b"dtype", b"shape"})
 _MORE_FIELDS = frozenset({b"strides"})

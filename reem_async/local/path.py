@@ -20,25 +20,17 @@ if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from .reader import LocalReader
     from .segment import HEAD, SLOTS, Segment
 
-LEAST = 1 << 16
-"""Bytes from which a value goes through shared memory: below, a fetch from the server takes no longer."""
+LEAST = 1 << 16  # bytes from which a value goes through shared memory: below, a fetch from the server takes no longer
 
-MEMORY = 256 << 20
-"""Bytes of shared memory of one interface, unless another number is given."""
+MEMORY = 256 << 20  # bytes of shared memory of one interface, unless another number is given
 
 _MODES = ("auto", "off", "early")
-_SEGMENTS = 64
-"""Keys of one interface that have a segment at a time; each takes two file descriptors."""
-_ASKED = 1.0
-"""Seconds for which an answer holds of how many processes near by listen to a key."""
-_REFUSED = 60.0
-"""Seconds after which a server is asked again that has refused to say."""
-_IDLE = 10.0
-"""Seconds after which a segment that was not written is given up, with the next large value of any key."""
-_GROWTH = 2
-"""Times the room of the segment before, where a value has outgrown that."""
-_KEYS = 1000
-"""Keys whose local audience is cached."""
+_SEGMENTS = 64  # keys of one interface that have a segment at a time; each takes two file descriptors
+_ASKED = 1.0  # seconds for which an answer holds of how many processes near by listen to a key
+_REFUSED = 60.0  # seconds after which a server is asked again that has refused to say
+_IDLE = 10.0  # seconds after which a segment that was not written is given up, with the next large value of any key
+_GROWTH = 2  # times the room of the segment before, where a value has outgrown that
+_KEYS = 1000  # keys whose local audience is cached
 
 
 class LocalPath:

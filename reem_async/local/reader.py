@@ -23,21 +23,17 @@ from ..concurrency.wakeup import Descriptor
 from ..plan.notices import Slot
 from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, lock_for_reading, stamp_at
 
-_MAPPINGS = 64
-"""Segments that are kept mapped: so many cameras that publish through one host."""
+_MAPPINGS = 64  # segments that are kept mapped: so many cameras that publish through one host
 
 _PINS = 3
 """Slots of a segment that may be looked into at a time: what a slow callback works on, the newest, and the one that
 takes its place. A program that keeps more gets copies, so that collecting frames does not use up the slots."""
 
-_IDLE = 10.0
-"""Seconds after which a segment is unmapped that nothing was looked for in."""
+_IDLE = 10.0  # seconds after which a segment is unmapped that nothing was looked for in
 
 _MOST_SLOTS = 64
-_LARGEST = 1 << 34
-"""Bytes of a segment: no publisher makes one of 16 GB."""
-_BLOCK = 512
-"""Bytes of what `st_blocks` counts, whatever the file system's blocks are."""
+_LARGEST = 1 << 34  # bytes of a segment: no publisher makes one of 16 GB
+_BLOCK = 512  # bytes of what `st_blocks` counts, whatever the file system's blocks are
 
 
 class _Pin(NamedTuple):

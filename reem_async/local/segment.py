@@ -27,14 +27,11 @@ import numpy as np
 from ..concurrency.wakeup import Descriptor
 from ..plan.notices import starts
 
-SLOTS = 6
-"""One that is written, three for a subscriber (see `reader.py`), two for others that are not as far."""
+SLOTS = 6  # one that is written, three for a subscriber (see `reader.py`), two for others that are not as far
 
-NAME = "reem"
-"""Of the file, for a look at the descriptors of a process."""
+NAME = "reem"  # of the file, for a look at the descriptors of a process
 
-HEAD = 4096
-"""Bytes before the first slot: a page."""
+HEAD = 4096  # bytes before the first slot: a page
 
 IDENTITY = struct.Struct("<8sQQ")
 """What every segment begins with: a mark, how many slots it has, and the bytes of each."""

@@ -39,8 +39,7 @@ from .gaps import GapDetector, Numbered
 
 U = TypeVar("U", bound=Numbered)
 T = TypeVar("T")
-_TRIES = 10
-"""Maximum attempts; exceeded only if an unseen publisher keeps writing."""
+_TRIES = 10  # maximum attempts; exceeded only if an unseen publisher keeps writing
 
 
 class Phase(Enum):

@@ -117,8 +117,7 @@ class Failed(NamedTuple):
 Output = Step | Look | Updated | Stored | Skipped | Snapshot | Ready | Failed
 
 
-_UNKNOWN: Any = object()
-"""A copy of which it is not known what it was."""
+_UNKNOWN: Any = object()  # a copy of which it is not known what it was
 
 
 class Report(Enum):

@@ -9,8 +9,7 @@ from collections.abc import Awaitable, Callable, Iterable
 from ..plan.paths import Pattern
 from ..session import Session
 
-_PERIOD = 1.0
-"""Seconds between searches."""
+_PERIOD = 1.0  # seconds between searches
 _PAUSE = 10
 """The time until the next search is at least so many times as long as the last one took. A server with a million keys
 is asked for a thousand pages, and has other things to do."""

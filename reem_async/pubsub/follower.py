@@ -36,8 +36,7 @@ from .replica import Arm, Failed, Fence, Look, Open, Output, Read, Ready, Replic
 
 logger = logging.getLogger("reem.subscribe")
 
-_PROBE_PERIOD = 1.0
-"""Seconds between probes of a document for a listener that needs no more of them."""
+_PROBE_PERIOD = 1.0  # seconds between probes of a document for a listener that needs no more of them
 
 
 class Follower(Listener):

@@ -11,11 +11,9 @@ from ..plan.notices import parsed_note
 
 # Ids of interfaces. A stranger may make up any number of them, so what is kept of them is bounded.
 _MOST_PUBLISHERS = 10_000
-_RECENT = 256
-"""Updates that are known again if they come twice."""
+_RECENT = 256  # updates that are known again if they come twice
 
-Stamp = tuple[str, int, float]
-"""Publisher, number and time of an update."""
+Stamp = tuple[str, int, float]  # publisher, number and time of an update
 
 
 class Numbered(Protocol):

@@ -38,8 +38,7 @@ _GONE = QUIET + 30.0
 """Seconds without a key and without an update of it until it is dropped: by then no publisher still assumes that this
 process follows the key."""
 
-_MOST = 10_000
-"""Keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes."""
+_MOST = 10_000  # keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes
 
 _TAIL = "}:notices"
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)

@@ -35,11 +35,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("reem.subscribe")
 
-_LONGEST_PAUSE = 0.5
-"""Seconds between tries to connect: with one that hangs before it, still less than two in all."""
+_LONGEST_PAUSE = 0.5  # seconds between tries to connect: with one that hangs before it, still less than two in all
 
-_MOST_REPORTED = 1000
-"""Places that cannot be read of which is warned: programs may publish under ever new names."""
+_MOST_REPORTED = 1000  # places that cannot be read of which is warned: programs may publish under ever new names
 
 
 def manager_of(session: Session) -> SubscriptionManager:

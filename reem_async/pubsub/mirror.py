@@ -20,14 +20,10 @@ from ..session import Session
 from .follower import Follower, checked_largest, own
 from .subscribers import Link, LocalAccessor
 
-_PROBES = 3
-"""Probes in the time of `max_age`."""
-_SHORTEST = 0.005
-"""Seconds that `max_age` has at least: probes are a load too."""
-_RETRY = 0.02
-"""Seconds after which a waiting caller looks again at a copy that was too old."""
-_MOST_STATES = 1000
-"""States of the copy that wait for a predicate; of more, the oldest are dropped."""
+_PROBES = 3  # probes in the time of `max_age`
+_SHORTEST = 0.005  # seconds that `max_age` has at least: probes are a load too
+_RETRY = 0.02  # seconds after which a waiting caller looks again at a copy that was too old
+_MOST_STATES = 1000  # states of the copy that wait for a predicate; of more, the oldest are dropped
 _NO_STATE: Any = object()
 
 

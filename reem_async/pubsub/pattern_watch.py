@@ -26,10 +26,8 @@ from .patterns import PatternStream
 
 logger = logging.getLogger("reem.subscribe")
 
-_MOST_WAITING = 1000
-"""Updates that wait for a loop that is slower, if no policy is given."""
-_MOST_BORN = 1000
-"""Notices of a key that is about to be followed; more are read with it."""
+_MOST_WAITING = 1000  # updates that wait for a loop that is slower, if no policy is given
+_MOST_BORN = 1000  # notices of a key that is about to be followed; more are read with it
 
 
 class PatternWatch(PatternStream[Update]):

@@ -18,8 +18,7 @@ class Pace(NamedTuple):
     notice_delay: float = 0.0  # in which the notice of a change may come behind the report of it
 
 
-LIVE = Pace(0.001, 0.02)
-"""Of subscribers. A key that is stored at any rate is read 1,000 times a second at most."""
+LIVE = Pace(0.001, 0.02)  # of subscribers. A key that is stored at any rate is read 1,000 times a second at most.
 BACKGROUND = Pace(0.02, 0.5, 0.015)
 """Of recordings and the page. Their notices wait for each other up to 10 ms, which is less than the notice delay."""
 BACKGROUND_RATE = 8 << 20

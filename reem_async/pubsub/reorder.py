@@ -19,12 +19,10 @@ if TYPE_CHECKING:
     from .gaps import Stamp
     from .listeners import Listener
 
-_PATIENCE = 0.5
-"""Seconds to wait for what is older: ten times as long as nodes took to pass it on."""
+_PATIENCE = 0.5  # seconds to wait for what is older: ten times as long as nodes took to pass it on
 _REMEMBERED = 5.0
 """Seconds for which is remembered what all nodes were told, once the key's own node is listened to: it may be late."""
-_MOST = 10_000
-"""Updates that wait or are remembered: anybody may publish under made-up names."""
+_MOST = 10_000  # updates that wait or are remembered: anybody may publish under made-up names
 
 
 class ReorderBuffer:

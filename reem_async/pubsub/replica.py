@@ -74,8 +74,7 @@ __all__ = [
 ]  # fmt: skip
 
 
-_PATIENT = 3
-"""Notes, one a second, after which what was told early should have been confirmed: at least two seconds."""
+_PATIENT = 3  # notes, one a second, after which what was told early should have been confirmed: at least two seconds
 
 
 class Outcome(Enum):
@@ -102,8 +101,7 @@ class State(Enum):
 
 
 _OFFLINE, _CURRENT = State.OFFLINE, State.CURRENT  # an attribute of an Enum takes 40 ns
-_AT_REST = State.CURRENT, State.UNREAD, State.BROKEN
-"""No read is under way."""
+_AT_REST = State.CURRENT, State.UNREAD, State.BROKEN  # no read is under way
 
 
 class Replica:

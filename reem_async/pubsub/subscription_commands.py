@@ -20,8 +20,7 @@ logger = logging.getLogger("reem.subscribe")
 
 _TRACK = ("CLIENT", "TRACKING", "ON")
 """Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
-_PERIOD = 1.0
-"""Seconds between looks at a connection; one that is dead shows a call's time limit later."""
+_PERIOD = 1.0  # seconds between looks at a connection; one that is dead shows a call's time limit later
 
 
 class Subscribing:
