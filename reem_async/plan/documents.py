@@ -13,7 +13,7 @@ import enum
 import marshal
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
@@ -40,16 +40,7 @@ _OPTIONS = orjson.OPT_PASSTHROUGH_DATACLASS | orjson.OPT_PASSTHROUGH_DATETIME
 _LOWEST, _HIGHEST = -(2**63), 2**64 - 1
 
 
-class Carrier(Protocol):
-    """As much of a ship as a document needs to know."""
-
-    label: str
-
-    def describe(self, value: Any, /) -> tuple[int, str]:
-        """Return bytes and a summary; raises BadType or BadValue."""
-
-
-Fits = Callable[[Any], Carrier | None]  # returns the ship for a value that is not JSON, or None
+Fits = Callable[[Any], Any]  # returns the ship for a value that is not JSON, or None
 
 
 class Attachment(NamedTuple):
@@ -261,7 +252,7 @@ class _Walker:
                 return self.convert(plain_value(value), path)
         raise self._refusal(value, path)
 
-    def _parcel(self, ship: Carrier, value: Any, path: Path) -> str:
+    def _parcel(self, ship: Any, value: Any, path: Path) -> str:
         try:
             size, summary = ship.describe(value)
         except (BadType, BadValue) as error:
