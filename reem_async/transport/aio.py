@@ -359,6 +359,10 @@ class AsyncTransport(OneServer):
         self._begin()
 
     def retire(self) -> bool:
+        """Close the connections on which nothing is due, since no new calls will come; return whether all are closed.
+
+        To be called again if not. One that is given back, in a blocking program, is closed then.
+        """
         if self._loop is asyncio.get_running_loop():
             for wire in (*self._lanes.values(), *self._spare):
                 if not wire.busy:

@@ -5,24 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Iterable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import Protocol, Self
+from typing import Any, Self
 
 from ..concurrency.timeouts import time_limit
 from . import Transport
 from .options import Options
 
-
-class ToOneServer(Transport, Protocol):
-    """The transport to one server."""
-
-    def retire(self) -> bool:
-        """Close the connections on which nothing is due, since no new calls will come; return whether all are closed.
-
-        To be called again if not. One that is given back, in a blocking program, is closed then.
-        """
-
-
-NewTransport = Callable[[Options], ToOneServer]
+NewTransport = Callable[[Options], Any]
 """Makes the transport to one server: on an event loop, or for plain threads."""
 
 

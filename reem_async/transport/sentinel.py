@@ -15,7 +15,7 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, suppress
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import redis.exceptions
 
@@ -24,12 +24,11 @@ from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused,
 from ..plan import Command, Reply
 from . import Held, Transport
 from .addresses import address_of, listed
-from .composite import CompositeTransport, NewTransport, ToOneServer
+from .composite import CompositeTransport, NewTransport
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
 from .state import States
 
 if TYPE_CHECKING:
-    from .aio import AsyncTransport
     from .wire import Wire
 
 _LOOK_PAUSE = 1.0  # seconds between questions to the sentinels
@@ -214,11 +213,11 @@ class SentinelTransport(CompositeTransport):
     def __init__(self, options: SentinelOptions, new_transport: NewTransport) -> None:
         self._options = options
         self._new_transport = new_transport
-        self._now: ToOneServer = new_transport(options)
+        self._now: Any = new_transport(options)
         self._root = self._now  # for what must outlive a failover: locks and the event loop
         self._states = self._root.states
         # Ways to primaries of before on which calls still wait for replies.
-        self._demoted: list[ToOneServer] = []
+        self._demoted: list[Any] = []
         # Subscription connections: a primary of before sends nothing any more, and would not be missed.
         self._listening: WeakList[Wire] = WeakList()
         self._lookout: _Lookout | None = None
@@ -229,7 +228,7 @@ class SentinelTransport(CompositeTransport):
         now = self._current()
         return self._checked(now, await now.roundtrip(commands, bulk=bulk))
 
-    def _current(self) -> ToOneServer:
+    def _current(self) -> Any:
         """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
             self._lookout = _Lookout(self._options, self)
@@ -250,7 +249,7 @@ class SentinelTransport(CompositeTransport):
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         self._root.check()
-        wire = await cast("AsyncTransport", self._current()).listen(on_push, on_lost)
+        wire: Wire = await self._current().listen(on_push, on_lost)
         self._listening.add(wire)
         return wire
 
