@@ -129,10 +129,6 @@ class Monitor(PatternStream[Event]):
         self.changed: Callable[[str | None], None] = lambda key: None
         self._resynchronising = False  # that it resynchronises, in this turn of the event loop
 
-    async def listen(self) -> None:
-        """Begin to follow. When this returns, no later update is missed. Idempotent; one round trip a pattern."""
-        await super().listen()
-
     def _listener(self, topic: Topic) -> Listener:
         return _PatternListener(self, topic)
 

@@ -62,10 +62,6 @@ class PatternWatch(PatternStream[Update]):
         self._unreadable: dict[str, tuple[Path, ...]] = {}  # places in keys, because of what is there, or of rights
         self._warned: set[tuple[str, Path]] = set()
 
-    async def listen(self) -> None:
-        """Begin to follow. When this returns, no later change is missed. Idempotent; a few round trips for each key."""
-        await super().listen()
-
     def _listener(self, topic: Topic) -> Listener:
         return _Publishers(self, topic)
 

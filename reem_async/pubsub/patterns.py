@@ -23,7 +23,7 @@ class PatternStream(Stream[Item]):
     def __init__(self, session: Session, patterns: Sequence[Pattern], policy: Policy) -> None:
         super().__init__(policy)
         self.patterns = list(patterns) or [Pattern("*")]
-        self.tops = list(dict.fromkeys(pattern.top for pattern in self.patterns))
+        self.tops = list(dict.fromkeys(pattern.top for pattern in self.patterns))  # globs of top-level keys
         self._session = session
         self._listeners: list[Listener] = []
         self._manager: SubscriptionManager | None = None
@@ -38,6 +38,10 @@ class PatternStream(Stream[Item]):
         return self._begun or self._closed
 
     async def listen(self) -> None:
+        """Begin to follow. When this returns, no later change is missed. Idempotent.
+
+        One round trip for each pattern, and a few for each key that a watch of patterns follows.
+        """
         if self._closed:
             raise InterfaceClosed(f"this {type(self).__name__} is closed; make a new one")
         if self._begun:
