@@ -85,11 +85,7 @@ def path_in(request: Request) -> Path:
 
 
 def value_path_in(request: Request) -> Path:
-    """Return the path asked for, which must lead to a value: the root is none.
-
-    Raises:
-        BadValue: It is missing or empty.
-    """
+    """Return the path asked for, which must lead to a value; raises BadValue for the root."""
     path = path_in(request)
     if not path:
         raise BadValue("path= is missing; give a key, such as path=foo.bar")
@@ -133,11 +129,7 @@ def told(handler: Callable[[Request], Awaitable[Response]]) -> Callable[[Request
 
 
 async def body_of(request: Request) -> Any:
-    """Return the JSON a request carries.
-
-    Raises:
-        RefusedRequest: More than `LARGEST_BODY`, or not JSON.
-    """
+    """Return the JSON a request carries; raises RefusedRequest for more than `LARGEST_BODY`, or no JSON."""
     if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
         raise RefusedRequest(415, "send application/json")
     body = bytearray()
@@ -178,11 +170,7 @@ _LONGEST_TEXT = 200_000
 
 
 class Api:
-    """Answers about one source.
-
-    Args:
-        allow_write: Whether values may be changed.
-    """
+    """Answers about one source. Values may be changed if `allow_write`."""
 
     def __init__(self, source: Source, allow_write: bool) -> None:
         self._source = source

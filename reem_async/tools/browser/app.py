@@ -217,11 +217,7 @@ class PageServer(uvicorn.Server):
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket bound to a port, 0 for a free one.
-
-    Raises:
-        ServerFailed: The port is taken, or the address is not one of this machine.
-    """
+    """Return a socket bound to a port, 0 for a free one; raises ServerFailed."""
     try:
         family, _, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
         # asyncio turns Nagle's algorithm off, 40 ms for each answer, where it sees that this is TCP.

@@ -81,8 +81,7 @@ def _leading(shape: tuple[int, ...], free: int) -> Slice:
 def parse_slice(text: str, shape: tuple[int, ...], most_free: int) -> Slice:
     """Return the part that `text` names, such as "0,:,:".
 
-    Raises:
-        BadValue: Not one colon or index within its axis for each of the axes, or too many colons.
+    Raises BadValue unless it has a colon or an index for each axis, within it, and `most_free` colons at most.
     """
     words = [word.strip() for word in text.split(",")] if text.strip() else []
     if len(words) != len(shape):

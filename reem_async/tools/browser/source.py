@@ -30,11 +30,7 @@ def address(path: Path) -> str:
 
 
 def path_of(text: str) -> Path:
-    """Return the path whose address is `text`, or which a user typed.
-
-    Raises:
-        BadKey: Not a path, such as `../etc`, or one that is far too long.
-    """
+    """Return the path whose address is `text`, or which a user typed; raises BadKey for one such as `../etc`."""
     if len(text) > _LONGEST:
         raise BadKey(f"a path of {len(text)} characters is too long; shorten it to {_LONGEST}")
     path = parse_suffix(text if text[0] == "[" else "." + text) if '["' in text else parse(text)

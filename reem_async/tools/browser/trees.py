@@ -74,12 +74,9 @@ def described(value: Any) -> Unfetched:
 
 
 def tree_of(text: bytes, name: str) -> Any:
-    """Return the tree in a document's text, an `Unfetched` in the place of each placeholder.
+    """Return the tree in a document's text, an `Unfetched` in the place of each placeholder. Raises BadData.
 
     In the place of something that looks like a placeholder and is none there is an `Unreadable`.
-
-    Raises:
-        BadData: It is no JSON.
     """
     try:
         holder = [orjson.loads(text)]
