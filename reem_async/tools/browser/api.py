@@ -179,14 +179,8 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        asked = {
-            "tree": self.tree,
-            "series": self.series,
-            "step": self.step,
-            "activity": self.activity,
-            "search": self.search,
-        }
-        routes = [Route(f"/{name}", answered(handler), methods=["GET"]) for name, handler in asked.items()]
+        asked = self.tree, self.series, self.step, self.activity, self.search
+        routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         return [*routes, Route("/write", answered(self.write), methods=["POST"])]
 
