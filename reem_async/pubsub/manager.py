@@ -347,7 +347,8 @@ class SubscriptionManager:
         for listener in listeners:
             listener.lost(reason)
         if listeners and not self._closed:
-            logger.warning("the subscription connection was lost and is made again: %s", reason)
+            why = str(reason).removesuffix("; the call was applied once or not at all")  # this is no call
+            logger.warning("the subscription connection was lost, reconnecting: %s", why)
             self.transport.states.lost(reason)
             self.transport.states.retrying()
         self._repair()
