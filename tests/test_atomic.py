@@ -185,21 +185,6 @@ def test_a_plain_read_is_one_command_and_a_plain_write_needs_no_transaction(fron
 # --- changes of shape ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "array", [np.arange(3), b"bytes", [np.arange(2), {"x": np.arange(4)}]], ids=["array", "bytes", "list"]
-)
-def test_a_write_refused_by_the_server_leaves_no_arrays(front, key, raw, array):
-    """The document part cannot be set, so its arrays must not stay either, nor replace others."""
-    front.write([key()], {"scalar": 1, "image": np.zeros(2), "l": [np.ones(1)]})
-    before = set(raw.scan_iter(match=f"*{key()}*"))
-    for path in (["scalar", "x"], ["gone", "x"], ["image", "x"], ["l", 5], ["l", 0, "x"], ["image", 0]):
-        with pytest.raises(PathRefused):
-            front.write([key(), *path], array)
-        assert set(raw.scan_iter(match=f"*{key()}*")) == before
-    assert_same(front.read([key()]), {"scalar": 1, "image": np.zeros(2), "l": [np.ones(1)]})
-    assert_no_orphans(raw, key())
-
-
 @pytest.mark.parametrize("published", [False, True], ids=["store", "space"])
 def test_arrays_of_a_write_that_cannot_be_are_not_even_sent(interface, key, raw, published):
     """If the connection broke just then, nobody would take them away."""

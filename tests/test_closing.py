@@ -149,14 +149,6 @@ def test_a_task_that_is_slow_to_end_keeps_no_connection_open(server_url, key):
     assert followers.local._off  # the last of what closing does
 
 
-def test_a_watch_that_is_closed_after_its_interface_ends(server_url, key):
-    interface = reem.RedisInterface(server_url)
-    watch = reem.KeyValueStore(interface)[key()].watch()
-    interface.close()
-    watch.close()
-    assert list(watch) == []
-
-
 def test_closing_a_subscriber_ends_loops_over_it(interface, pspace, key):
     """In other threads, one over a subscriber with callbacks too."""
     pspace[key()] = 1

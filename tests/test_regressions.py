@@ -17,7 +17,7 @@ from test_ships import Pose, PoseShip
 
 import reem
 import reem_async
-from reem_async.errors import BadData, BadKey, BadType, BadValue, ConnectionLost, NotConnected, WrongLoop
+from reem_async.errors import BadData, BadKey, BadType, ConnectionLost, NotConnected, WrongLoop
 
 A = np.arange(3.0)
 
@@ -193,13 +193,6 @@ async def test_an_edit_works_after_its_connection_was_killed_while_it_lay_idle(s
             await asyncio.sleep(0.05)
             assert killed, "nothing was kept"
             assert await kvs[key()]["n"].read() == n
-
-
-def test_the_older_protocol_is_refused():
-    """Notices and replies share a connection, which only protocol 3 can do."""
-    for module in (reem, reem_async):
-        with pytest.raises(BadValue, match="protocol"):
-            module.RedisInterface("localhost", protocol=2)
 
 
 # --- ships ----------------------------------------------------------------------------------------

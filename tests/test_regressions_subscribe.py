@@ -143,9 +143,10 @@ async def test_closing_a_subscriber_after_its_interface_is_quiet(server_url, key
         module.SilentSubscriber(key(), interface),
         module.CallbackSubscriber(key(), interface, lambda data, updated_path: None),
         module.KeyValueStore(interface)[key()].watch(),
-        module.SilentSubscriber(key(), interface),  # never listens
+        module.SilentSubscriber(key(), interface),  # these never listen
+        module.KeyValueStore(interface)[key()].watch(),
     ]
-    for each in made[:-1]:
+    for each in made[:-2]:
         await done(each.listen())
     await done(interface.close())
     for each in made:

@@ -308,6 +308,9 @@ def test_options_that_would_only_fail_later_are_refused_at_once(certificates, tm
         reem.RedisInterface("rediss://localhost", ssl_cert_reqs="never")
     with pytest.raises(reem.BadValue, match="options"):
         reem.RedisInterface("localhost", port="abc")
+    for package in (reem, reem_async):  # notices and replies share a connection, which only protocol 3 can do
+        with pytest.raises(reem.BadValue, match="protocol"):
+            package.RedisInterface("localhost", protocol=2)
 
 
 @pytest.fixture(scope="module")
