@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import re
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -24,7 +23,7 @@ from ...plan.placeholders import Unfetched
 from ..jsontext import json_text
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
 from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
-from .source import NotKept, Sample, Source, address, shown_text, thinned
+from .source import NotKept, Sample, Source, address, finite, shown_text, thinned
 from .trees import described
 
 # Tables, lines and histograms: as much of an array as a screen has room for.
@@ -92,7 +91,7 @@ def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
     return {
         "names": names,
         "times": places,
-        "lines": [[_finite(item) for item in column] for column in columns[places].T.tolist()],
+        "lines": [[finite(item) for item in column] for column in columns[places].T.tolist()],
         "more": total - columns.shape[1],
         "magnitude": magnitude,
     }
@@ -139,11 +138,6 @@ def statistics(array: np.ndarray[Any, Any]) -> dict[str, Any]:
 def _sampled(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     flat = array.reshape(-1)
     return flat[:: -(-flat.size // _SAMPLE)] if flat.size > _SAMPLE else flat
-
-
-def _finite(item: Any) -> float | None:
-    number = float(item)
-    return number if math.isfinite(number) else None
 
 
 # Files: `/view/<path>?format=json`, `npy`, `csv`, `png` or `bin`.

@@ -12,7 +12,6 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from itertools import islice
@@ -298,7 +297,7 @@ class Follower:
         self._owing: dict[str, None] = {}  # keys with arrays to be read
         self._news, self._owes = asyncio.Event(), asyncio.Event()
         self._shared: dict[str, float] = {}  # when the last value of a key came that is in shared memory too
-        self.names: list[str] = []  # the top-level keys, sorted
+        self.names: set[str] = set()  # the top-level keys
         # Keys that were there when following began and were not read yet: what they hold is no change
         self.unread: set[str] = set()
         self.lost = ""  # why the server cannot be read at the moment; empty if all is well
@@ -309,7 +308,7 @@ class Follower:
         await self._interface.initialize()
         await self._monitor.listen()
         await self._monitor.watch_changes()
-        self.names = sorted(await self._present())
+        self.names = await self._present()
         self.unread.update(self.names)
         self.read_soon(self.names)
         for work in (self._follow(), self._read_documents(), self._read_arrays(), find_regularly(self._search)):
@@ -369,25 +368,15 @@ class Follower:
                 self._shared.clear()
             self._shared[name] = time.monotonic()
         if len(event.path) == 1 and event.deleted:
-            self._forget(name)
+            self.names.discard(name)
         elif len(event.path) == 1 or name not in self.history.names:
-            self._note_name(name)
+            self.names.add(name)
+            if not self.history.knows(name) and name not in self.unread:
+                self.history.begin(name, None)
         when = self.history.clock.of(event.received)
         value = MISSING if event.deleted else PENDING if event.value is ANNOUNCED else event.value
         self.history.add(event.path, value, 0 if value is PENDING else event.size, when)
         self.key(name).hear(event)
-
-    def _note_name(self, name: str) -> None:
-        if not self.history.knows(name) and name not in self.unread:
-            self.history.begin(name, None)
-        index = bisect_left(self.names, name)
-        if self.names[index : index + 1] != [name]:
-            self.names = [*self.names[:index], name, *self.names[index:]]
-
-    def _forget(self, name: str) -> None:
-        index = bisect_left(self.names, name)
-        if self.names[index : index + 1] == [name]:
-            self.names = [*self.names[:index], *self.names[index + 1 :]]
 
     # --- what the server says was changed
 
@@ -500,7 +489,7 @@ class Follower:
         before = set(self.names)
         present = await self._present()
         # The list may be older than what was heard meanwhile.
-        present.update(set(self.names) - before)
-        self.names = sorted(present)
+        present.update(self.names - before)
+        self.names = present
         self.read_soon(name for name in self.names if name not in self._keys or not self._keys[name].feed.tracked)
         self.read_soon(before - present)

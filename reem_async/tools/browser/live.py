@@ -148,7 +148,7 @@ class LiveSource:
     def _names(self, at: float | None) -> Sequence[str]:
         names = self._follower.names
         if at is None:
-            return names
+            return sorted(names)
         # None: not known, so what is there now is taken to have been there then.
         known = {name: self.history.existed(name, at) for name in self.history.names}
         present = {name for name in names if known.get(name) is not False}

@@ -268,10 +268,10 @@ def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:
     width = max([len(row) for _, row in pairs if isinstance(row, list)], default=0)
     times = [when for when, _ in pairs]
     if not width:
-        lines = [[_number(value) for _, value in pairs]]
+        lines = [[finite(value) for _, value in pairs]]
     else:
         rows = [row if isinstance(row, list) else [row] for _, row in pairs]
-        lines = [[_number(row[index]) if index < len(row) else None for row in rows] for index in range(width)]
+        lines = [[finite(row[index]) if index < len(row) else None for row in rows] for index in range(width)]
     if all(number is None for line in lines for number in line):
         return Series([], [], [])
     return Series([f"[{index}]" for index in range(width)] if width else [""], times, lines)
@@ -306,7 +306,7 @@ def is_small_vector(value: Any) -> bool:
     return isinstance(value, Unfetched | Frame | np.ndarray) and described(value).size <= _LARGEST_VECTOR
 
 
-def _number(value: Any) -> float | None:
+def finite(value: Any) -> float | None:
     if type(value) is not float and not isinstance(value, bool | int | float):
         return None
     number = float(value)
