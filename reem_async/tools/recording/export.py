@@ -6,7 +6,7 @@ import csv
 import io
 import itertools
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path as FilePath
 from typing import Any
@@ -40,30 +40,29 @@ class Export:
         self.stored = ""
         self.unreadable = 0  # updates that were left out, since they are damaged or of a type that was not recorded
 
-    def begin(self, columns: Iterable[str]) -> None:
-        """Take the names of the columns, with those for what was deleted or only stored; BadValue if there is no other.
+    def begin(self, keys: Collection[str]) -> list[str]:
+        """Name the columns, and return the keys of their cells; BadValue if only deleted or stored paths have any.
 
         These two come last, so that tables of recordings without them are as they always were.
         """
-        given = list(columns)
-        self.columns = [name for name in given if name not in (_DELETED, _STORED)]
-        if not self.columns:
+        special = [key for key in (_DELETED, _STORED) if key in keys]
+        plain = [key for key in keys if key not in special]
+        self.columns = plain.copy()
+        if not plain:
             raise BadValue("nothing of this can be exported so: no number or text was recorded under these patterns")
         while self.time in self.columns:
             self.time = f"_{self.time}"
-        if _DELETED in given:
+        if _DELETED in special:
             self.deleted = self._add("deleted")
-        if _STORED in given:
+        if _STORED in special:
             self.stored = self._add("stored")
+        return [*plain, *special]
 
     def _add(self, name: str) -> str:
         while name in self.columns:
             name = f"_{name}"
         self.columns.append(name)
         return name
-
-    def named(self, cells: dict[str, Any]) -> dict[str, Any]:
-        return cells | {self.deleted: cells.get(_DELETED), self.stored: cells.get(_STORED)}
 
 
 def export(
@@ -136,7 +135,7 @@ def _name(path: Path) -> str:
 
 
 def _columns(log: Log, patterns: Sequence[str], result: Export) -> dict[str, set[type]]:
-    """Take the columns of all rows, which must be known before the first row; return the types in each.
+    """Name the columns of all rows, which must be known before the first row; return the types in each, by its key.
 
     The rows are read again to be written, with another `Export`: this pass has counted what is left out.
     """
@@ -145,19 +144,17 @@ def _columns(log: Log, patterns: Sequence[str], result: Export) -> dict[str, set
         for name, value in cells.items():
             kinds.setdefault(name, set()).add(_kind(value))
     result.unreadable = log.unreadable
-    result.begin(kinds)
-    return kinds | {result.deleted: {str}, result.stored: {str}}
+    return {key: kinds[key] for key in result.begin(kinds)}
 
 
 def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
-    _columns(log, patterns, result)
+    keys = list(_columns(log, patterns, result))
     with target.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([result.time, *result.columns])
         for time, cells in _rows(log, patterns, Export()):
             result.rows += 1
-            row = result.named(cells)
-            writer.writerow([f"{time:.6f}", *[row.get(name) for name in result.columns]])
+            writer.writerow([f"{time:.6f}", *[cells.get(key) for key in keys]])
 
 
 def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
@@ -167,22 +164,22 @@ def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export
     except ModuleNotFoundError:
         raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
     # None stands for an empty cell in every type.
-    forms = {name: _form(found - {type(None)}) for name, found in _columns(log, patterns, result).items()}
+    forms = {key: _form(found - {type(None)}) for key, found in _columns(log, patterns, result).items()}
     arrow = {
         bool: pyarrow.bool_(),
         int: pyarrow.int64(),
         float: pyarrow.float64(),
         str: pyarrow.string(),
     }
-    fields = [(result.time, pyarrow.timestamp("us", "UTC")), *[(name, arrow[forms[name]]) for name in result.columns]]
+    titles = dict(zip(forms, result.columns, strict=True))
+    fields = [(result.time, pyarrow.timestamp("us", "UTC")), *[(titles[key], arrow[forms[key]]) for key in forms]]
     schema = pyarrow.schema(fields)
     rows = _rows(log, patterns, Export())
     with parquet.ParquetWriter(target, schema) as writer:
         while batch := list(itertools.islice(rows, _ROWS)):
             data: dict[str, list[Any]] = {result.time: [round(time * 1e6) for time, _ in batch]}
-            lines = [result.named(cells) for _, cells in batch]
-            for name in result.columns:
-                data[name] = [_cell(line.get(name), forms[name]) for line in lines]
+            for key, form in forms.items():
+                data[titles[key]] = [_cell(cells.get(key), form) for _, cells in batch]
             writer.write_table(pyarrow.table(data, schema=schema))
             result.rows += len(batch)
 
