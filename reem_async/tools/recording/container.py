@@ -415,9 +415,10 @@ class Timeline:
     def _holders(self, channel: int, before: int) -> Iterator[ChunkInfo]:
         """Yield the chunks that have messages of a channel, from that with the number `before` - 1 backwards."""
         if self._blocks is None:
-            self._blocks = np.zeros((-(-len(self._chunks) // _BLOCK), _CHANNELS), bool)
+            blocks = np.zeros((-(-len(self._chunks) // _BLOCK), _CHANNELS), bool)
             for info in self._chunks:
-                self._blocks[info.number // _BLOCK, info.channels] = True
+                blocks[info.number // _BLOCK, info.channels] = True
+            self._blocks = blocks  # now and not before: another thread may use it
         # Backwards, since the newest message before an instant is what is asked for most.
         for block in np.flatnonzero(self._blocks[:, channel])[::-1].tolist():
             for info in reversed(self._chunks[block * _BLOCK : min((block + 1) * _BLOCK, before)]):

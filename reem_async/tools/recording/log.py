@@ -244,7 +244,7 @@ class Log:
         if not place:
             trees = self._trees_at(nanoseconds(instant))
             return {name: resolve(tree, self._recorded) for name, tree in trees.items()}
-        found = self._at(place, nanoseconds(instant))
+        found = self._past.tree(place, nanoseconds(instant))
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
         return self._past.value(found) if type(found) is Reference else resolve(found, self._recorded)
@@ -262,7 +262,7 @@ class Log:
         What cannot be read is counted in `unreadable`. An item of a list is None then: the others keep their places.
         """
         try:
-            tree = self._at((name,), nanoseconds(instant))
+            tree = self._past.tree((name,), nanoseconds(instant))
         except ValueError:  # all of it is damaged
             self._past.unreadable += 1
             return MISSING
@@ -302,10 +302,6 @@ class Log:
             while len(self._trees) > max(_CACHED_TREES, 2 * len(self._past.names)):
                 self._trees.popitem(last=False)
             return tree
-
-    def _at(self, path: Path, ns: int) -> Any:
-        with self._lock:
-            return self._past.tree(path, ns)
 
     def changes(self, after: Instant, until: Instant) -> set[Path]:
         """Return the paths that were updated after one instant and not after another."""
