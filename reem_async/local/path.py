@@ -21,7 +21,6 @@ if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from .segment import HEAD, SLOTS, Segment
 
 LEAST = 1 << 16  # bytes from which a value goes through shared memory: below, a fetch from the server takes no longer
-
 MEMORY = 256 << 20  # bytes of shared memory of one interface, unless another number is given
 
 _MODES = ("auto", "off", "early")

@@ -28,9 +28,7 @@ from ..concurrency.wakeup import Descriptor
 from ..plan.notices import starts
 
 SLOTS = 6  # one that is written, three for a subscriber (see `reader.py`), two for others that are not as far
-
 NAME = "reem"  # of the file, for a look at the descriptors of a process
-
 HEAD = 4096  # bytes before the first slot: a page
 
 IDENTITY = struct.Struct("<8sQQ")

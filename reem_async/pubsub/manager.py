@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger("reem.subscribe")
 
 _LONGEST_PAUSE = 0.5  # seconds between tries to connect: with one that hangs before it, still less than two in all
-
 _MOST_REPORTED = 1000  # places that cannot be read of which is warned: programs may publish under ever new names
 
 

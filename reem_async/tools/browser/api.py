@@ -310,13 +310,9 @@ def _thinned(series: Series) -> Series:
 
 # Seconds between two looks: a page draws no faster.
 _PAUSE = 0.1
-_QUIET = 1.0
-"""Seconds after which something is sent though nothing changed: the page knows by it that all is well."""
-
-# Paths that are named; if there are more, the event says only that, and the page reads all it shows.
-_MOST_PATHS = 100
-# Pages that receive events at the same time, each over a connection that stays open.
-_MOST_CLIENTS = 64
+_QUIET = 1.0  # seconds after which something is sent though nothing changed: the page knows by it that all is well
+_MOST_PATHS = 100  # paths that are named; if there are more, the event says only that, and the page reads all it shows
+_MOST_CLIENTS = 64  # pages that receive events at the same time, each over a connection that stays open
 
 
 class Events:

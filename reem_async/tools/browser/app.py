@@ -36,12 +36,8 @@ from .source import NotKept, Source, path_of, visible
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
 """The names under which a browser on this machine reaches it."""
 
-_COOKIE = "reem_browse_"
-"""Its name ends with the port: browsers send the cookies of a host to all its ports."""
-
-_LONGEST_URL = 48_000
-"""Characters: a page asks for all its open branches in one."""
-
+_COOKIE = "reem_browse_"  # its name ends with the port: browsers send the cookies of a host to all its ports
+_LONGEST_URL = 48_000  # characters: a page asks for all its open branches in one
 _HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -176,8 +172,7 @@ def _is_address(host: str) -> bool:
 # Running the application on a port.
 
 
-# For requests that are being answered when the program ends.
-_GRACE_SECONDS = 2
+_GRACE_SECONDS = 2  # for requests that are being answered when the program ends
 
 
 class PageServer(uvicorn.Server):

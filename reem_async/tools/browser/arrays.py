@@ -31,12 +31,9 @@ from .trees import described
 
 # Of a table that is sent at once.
 MOST_ROWS, MOST_COLUMNS = 200, 64
-# Of a line: about as many as a screen has pixels.
-_POINTS = 1000
-# Curves in one plot: more of them cannot be told apart.
-_MOST_CURVES = 16
-# Numbers that histograms and statistics look at; of larger arrays an even selection.
-_SAMPLE = 4_000_000
+_POINTS = 1000  # of a line: about as many as a screen has pixels
+_MOST_CURVES = 16  # curves in one plot: more of them cannot be told apart
+_SAMPLE = 4_000_000  # numbers that histograms and statistics look at; of larger arrays an even selection
 
 
 def table(plane: np.ndarray[Any, Any], row: int, column: int, rows: int, columns: int) -> dict[str, Any]:
@@ -143,8 +140,7 @@ def _sampled(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 # Files: `/view/<path>?format=json`, `npy`, `csv`, `png` or `bin`.
 
 
-_LONGEST_LIST = 1_000_000
-"""Numbers of an array up to which it is written as a list."""
+_LONGEST_LIST = 1_000_000  # numbers of an array up to which it is written as a list
 # All else is replaced in the plain name; the second one has all characters, percent-encoded (RFC 6266).
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -281,10 +277,8 @@ FORMATS: dict[str, tuple[Callable[[Any, Path, str | None], bytes], str]] = {
 
 Result = TypeVar("Result")
 
-# Bytes up to which work is done at once: handing it to a thread takes longer.
-_SMALL = 1 << 16
-# Bytes that are shown of a value of type bytes.
-_HEX_BYTES = 1024
+_SMALL = 1 << 16  # bytes up to which work is done at once: handing it to a thread takes longer
+_HEX_BYTES = 1024  # bytes that are shown of a value of type bytes
 # What is shown as a picture: only what these signatures begin, and never SVG, which may hold scripts.
 _MAGIC = ((b"\x89PNG\r\n\x1a\n", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"GIF8", "image/gif"))
 

@@ -38,25 +38,16 @@ from .history import LARGEST_TEXT, History
 from .timeline import PENDING
 from .trees import framed, is_kept, same, weight
 
-_WAITING = 50_000
-"""Updates that wait for this program before the oldest are skipped."""
-
-_MOST_SHARED = 10_000
-"""Keys of which is remembered when their publisher has shared memory."""
-_SHARED_SECONDS = 10.0
-"""For so long a publisher is said to share memory after it has; as in `reem top`."""
-
-_RECENT = 16
-"""Updates that are known again if they come twice, where there may be thousands of keys."""
+_WAITING = 50_000  # updates that wait for this program before the oldest are skipped
+_MOST_SHARED = 10_000  # keys of which is remembered when their publisher has shared memory
+_SHARED_SECONDS = 10.0  # for so long a publisher is said to share memory after it has; as in `reem top`
+_RECENT = 16  # updates that are known again if they come twice, where there may be thousands of keys
 
 # Documents that are asked for at the same time.
 _BATCH = 100
-_REST = 4
-"""How many times as long as reading took none are read: others ask the server, and this program, too."""
-_PAUSE = 0.1
-"""Seconds after a read that failed."""
-_SHARE = 4
-"""A key may take one in so many of the bytes that are read."""
+_REST = 4  # how many times as long as reading took none are read: others ask the server, and this program, too
+_PAUSE = 0.1  # seconds after a read that failed
+_SHARE = 4  # a key may take one in so many of the bytes that are read
 
 
 Attachment = tuple[str, str]

@@ -23,8 +23,7 @@ from .trees import Frame, same, weight
 # One clock for everything in the buffer, which is never set back.
 
 
-_WAITED = 1.0
-"""Seconds before now that something may have been received, at most: the clock may have been set since."""
+_WAITED = 1.0  # seconds before now that something may have been received, at most: the clock may have been set since
 
 
 class BufferClock:
@@ -175,14 +174,9 @@ def _has_both(frame: Frame) -> bool:
 Text = bytes
 """A document as the server sends it; History has something else of the name of that type."""
 
-_OVERHEAD = 300
-"""Bytes of memory that a change takes besides its value."""
-
-# Seconds between two looks for what is too old.
-_TRIM_SECONDS = 1.0
-
-_FILLED = 0.9
-"""The part of the bytes that is left full when room is made: it is then a while until more must be."""
+_OVERHEAD = 300  # bytes of memory that a change takes besides its value
+_TRIM_SECONDS = 1.0  # seconds between two looks for what is too old
+_FILLED = 0.9  # the part of the bytes that is left full when room is made: it is then a while until more must be
 
 LARGEST_TEXT = 1 << 18
 """Bytes of a document's text up to which it is kept as the state before the first change."""

@@ -35,15 +35,9 @@ from .source import (
 from .timeline import UNKNOWN
 from .trees import Frame, differing, thawed, tree_of_outline
 
-_LARGEST = 1 << 28
-"""Bytes of arrays up to which a value is read for a page."""
-
-_SHARED_SECONDS = 0.2
-"""How long one reading of a large value serves all requests."""
-
-_SHORT = 128
-"""Bytes of a value up to which it is read to be drawn."""
-
+_LARGEST = 1 << 28  # bytes of arrays up to which a value is read for a page
+_SHARED_SECONDS = 0.2  # how long one reading of a large value serves all requests
+_SHORT = 128  # bytes of a value up to which it is read to be drawn
 _UNTOLD = (
     "what is only stored is looked for once a second, and overwritten arrays are not noticed: the server does not tell"
 )

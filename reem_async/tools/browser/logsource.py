@@ -33,8 +33,7 @@ from .trees import differing, tree_of_outline
 
 Result = TypeVar("Result")
 
-# States, and lists of times, that are kept: neighbouring instants are asked for together.
-_CACHED = 8
+_CACHED = 8  # states, and lists of times, that are kept: neighbouring instants are asked for together
 # Values that are read to find out whether a path is worth drawing.
 _LOOKS = 6
 _ROUNDING = 1e-6

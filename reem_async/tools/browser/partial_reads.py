@@ -19,11 +19,8 @@ from ...session import Session
 from .source import Node, node_of, shown_text
 from .trees import tree_of
 
-_LONGEST = 2048
-"""Bytes of a text that are fetched to show its beginning; placeholders are shorter."""
-
-# Items of a list that the tree shows in its row.
-_SHORT_LIST = 8
+_LONGEST = 2048  # bytes of a text that are fetched to show its beginning; placeholders are shorter
+_SHORT_LIST = 8  # items of a list that the tree shows in its row
 # The server's words for types -> Python's.
 _CONTAINERS = {"object": "dict", "array": "list"}
 _PLAIN = {b"integer", b"number", b"boolean", b"null"}

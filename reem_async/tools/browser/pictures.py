@@ -19,10 +19,8 @@ Slice = tuple[int | None, ...]
 """For each axis an index, or None for all of it."""
 
 _INDEX = re.compile(r"-?\d{1,12}")
-# Rows and columns up to which an array is read as numbers.
-_SMALL = 16
-# Columns up to which an array is drawn as lines.
-_MOST_CURVES = 16
+_SMALL = 16  # rows and columns up to which an array is read as numbers
+_MOST_CURVES = 16  # columns up to which an array is drawn as lines
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,8 +117,7 @@ _ANCHORS = {
 MAPS = tuple(_ANCHORS)
 """The names of the colour maps."""
 
-# Magenta: no colour map has it.
-_NAN = (255, 0, 255)
+_NAN = (255, 0, 255)  # magenta: no colour map has it
 # Pixels of a picture that is sent, at most.
 LARGEST_SIDE = 4096
 
@@ -256,13 +253,11 @@ def colours_of(colours: str) -> list[str]:
 # Previews: what is kept of an array if there is no room for the whole.
 
 
-_SIDE = 320
-"""Pixels of the longer side: a quarter of those of a camera's 640 x 480."""
+_SIDE = 320  # pixels of the longer side: a quarter of those of a camera's 640 x 480
 
 # Of JPEG, 1 to 95: a preview is to be small, and stands for what is not kept.
 _QUALITY = 80
-_LEVELS = 254
-"""Levels of a number; one more, the first, stands for what is not finite."""
+_LEVELS = 254  # levels of a number; one more, the first, stands for what is not finite
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,8 +20,7 @@ from .trees import Frame, described
 # Paths in URLs and snippets: one text for each path, which leads back to exactly that path.
 
 
-# Characters.
-_LONGEST = 4096
+_LONGEST = 4096  # characters
 
 
 def address(path: Path) -> str:
@@ -64,8 +63,7 @@ def snippets(path: Path, url: str, namespace: str) -> dict[str, str]:
 LONGEST_TEXT = 200
 """Characters of a text that a line shows."""
 
-# Items of a list that stand in its row.
-_PREVIEW_ITEMS = 8
+_PREVIEW_ITEMS = 8  # items of a list that stand in its row
 # Control characters, and those that turn the direction of what follows: shown as escapes, never obeyed.
 _INVISIBLE = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
@@ -149,8 +147,7 @@ def _preview(value: dict[str, Any] | list[Any]) -> str:
     return "[" + ", ".join([_plain(item).removesuffix(".0") for item in value]) + "]"
 
 
-# Places that are looked at for one search, so that the program answers others meanwhile.
-_WALKED = 200_000
+_WALKED = 200_000  # places that are looked at for one search, so that the program answers others meanwhile
 
 
 def matching(needle: str, names: Iterable[str], trees: Iterable[tuple[str, Any]], most: int) -> list[Path]:
@@ -257,8 +254,7 @@ def rate_span(at: float, start: float, end: float, over: float = _RATE_SECONDS) 
 
 # Items of a list or vector up to which each is drawn as a line over time.
 _MOST_LINES = 16
-_LARGEST_VECTOR = 8 * _MOST_LINES
-"""Bytes."""
+_LARGEST_VECTOR = 8 * _MOST_LINES  # bytes
 
 
 def numbers_in(samples: Iterable[tuple[float, Any]]) -> Series:

@@ -18,8 +18,7 @@ PENDING: Any = type("Pending", (), {"__repr__": lambda self: "PENDING"})()
 UNKNOWN: Any = type("Unknown", (), {"__repr__": lambda self: "UNKNOWN"})()
 """What a key held before anything is known of it."""
 
-_LOOK_BACK = 2000
-"""Changes looked at to find when a path last changed."""
+_LOOK_BACK = 2000  # changes looked at to find when a path last changed
 
 
 class BufferedChange(NamedTuple):

@@ -20,8 +20,7 @@ from .pictures import preview_of
 
 _NUMPY = NumpyShip()
 _SCALARS = (str, int, float, bool, type(None))
-_OVERHEAD = 200
-"""Bytes of memory that an array takes besides its items."""
+_OVERHEAD = 200  # bytes of memory that an array takes besides its items
 
 
 class Frame:
