@@ -37,8 +37,7 @@ from .source import Node, NotKept, Series, Source, address, path_of, thinned, vi
 # Requests: parameters are checked, and errors become answers with the right status.
 
 
-# Bytes: what a person edits on a page.
-LARGEST_BODY = 1 << 16
+LARGEST_BODY = 1 << 16  # bytes: what a person edits on a page
 
 # The first that fits counts, so special errors stand before what they are special cases of.
 _STATUS: tuple[tuple[type[Exception], int], ...] = (

@@ -33,9 +33,7 @@ from .source import NotKept, Source, path_of, visible
 # Access checks: the Host header, the token, where a request comes from, and what answers carry.
 
 
-LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})
-"""The names under which a browser on this machine reaches it."""
-
+LOOPBACK = frozenset({"localhost", "127.0.0.1", "::1"})  # the names under which a browser on this machine reaches it
 _COOKIE = "reem_browse_"  # its name ends with the port: browsers send the cookies of a host to all its ports
 _LONGEST_URL = 48_000  # characters: a page asks for all its open branches in one
 _HEADERS = {
@@ -171,7 +169,6 @@ def _is_address(host: str) -> bool:
 
 # Running the application on a port.
 
-
 _GRACE_SECONDS = 2  # for requests that are being answered when the program ends
 
 
@@ -232,7 +229,6 @@ def listen(host: str, port: int) -> socket.socket:
 
 
 # The application.
-
 
 _TYPES = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
 

@@ -139,7 +139,6 @@ def _sampled(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 # Files: `/view/<path>?format=json`, `npy`, `csv`, `png` or `bin`.
 
-
 _LONGEST_LIST = 1_000_000  # numbers of an array up to which it is written as a list
 # All else is replaced in the plain name; the second one has all characters, percent-encoded (RFC 6266).
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
@@ -273,7 +272,6 @@ FORMATS: dict[str, tuple[Callable[[Any, Path, str | None], bytes], str]] = {
 
 
 # The routes.
-
 
 Result = TypeVar("Result")
 

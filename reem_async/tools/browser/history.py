@@ -47,7 +47,6 @@ class BufferClock:
 
 # The arrays of the past: which there are, and which go when room runs short.
 
-
 _WHOLE_SHARE = 4
 """Of the bytes of all frames, one in so many is kept for the newest whole ones that have a preview as well."""
 
@@ -170,16 +169,13 @@ def _has_both(frame: Frame) -> bool:
 
 # The buffer.
 
-
 Text = bytes
 """A document as the server sends it; History has something else of the name of that type."""
 
 _OVERHEAD = 300  # bytes of memory that a change takes besides its value
 _TRIM_SECONDS = 1.0  # seconds between two looks for what is too old
 _FILLED = 0.9  # the part of the bytes that is left full when room is made: it is then a while until more must be
-
-LARGEST_TEXT = 1 << 18
-"""Bytes of a document's text up to which it is kept as the state before the first change."""
+LARGEST_TEXT = 1 << 18  # bytes of a document's text up to which it is kept as the state before the first change
 
 
 class History:

@@ -114,12 +114,9 @@ _ANCHORS = {
     "turbo": ("30123b", "4662d7", "36aaf9", "1ae4b6", "72fe5e", "c8ef34", "faba39", "f66b19", "7a0403"),
     "signed": ("2166ac", "67a9cf", "d1e5f0", "f7f7f7", "fddbc7", "ef8a62", "b2182b"),
 }
-MAPS = tuple(_ANCHORS)
-"""The names of the colour maps."""
-
+MAPS = tuple(_ANCHORS)  # the names of the colour maps
 _NAN = (255, 0, 255)  # magenta: no colour map has it
-# Pixels of a picture that is sent, at most.
-LARGEST_SIDE = 4096
+LARGEST_SIDE = 4096  # pixels of a picture that is sent, at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +248,6 @@ def colours_of(colours: str) -> list[str]:
 
 
 # Previews: what is kept of an array if there is no room for the whole.
-
 
 _SIDE = 320  # pixels of the longer side: a quarter of those of a camera's 640 x 480
 

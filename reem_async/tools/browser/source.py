@@ -59,10 +59,7 @@ def snippets(path: Path, url: str, namespace: str) -> dict[str, str]:
 
 # Nodes: what one line of the tree shows.
 
-
-LONGEST_TEXT = 200
-"""Characters of a text that a line shows."""
-
+LONGEST_TEXT = 200  # characters of a text that a line shows
 _PREVIEW_ITEMS = 8  # items of a list that stand in its row
 # Control characters, and those that turn the direction of what follows: shown as escapes, never obeyed.
 _INVISIBLE = re.compile(
