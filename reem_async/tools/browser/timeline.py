@@ -78,19 +78,6 @@ class ChangeIndex:
 class BufferedPast(Past[int]):
     """What is known of one top-level key. Positions of changes are their numbers, from the first one ever."""
 
-    __slots__ = (
-        "_base",
-        "_gone",
-        "_known",
-        "_moves",
-        "_name",
-        "_pending",
-        "_times",
-        "base_size",
-        "changes",
-        "text",
-    )
-
     def __init__(self, name: str, base: Any, text: bytes | None = None) -> None:
         self._name = name
         self._base = base  # what it held at first: a document's text, a tree, MISSING or UNKNOWN
