@@ -166,15 +166,13 @@ class PatternWatch(PatternStream[Update]):
         if born is not None:
             if len(born) < _MOST_BORN:
                 born.append(notice)
-        elif notice.deleted and not notice.path:  # who followed the key has told that it is gone
             return
-        elif name and self._is_new(name) and self._manager is not None and self._paths(name):
+        # The follower of a deleted key has told that; an unreadable one waits for a search.
+        if (notice.deleted and not notice.path) or name in self._followed or name in self._unreadable:
+            return
+        if name and self._manager is not None and self._paths(name):
             self._born[name] = [notice]
             self._manager.tasks.start(self._follow_late([name]), "reem discovery of new keys")
-
-    def _is_new(self, name: str) -> bool:
-        """Return whether a key is to be followed at once; one that was unreadable waits for a search."""
-        return name not in self._followed and name not in self._unreadable
 
     async def _follow_late(self, names: Iterable[str]) -> None:
         try:

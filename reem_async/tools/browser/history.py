@@ -270,17 +270,13 @@ class History:
             self.frames.thin(max(room, self.budget // 2), when)
         # Then plain changes, a tenth at a time: folding each by itself would copy the state each time.
         while self.bytes > self.budget and self._all:
-            self._shed()
+            while self._heavy:  # first the arrays of states that the slider does not reach any more
+                self._bytes -= self._lines[self._heavy.pop()].strip()
             if self.bytes <= self.budget:
                 break
             count = max(len(self._all) // 10, 1)
             self.dropped += count
             self._fold(count)
-
-    def _shed(self) -> None:
-        """Drop the arrays of states that the slider does not reach any more."""
-        while self._heavy:
-            self._bytes -= self._lines[self._heavy.pop()].strip()
 
     # The oldest changes become the state that the past begins with.
     def _fold(self, count: int) -> None:

@@ -103,7 +103,7 @@ class LiveSource:
         # What has not changed since an instant is still there: it is asked of the server, and costs no memory here.
         now = [path for path in paths if at is None or self.history.unchanged(path[:1], at)]
         try:
-            found = dict(zip(now, await self._peek(now), strict=True))
+            found = dict(zip(now, await peek(self.interface.session, now), strict=True))
         except _AWAY:
             if at is None:
                 raise
@@ -113,9 +113,6 @@ class LiveSource:
                 found[path] = self._past(path, when)
         last = self.history.last(paths, when)
         return [self._stamped(found[path], last, when, live=at is None) for path in paths]
-
-    async def _peek(self, paths: Sequence[Path]) -> list[Node | None]:
-        return await peek(self.interface.session, paths)
 
     def _past(self, path: Path, at: float) -> Node | None:
         value = self.history.tree(path, at)
