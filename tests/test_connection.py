@@ -49,6 +49,15 @@ def test_a_call_to_a_stopped_server_ends_in_time(server, open_front):
     assert front.interface.state == "connected"
 
 
+@pytest.mark.parametrize("size", [1, 1 << 25], ids=["small", "large"])
+def test_a_write_to_a_stopped_server_ends_by_itself(server, open_front, size):
+    """Though a large one never waits for a reply: the server takes no byte of it any more."""
+    front = open_front(url=server.url, timeout=0.3)
+    front.write(["foo"], 1)
+    with stopped(server), pytest.raises(ConnectionLost, match=r"0\.3 s"):
+        front.write(["foo"], np.zeros(size, np.uint8))
+
+
 async def test_a_dead_connection_is_given_up_though_calls_go_on(server):
     """A link swallows all bytes for a moment. New calls waited behind those before them, for ever."""
     with Proxy(server.port) as proxy:
