@@ -113,21 +113,19 @@ async def _stores(interface: RedisInterface, patterns: Sequence[str], monitor: M
         await watch.listen()
     except ReemError as error:
         note(f"plain writes are not shown: {error}")
-    task = asyncio.ensure_future(_hand_on(watch, monitor))
+
+    async def hand_on() -> None:
+        async for update in watch:
+            if update.origin == "stored":
+                path, now = parse_shown(update.path), time.time()
+                monitor.queue.put(Event(path, update.value, update.deleted, 0, now, now, "", 0, stored=True))
+
+    task = asyncio.create_task(hand_on())
     try:
         yield
     finally:
         task.cancel()
         await watch.close()
-
-
-async def _hand_on(watch: PatternWatch, monitor: Monitor) -> None:
-    async for update in watch:
-        if update.origin == "stored":
-            now = time.time()
-            monitor.queue.put(
-                Event(parse_shown(update.path), update.value, update.deleted, 0, now, now, "", 0, stored=True)
-            )
 
 
 @contextlib.asynccontextmanager
@@ -164,10 +162,7 @@ def _enter(event: Event, ending: Ending) -> None:
 
 async def _next(monitor: Monitor, when: float) -> Event | None:
     """Return the next update, None if there is none by `when`."""
-    if when == _NEVER:
-        return await anext(monitor)
-    try:
-        async with asyncio.timeout(max(when - time.monotonic(), 0)):
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(None if when == _NEVER else max(when - time.monotonic(), 0)):
             return await anext(monitor)
-    except TimeoutError:
-        return None
+    return None
