@@ -154,7 +154,7 @@ def test_echo_goes_on_after_a_broken_connection(space, listening, raw):
         for connection in subscribed(raw):
             raw.client_kill_filter(_id=connection)
         assert "waiting for it" in process.stderr.readline()
-        assert "made again" in process.stderr.readline()
+        assert "reconnecting" in process.stderr.readline()
         # To the notices of all keys, or of a key of a cluster; the channel of stored changes may come before or after.
         eventually(lambda: any(int(row["psub"]) or int(row.get("ssub", 0)) for row in raw.client_list()))
         space["foo"] = 2
