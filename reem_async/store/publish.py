@@ -176,15 +176,11 @@ class DocumentPublisher(DocumentWriter):
 
     keeps_order = True
 
-    def __init__(self, session: Session, name: object, outages: Outage | None = None) -> None:
-        super().__init__(session, name, outages)
-        self._policy = "raise" if outages is None else outages.policy
-
     def turn(self) -> PublishTurn:
         return PublishTurn(self.session, self.keys)
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
-        return partial(publisher, policy=self._policy)
+        return partial(publisher, policy="raise" if self._outages is None else self._outages.policy)
 
 
 def publisher(session: Session, name: object, policy: str) -> DocumentPublisher:
