@@ -61,10 +61,16 @@ class RawRead(NamedTuple):
 
 def interpreted(raw_read: RawRead, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
     """Return what the ship makes of a reply: the value, something for `awaited`, or an Unreadable."""
+    cause: Exception | None = None
     try:
-        return interpret(raw_read.name, slot, ship, reply)
+        return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
     except BadData as error:
-        return raw_read.give_up(slot, error)
+        problem = str(error)
+    except Exception as error:
+        problem, cause = f"the ship {ship.label!r} could not make a value of it: {error!r}", error
+    it = BadData(f"{place_of(raw_read.name, slot.placeholder.suffix)}: {problem}")
+    it.__cause__ = cause
+    return raw_read.give_up(slot, it)
 
 
 async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any]) -> Any:
@@ -72,16 +78,6 @@ async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any
         return await value
     except Exception as error:
         return raw_read.give_up(slot, error)
-
-
-def interpret(name: str, slot: PlaceholderSlot, ship: Registered, reply: Reply) -> Any:
-    try:
-        return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
-    except BadData as error:
-        raise BadData(f"{place_of(name, slot.placeholder.suffix)}: {error}") from None
-    except Exception as error:
-        where = place_of(name, slot.placeholder.suffix)
-        raise BadData(f"{where}: the ship {ship.label!r} could not make a value of it: {error!r}") from error
 
 
 def _plain(reply: Reply) -> Reply:

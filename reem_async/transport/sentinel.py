@@ -258,18 +258,14 @@ class SentinelTransport(CompositeTransport):
             # The only sign, before the connection breaks, that the server was demoted. A primary that cannot save, or
             # that lacks replicas, refuses writes with another code.
             if isinstance(reply, redis.exceptions.ReadOnlyError) and "READONLY" in str(reply):
-                self._leave(asked)
+                if asked is self._now:  # its connections serve the calls that wait for a reply on them
+                    self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
+                    self._renew()
                 raise NotConnected(
                     f"the server that was the primary of {self._options.address} is a replica now ({reply}); "
                     "nothing was applied: call again, the next connection asks the sentinels"
                 )
         return replies
-
-    def _leave(self, demoted: Transport) -> None:
-        """Use new connections from now on. The old ones serve calls that wait for a reply on them."""
-        if demoted is self._now:
-            self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
-            self._renew()
 
     def _renew(self) -> None:
         # The user hears of one primary. What becomes of the connections to the old one is not its state.
