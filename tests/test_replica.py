@@ -20,7 +20,7 @@ from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
 from reem_async.plan.paths import suffix, to_jsonpath
 from reem_async.plan.placeholders import Placeholder
-from reem_async.plan.reads import interpret
+from reem_async.plan.reads import interpreted
 from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.sizes import LARGE
 from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced, same
@@ -353,7 +353,7 @@ class World:
             self.replica.failed(command.number, BadData("nonsense"))
         else:
             for slot, ship, reply in command.raw_read.slots:
-                slot.container[slot.key] = interpret(command.raw_read.name, slot, ship, reply)
+                slot.container[slot.key] = interpreted(command.raw_read, slot, ship, reply)
             self.replica.opened(command.number, command.raw_read.holder[0])
         self.drain()
 
