@@ -58,7 +58,8 @@ def test_a_path_for_which_there_is_no_channel_any_more_is_not_taken_for_its_old_
     writing.put(Role.UPDATE, 4, "z")
     writing.put(Role.KEYFRAME, None)
     writing.told()
-    assert writing.thread.counts.lost == 3
+    counts = writing.thread.counts
+    assert (counts.lost, counts.by_path) == (3, {"a.x": 1, "a.y": 1, "a.z": 1})
     with open_log(file) as log:
         assert log.readable_at("a", log.end - 0.001) == {"x": "text", "y": 2, "z": 3, "u": 1}
         assert log.readable_at("a", log.end) == {"z": 4, "u": 1}
