@@ -233,6 +233,23 @@ async def test_updates_of_one_publisher_arrive_in_order_and_once(akvs, apspace, 
     assert len(last) == 2
 
 
+async def test_an_update_that_the_server_applied_late_comes_late_and_once(akvs, apspace, key, ainterface, monkeypatch):
+    """Its connection broke before the reply, so that the publisher's next update reached the server first."""
+    await akvs[key()].write({"n": 0})
+    updates = akvs[key()].watch(policy=Every(1000))
+    await following(updates)
+    await apspace[key()]["n"].write(1)
+    late = ainterface.session.stamp(ainterface.session.keys(key()))
+    await apspace[key()]["n"].write(3)
+    with monkeypatch.context() as patch:
+        patch.setattr(ainterface.session, "stamp", lambda _: late)
+        await apspace[key()]["n"].write(2)
+    await apspace[key()]["n"].write(4)
+    seen = [await following(updates) for _ in range(4)]
+    assert [it.sequence - late[1] for it in seen] == [-1, 1, 0, 2]
+    assert [(it.value, it.data["n"], it.missed) for it in seen] == [(1, 1, 0), (3, 3, 1), (2, 2, 0), (4, 4, 0)]
+
+
 async def test_a_cancelled_wait_swallows_no_update(akvs, apspace, key):
     """The next one is there for the next wait."""
     await akvs[key()].write(-1)

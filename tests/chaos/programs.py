@@ -82,7 +82,7 @@ async def _stalled(url: str) -> None:
                 gaps=log.gaps - gaps,
                 grown=max(peak, rss()) - before,
                 silent=log.silent,
-                disordered=log.repeated + log.backward,
+                disordered=[repr(it) for it in log.repeated + log.backward],
             )
 
 

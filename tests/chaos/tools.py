@@ -153,6 +153,7 @@ class Log:
         self.backward: list[Any] = []
         self.silent: list[Any] = []
         self._last: dict[str, int] = {}
+        self._delivered: set[tuple[str, int]] = set()
         self._excused: dict[str, bool] = {}
         self._drawn = 0  # how many of the loop's own skipped updates have been met
 
@@ -169,9 +170,13 @@ class Log:
         publisher, sequence = update.publisher, update.sequence
         if publisher is None:
             return
+        if (publisher, sequence) in self._delivered:
+            self.repeated.append(update)
+            return
+        self._delivered.add((publisher, sequence))
         last = self._last.get(publisher)
-        if last is not None and sequence <= last:
-            (self.repeated if sequence == last else self.backward).append((publisher, last, sequence))
+        if last is not None and sequence < last:
+            self.backward.append(update)
             return
         if last is not None and sequence > last + 1 and not self._excused.get(publisher):
             self._drawn += sequence - last - 1
