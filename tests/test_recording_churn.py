@@ -5,7 +5,7 @@ import random
 import time
 
 import pytest
-from conftest import RawCluster, aeventually, sized
+from conftest import aeventually, sized
 from test_recording_stored import news
 
 from reem_async.tools.recording import Recorder, open_log
@@ -34,10 +34,8 @@ async def test_nothing_is_kept_of_keys_that_came_and_went(key, apspace, akvs, bi
 
 
 @pytest.mark.parametrize("pause", sized([0.02], [0.0, 0.02, 0.15]))
-async def test_a_key_that_comes_again_loses_nothing_at_whatever_instant(raw, key, apspace, binterface, file, pause):
+async def test_a_key_that_comes_again_loses_nothing_at_whatever_instant(key, apspace, binterface, file, pause):
     """What was kept of it is let go of at keyframes, here all the time."""
-    if isinstance(raw, RawCluster):
-        pytest.skip("in a cluster the first updates of a key may be told as what they led to")
     rng, sent = random.Random(5), {key(f"job{number}"): [] for number in range(3)}
 
     async def come_and_go(name):
