@@ -240,7 +240,7 @@ class FollowedKey:
 
         Those of a key that was never seen to change are not read: the buffer has what the document says of them.
         """
-        first, owed, answers = self.name in self._follower.unread, self.owed, self._answers
+        first, owed, answers = self.name in self._follower.unread and not self.looks.heard, self.owed, self._answers
         places = {id(it): place for place, it in {**self.feed.attachments.values, **found}.items()}
         before = self._history.tree((self.name,), when)
         if first:
