@@ -261,7 +261,7 @@ class FollowedKey:
                     self.owed[place], is_news = it, False
             if is_noted and place is not None:
                 answers.add(place)
-            elif is_news and place in self._unchanged:
+            elif is_news and place in self._unchanged and not is_unreadable:
                 self._history.frames.add(path, it, when)
             elif is_news:
                 self._history.add_read(path, it, when, answer=place in answers)
