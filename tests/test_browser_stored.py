@@ -11,6 +11,7 @@ import redis
 from conftest import LOOKING, PLAIN, RawCluster, aeventually, commands_run, same_bits, server_without_right, subscribed
 
 import reem_async
+from reem_async.plan.placeholders import Unreadable
 from reem_async.plan.trees import MISSING
 from reem_async.pubsub import finder
 from reem_async.server.embedded import EmbeddedServer
@@ -166,6 +167,14 @@ async def test_of_a_key_only_the_arrays_that_changed_are_read_again(server_url, 
         assert len(list(source.history.frames.concerning((key(), "a")))) >= 3
         assert len(list(source.history.frames.concerning((key(), "b")))) == 1
         assert source.history.times((key(), "b")) == [], "it did not change"
+
+
+async def test_an_array_that_was_gone_before_is_unreadable_once_its_key_changes(server_url, key, akvs, raw):
+    await akvs[key()].write({"n": 0, "image": np.zeros(100)})
+    raw.delete(f"{{{key()}}}.image")
+    async with past_of(server_url, key()) as source:
+        await akvs[key()]["n"].write(1)
+        await aeventually(lambda: isinstance(content(source, key(), "image"), Unreadable))
 
 
 async def test_what_is_stored_anew_as_it_was_is_no_change(server_url, key, akvs, nobody_looks):
