@@ -106,6 +106,7 @@ class Followers:
             await each.listen()
         await self.recorder.start()
         await self.page.start()
+        await aeventually(lambda: not self.page._follower.unread)  # of those it reads no arrays
 
     def seen(self):
         for name, updates in self.updates.items():
