@@ -20,9 +20,8 @@ from reem_async.pubsub.events import Origin, Update
 from .accessor import Accessor, Publisher, Reader, Writer
 from .connection import RedisInterface
 from .errors import *
-from .publish import PublishSpace
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
-from .store import KeyValueStore
+from .store import KeyValueStore, PublishSpace
 from .subscribe import CallbackSubscriber, SilentSubscriber
 
 if clash := original_reem():

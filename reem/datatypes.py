@@ -6,8 +6,7 @@ from typing import Any
 from reem_async.pubsub.subscribers import Update
 
 from .accessor import Accessor, Publisher, Reader, Writer
-from .publish import PublishSpace
-from .store import KeyValueStore
+from .store import KeyValueStore, PublishSpace
 from .subscribe import CallbackSubscriber, SilentSubscriber
 
 __all__ = [  # noqa: F822 - the functions stood here in REEM 0.0.x, for `from reem.datatypes import *`

@@ -134,7 +134,7 @@ def beside(tree):
 
 
 @pytest.fixture(params=["json", "plain"], scope="module")
-def server(request):
+def server(request, server_url):  # the shared one must have started: it would be of this kind, too
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "plain":
             patch.setenv("REEM_SERVER_PLAIN", "1")

@@ -158,10 +158,10 @@ class SubscriptionManager:
     async def follow_here(self, listener: Listener) -> None:
         """Follow a topic that the servers themselves know."""
         deadline = time.monotonic() + self.transport.timeout
-        anew = False
+        retry = False
         while True:
             try:
-                await self._follow(listener, anew=anew)
+                await self._follow(listener, retry=retry)
                 return
             except RedisError as error:
                 unapplied = is_unapplied(error) or isinstance(error, NotConnected | ClusterNode)
@@ -170,10 +170,10 @@ class SubscriptionManager:
                 if time.monotonic() > deadline:
                     fact = error.fact if isinstance(error, ClusterNode) else str(error)
                     raise NotConnected(f"{fact}; the cluster is being changed: nothing is followed yet") from error
-            anew = True
+            retry = True
             await self.transport.pause(0.02)
 
-    async def _follow(self, listener: Listener, *, anew: bool) -> None:
+    async def _follow(self, listener: Listener, *, retry: bool) -> None:
         ready = listener.ready = asyncio.get_running_loop().create_future()
         try:
             async with self._lock:
@@ -183,7 +183,7 @@ class SubscriptionManager:
                 wire = self._subscribed.get(listener.topic)
                 if wire is None or not wire.alive:
                     with self._beginning([listener]):
-                        node = await self.transport.owner(listener.topic.name, refresh=anew)
+                        node = await self.transport.owner(listener.topic.name, refresh=retry)
                         wire = await self._subscribe_at(node, [listener.topic])
                 if listener.stored:
                     await self.invalidations.turn_on(wire)
