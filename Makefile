@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Two processes, each with a server of its own, take the test files in turns.
-TOGETHER := -n 2 --dist loadfile
+# Three processes, each with a server of its own, take the test files in turns: tests also wait.
+TOGETHER := -n 3 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
 
-test: $(VENV)/ready  ## the fast run, about six minutes: every promise, on an embedded real server
+test: $(VENV)/ready  ## the fast run, about five minutes: every promise, on an embedded real server
 	$(BIN)/python -m pytest -q $(TOGETHER)
 
 test-all: $(VENV)/ready  ## the long run: every test at full size, then those that measure time, alone, and all variants

@@ -236,3 +236,12 @@ def test_the_document_is_readable_in_redis_cli(front, key, raw):
     for told in ("$ship ", "4", "5", "3", "60"):
         assert told in text
     assert "{" + key() + "}.image" in {*raw.scan_iter(match=f"*{key()}*")}
+
+
+def test_bytes_that_look_like_the_protocol_are_read_wherever_a_buffer_ends(front, key):
+    """A buffer that begins with them was taken for the beginning of a reply that is too large."""
+    for number in range(28):
+        value = {"b": b"$99999999999\r\n" * 4000, "pad": "x" * (100_000 + number * 997)}
+        front.write([key()], value)
+        for _ in range(2):
+            assert front.read([key()]) == value

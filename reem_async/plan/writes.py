@@ -157,6 +157,7 @@ def _change(
             return None
         return ChangeOutcome(it, cache, commands, replies, main).next()
 
+    # Two commands are the change and a look at the registry: only one of them changes anything.
     whole = held or len(commands) > 2 or _is_tried(it, cache)
     return Plan(commands, decode, whole, held)
 
@@ -254,7 +255,7 @@ def _stale(it: DocumentChange, known: frozenset[bytes]) -> list[bytes]:
 
 def _clearing(it: DocumentChange, stale: list[bytes]) -> list[Command]:
     tag = it.keys.tag.encode()
-    # New ones are unlinked first: SET would fail in the transaction if a foreign type had that name.
+    # New ones are unlinked first: a user's ship may send HSET or RPUSH, which would fail over a foreign type, or add.
     gone = [tag + suffix for suffix in stale] + [tag + each.suffix.encode() for each in it.attachments]
     commands: list[Command] = [("UNLINK", *gone)]
     if stale:

@@ -15,7 +15,8 @@ do not contain. Each read is a sequence of steps, which a driver performs:
   been received.
 - Open: have the ships make values. The division then says which updates are in them (`division.py`).
 
-A read over the connection of the notices is in order with them. It needs neither Arm nor Fence.
+A read over the connection of the notices is in order with them. It needs neither Arm nor Fence. The recorder performs
+the same steps as one coroutine: `arm`, `touched`, and `divided_read` of `division.py`.
 """
 
 from __future__ import annotations

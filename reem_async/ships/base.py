@@ -12,7 +12,7 @@ from ..errors import BadData
 class SpecialDatatypeShip(ABC):
     """Base of the classes that store a custom type on the server.
 
-    Every method may be a plain function or `async def`. A ship never talks to the server itself:
+    The five methods of this class may be plain functions or `async def`. A ship never talks to the server itself:
     the `client` it is given records commands (with redis-py's names: `set`, `hset`, `rpush`, ...)
     and REEM sends them inside the transaction of the whole write or read. Values of exactly the
     types str, int, float, bool, None, dict, list and tuple are JSON; they are offered to ships only if one claims such

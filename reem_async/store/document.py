@@ -277,10 +277,10 @@ class DocumentWriter:
             if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
                 raise
         else:
-            if not path:  # the whole document was written: nothing of an old version is left
+            if not path:  # the whole document was written: it is not of REEM 0.1
                 self.session.cache.of(self.keys.document).saw_new()
             return
-        turn.release()  # the refusal was announced with numbers of its own
+        turn.release()  # the refusal was announced with numbers of its own; the value is not shared again
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
         await self.session.run(change(it, self.session.cache))
 

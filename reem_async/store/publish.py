@@ -46,6 +46,7 @@ class PublishTurn(Turn):
         return self
 
     async def __aexit__(self, *error: Any) -> None:
+        # An update that the server refused, or that found no server, keeps its number: subscribers report a gap.
         if isinstance(error[1], Contended):
             self.not_applied(len(self._announcements))
         # Before the next call's turn begins, which continues with the next number.

@@ -127,7 +127,7 @@ class _Line:
             raise
 
     def _replies(self, reader: ReplyReader, count: int, receive: Callable[[memoryview], int]) -> list[Reply]:
-        """Read `count` replies; raises InvalidResponse if anything is left over, since nothing else was asked."""
+        """Read `count` replies; raises InvalidResponse if there are more, since nothing else was asked."""
         replies: list[Reply] = []
         gets = reader.gets
         while True:
@@ -135,9 +135,10 @@ class _Line:
             if not received:
                 raise ConnectionResetError("closed by the server")
             reader.received(received)
+            before = len(replies)
             while (reply := gets()) is not MORE:
                 replies.append(reply)
-            if replies:
+            if len(replies) > before:
                 reader.fed = 0
             if len(replies) > count:
                 raise redis.exceptions.InvalidResponse("more replies than were asked for")

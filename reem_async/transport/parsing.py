@@ -59,8 +59,9 @@ class SmallReader:
         )
         self._buffer = bytearray(_BUFFER)
         self._view = memoryview(self._buffer)
-        # Bound once: both are called for each reply.
+        # Bound once: they are called for each reply.
         self._feed: Any = self._parser.feed
+        self._has_data: Any = self._parser.has_data
         # Returns the next reply, or MORE; raises redis.exceptions.InvalidResponse for what is not the protocol.
         self.gets = self._parser.gets
 
@@ -70,8 +71,10 @@ class SmallReader:
     def received(self, count: int) -> None:
         """Parse `count` bytes put there; raises redis.exceptions.InvalidResponse if the reply is too large."""
         self.fed += count
-        if self.fed == count and self._buffer[_LONG] in _DIGITS:  # a reply begins here, perhaps with a long number
+        if self.fed == count:
             self._look_at = _MUCH
+        # Perhaps with a long number, something begins here: the parser holds no beginning of it.
+        if self._buffer[_LONG] in _DIGITS and not self._has_data():
             _check_announced(bytes(self._view[:32]), self._largest)
         self._feed(self._buffer, 0, count)
         if self.fed > self._look_at:  # of a string, hiredis keeps all until it is whole

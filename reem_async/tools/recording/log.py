@@ -44,7 +44,7 @@ class LogUpdate:
         path: What was updated, top-level key first.
         value: What is there now; None if it was deleted.
         deleted: What was there is gone.
-        published: When it was published, in seconds since 1970 on the publisher's clock; `time` if it was not.
+        published: When it was published, in seconds since 1970 on the publisher's clock; `time`, or 0.0, if it was not.
         sequence: Its number among its publisher's updates of the top-level key; 0 if it was not published.
         kind: "pub" if it was published; "stored" if a client changed what is stored and published nothing: what that
             led to, at the instant at which it was found; "kvs" if it was sampled, or found when the key was read:

@@ -73,7 +73,7 @@ class Clock:
         # At most a second: `received` is on a clock that may have been set in between.
         ago = 0.0 if received is None else min(max(time.time() - received, 0.0), 1.0)
         now = time.monotonic_ns() + self._offset - int(ago * 1e9)
-        # No two messages have the same log time: it is what tells a stored value from others of its path.
+        # No two calls return the same log time, so no two values of a path have it. Messages of one item share it.
         self._last = max(now // STEP * STEP, self._last + STEP)
         return self._last
 

@@ -122,7 +122,7 @@ class WriterThread:
         with self._changed:
             if self.failure is not None or self._ending:
                 return False
-            # What is small always fits: gaps, deletions and skips must be told most of all when the disk is slow. One
+            # Gaps and skips always fit: they matter most when the disk is slow. One
             # operation fits into an empty queue whatever its size.
             if operation.role in _LARGE and self._size and self._size + size > self._limit:
                 self.counts.drop(operation.path)
