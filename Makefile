@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Three processes, each with a server of its own, take the test files in turns: tests also wait.
 TOGETHER := -n 3 --dist loadfile
+# The long run has more that needs the processor in time.
+LONG := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -16,7 +18,7 @@ test: $(VENV)/ready  ## the fast run, about five minutes: every promise, on an e
 	$(BIN)/python -m pytest -q $(TOGETHER)
 
 test-all: $(VENV)/ready  ## the long run: every test at full size, then those that measure time, alone, and all variants
-	$(BIN)/python -m pytest -q --long $(TOGETHER) -m "not alone"
+	$(BIN)/python -m pytest -q --long $(LONG) -m "not alone"
 	$(BIN)/python -m pytest -q --long -m alone
 	$(MAKE) test-plain test-cluster modes
 

@@ -255,7 +255,7 @@ def test_arrays_have_tabs(visit, kvs, key):
     eventually(lambda: colour(page) == [0, 0, 255])
     page.locator("#tab-table").click()
     expect(page.locator("tbody td").first).to_have_text("255")
-    expect(page.locator(".pager")).to_contain_text("rows 0–49 of 60")
+    expect(page.locator(".pager.tools")).to_contain_text("rows 0–49 of 60")
     page.get_by_label("Rows after").click()
     expect(page.locator("tbody th").first).to_have_text("50")
     page.goto(f"{visit.address}/view/{name}.deep")

@@ -53,7 +53,7 @@ def test_a_call_to_a_stopped_server_ends_in_time(server, open_front):
 def test_a_write_to_a_stopped_server_ends_by_itself(server, open_front, size):
     """Though a large one never waits for a reply: the server takes no byte of it any more."""
     front = open_front(url=server.url, timeout=0.3)
-    front.write(["foo"], 1)
+    front.write(["foo"], np.zeros(size, np.uint8))  # all connections are there
     with stopped(server), pytest.raises(ConnectionLost, match=r"0\.3 s"):
         front.write(["foo"], np.zeros(size, np.uint8))
 

