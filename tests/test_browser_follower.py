@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from conftest import aeventually, subscribed
 
 from reem_async.errors import ConnectionLost
 from reem_async.pubsub.monitor import Monitor
@@ -52,3 +53,20 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
         await page.read()
     assert page.announced == {(key(),)}
     assert history.tree((key(),), time.time()) == {}
+
+
+async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs, binterface, raw):
+    """It broke before it was followed, but keys were touched over it: the server reports nothing of them any more."""
+    await akvs[key()].write({"n": 1})
+    history = History(1000.0, 1 << 24)
+    follower = Follower(binterface, history)
+    await follower.start()
+    try:
+        await aeventually(lambda: follower.is_settled(key()))
+        follower._monitor.broken = lambda: None
+        for connection in subscribed(raw):
+            raw.client_kill_filter(_id=connection)
+        await akvs[key()].write({"n": 2})
+        await aeventually(lambda: history.tree((key(),), time.time()) == {"n": 2})
+    finally:
+        await follower.close()

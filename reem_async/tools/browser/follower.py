@@ -281,7 +281,9 @@ class Follower:
         self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
         self._monitor = Monitor(interface, policy=Last(_WAITING))
         self._monitor.invalidated = lambda name: self.key(name).doubt()
-        self._monitor.broken, self._monitor.changed = self._lost, self._changed
+        # Once more when it is followed again: a connection may break before it is, with keys touched over it.
+        self._monitor.broken = self._monitor.resynchronised = self._lost
+        self._monitor.changed = self._changed
         self._tasks: list[asyncio.Task[None]] = []
         self._keys: dict[str, FollowedKey] = {}
         self._due: dict[str, None] = {}  # documents to be read
