@@ -158,6 +158,7 @@ class FollowedKey:
             return 0
         except BaseException:
             self.feed.give_up()
+            self.feed.tracked = False  # it may not have come to touch the keys: it is read again
             raise
         finally:
             self.busy = False
@@ -174,7 +175,10 @@ class FollowedKey:
         )
         while not isinstance(step, Open):
             if isinstance(step, Arm):
-                feed.tracked = await manager_of(session).touch(self._keys.channel, step.keys, feed.touched)
+                losses = self._follower.losses
+                reported = await manager_of(session).touch(self._keys.channel, step.keys, feed.touched)
+                # The answer and the end of its connection may come together.
+                feed.tracked = reported and losses == self._follower.losses
                 step = feed.armed()
             elif isinstance(step, Read):
                 replies = await session.transport.roundtrip(wire_commands(step.plan), bulk=step.plan.bulk)
@@ -293,6 +297,7 @@ class Follower:
         self.names: set[str] = set()  # the top-level keys
         # Keys that were there when following began and were not read yet: what they hold is no change
         self.unread: set[str] = set()
+        self.losses = 0  # of the connection that reports changes
         self.lost = ""  # why the server cannot be read at the moment; empty if all is well
 
     async def start(self) -> None:
@@ -388,6 +393,7 @@ class Follower:
 
     def _lost(self) -> None:
         """Note that changes may be unknown: the connection that reports them is lost."""
+        self.losses += 1
         for key in self._keys.values():
             key.feed.change(None)
             key.feed.tracked = False
