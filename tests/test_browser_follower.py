@@ -7,6 +7,7 @@ import pytest
 from conftest import aeventually, subscribed
 
 from reem_async.errors import ConnectionLost
+from reem_async.pubsub import finder
 from reem_async.pubsub.monitor import Monitor
 from reem_async.tools.browser.follower import Follower
 from reem_async.tools.browser.history import History
@@ -55,8 +56,12 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
     assert history.tree((key(),), time.time()) == {}
 
 
-async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs, binterface, raw):
-    """It broke before it was followed, but keys were touched over it: the server reports nothing of them any more."""
+async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs, binterface, raw, monkeypatch):
+    """It broke before it was followed, but keys were touched over it: the server reports nothing of them any more.
+
+    The next search for keys is far, as after one that had no answer.
+    """
+    monkeypatch.setattr(finder, "_PERIOD", 600.0)
     await akvs[key()].write({"n": 1})
     history = History(1000.0, 1 << 24)
     follower = Follower(binterface, history)

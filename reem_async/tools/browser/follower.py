@@ -175,10 +175,7 @@ class FollowedKey:
         )
         while not isinstance(step, Open):
             if isinstance(step, Arm):
-                losses = self._follower.losses
-                reported = await manager_of(session).touch(self._keys.channel, step.keys, feed.touched)
-                # The answer and the end of its connection may come together.
-                feed.tracked = reported and losses == self._follower.losses
+                feed.tracked = await manager_of(session).touch(self._keys.channel, step.keys, feed.touched)
                 step = feed.armed()
             elif isinstance(step, Read):
                 replies = await session.transport.roundtrip(wire_commands(step.plan), bulk=step.plan.bulk)
@@ -285,9 +282,8 @@ class Follower:
         self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
         self._monitor = Monitor(interface, policy=Last(_WAITING))
         self._monitor.invalidated = lambda name: self.key(name).doubt()
-        # Once more when it is followed again: a connection may break before it is, with keys touched over it.
-        self._monitor.broken = self._monitor.resynchronised = self._lost
-        self._monitor.changed = self._changed
+        self._monitor.broken, self._monitor.changed = self._lost, self._changed
+        self._monitor.resynchronised = self._read_again
         self._tasks: list[asyncio.Task[None]] = []
         self._keys: dict[str, FollowedKey] = {}
         self._due: dict[str, None] = {}  # documents to be read
@@ -297,7 +293,6 @@ class Follower:
         self.names: set[str] = set()  # the top-level keys
         # Keys that were there when following began and were not read yet: what they hold is no change
         self.unread: set[str] = set()
-        self.losses = 0  # of the connection that reports changes
         self.lost = ""  # why the server cannot be read at the moment; empty if all is well
 
     async def start(self) -> None:
@@ -393,10 +388,18 @@ class Follower:
 
     def _lost(self) -> None:
         """Note that changes may be unknown: the connection that reports them is lost."""
-        self.losses += 1
         for key in self._keys.values():
             key.feed.change(None)
             key.feed.tracked = False
+
+    def _read_again(self) -> None:
+        """Read all keys: they are followed again after a loss.
+
+        A connection may break before it is followed, with keys touched over it, so `_lost` may not have been called for
+        it. And the next search may be far: it waits ten times as long as the last one, which may have had no answer.
+        """
+        self._lost()
+        self.read_soon(self.names | self._keys.keys())
 
     # --- what is read
 
