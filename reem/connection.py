@@ -10,7 +10,7 @@ import sys
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from importlib import import_module
-from threading import current_thread, main_thread
+from threading import Thread, current_thread, main_thread
 from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
 
 import reem_async
@@ -74,6 +74,7 @@ class _Background:
     def __init__(self, direct: reem_async.RedisInterface) -> None:
         self._direct = direct
         self._made: dict[int, tuple[Portal | LastPortal, reem_async.RedisInterface]] = {}
+        self.callers: weakref.WeakSet[Thread] = weakref.WeakSet()  # the threads that make calls for updates
 
     def started(self) -> tuple[Portal | LastPortal, reem_async.RedisInterface]:
         """Return both, starting them if need be; raises InterfaceClosed."""
@@ -123,10 +124,15 @@ class _Background:
             # Not before: an interrupted caller tries again.
             if _exiting:
                 self._made[pid] = LastPortal(), interface
+                # Python deletes no object of a module to which a thread refers, so it would not call `__del__`. These
+                # threads have the program's functions.
+                for thread in set(self.callers) - {current_thread()}:
+                    thread.join(_LONGEST_CALL)
             else:
                 self._made.pop(pid, None)
 
 
+_LONGEST_CALL = 1.0  # seconds to wait at exit for a callback that is being called
 _interfaces: weakref.WeakSet[RedisInterface] = weakref.WeakSet()
 _exiting = False
 

@@ -217,6 +217,7 @@ class CallbackSubscriber(SilentSubscriber):
             if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
                 self._thread.start()
+                self.interface._background.callers.add(self._thread)
 
     def _call_all(self) -> None:
         caller, queue = self._calls._caller(), self._calls._updates.queue
