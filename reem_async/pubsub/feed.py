@@ -130,7 +130,7 @@ class KeyFeed(Generic[U]):
     """The updates of one top-level key and the read that is under way; see the module."""
 
     def __init__(self, keys: Keys, division: Division[U] | None = None, *, aside: bool = False) -> None:
-        self._aside = aside
+        self._aside = aside  # every read goes over another connection than that of the notices
         self.division: Division[U] = division or Division(GapDetector())
         self.number = 0  # Of the last read. Answers to others are too late.
         self.reads_all = True  # the read that is under way has all that is followed of the key

@@ -395,8 +395,8 @@ class Follower:
     def _read_again(self) -> None:
         """Read all keys: they are followed again after a loss.
 
-        A connection may break before it is followed, with keys touched over it, so `_lost` may not have been called for
-        it. And the next search may be far: it waits ten times as long as the last one, which may have had no answer.
+        `_lost` is not called for a connection that breaks before its topics are subscribed, though keys may have been
+        touched over it. The next search may be seconds away: it waits ten times as long as the last one took.
         """
         self._lost()
         self.read_soon(self.names | self._keys.keys())
