@@ -5,6 +5,7 @@ import contextlib
 import logging
 import random
 import time
+from functools import partial
 
 import orjson
 import pytest
@@ -18,6 +19,7 @@ from reem_async.concurrency.queues import Every
 from reem_async.errors import BadData, BadKey, BadValue
 from reem_async.monitor import Monitor
 from reem_async.plan import notices
+from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.notices import Notice
 from reem_async.plan.paths import LONGEST_TOP_KEY, fits, names_key
 from reem_async.pubsub.gaps import GapDetector, Numbers
@@ -29,10 +31,10 @@ MESSAGES = max(60, EXAMPLES // 10)
 NAN, HUGE = b"NaN", b"9" * 400
 
 
-def forged(path=(), value=b"5", *, who="evil", number=1, when=None, kind="set", parts=(), size=None):
+def forged(path=(), value=b"5", *, who="evil", number=1, when=None, kind="set", parts=(), size=None, more=()):
     """A notice as anybody can make it."""
     when = time.time() if when is None else when
-    head = [1, who, number, when, list(path), kind, len(value) if size is None else size, list(parts)]
+    head = [1, who, number, when, list(path), kind, len(value) if size is None else size, list(parts), *more]
     return orjson.dumps(head) + b"\n" + (value if kind == "set" else b"")
 
 
@@ -73,6 +75,18 @@ UNSOUND = {
     "parts that are none": forged().replace(b",[]]", b",5]"),
     "a megabyte": forged(value=b'"' + b"x" * (1 << 20) + b'"'),
     "another kind": forged(kind="drop"),
+    "two fields too many": forged(more=[{}, {}]),
+    "extras that are none": forged(more=[None]),
+    "extras in a list": forged(more=[[["late", 1]]]),
+    "late below zero": forged(more=[{"late": -0.1}]),
+    "late without end": forged(more=[{"late": 1e300}]),
+    "late that is true": forged(more=[{"late": True}]),
+    "late in words": forged(more=[{"late": "1"}]),
+    "a lease below zero": forged(more=[{"lease": -1}]),
+    "a lease of a float": forged(more=[{"lease": 1.0}]),
+    "a lease that is true": forged(more=[{"lease": True}]),
+    "a lease beyond all counters": forged(more=[{"lease": 1 << 53}]),
+    "a lease that is none": forged(more=[{"lease": None}]),
     "another version": forged().replace(b"[1,", b"[2,", 1),
     "nothing": b"",
     "a line end": b"\n",
@@ -89,6 +103,8 @@ SOUND = {
     "the year 1970": forged(when=0),
     "the year 9999": forged(when=253_402_300_799),
     "an unnamed key": forged([""]),
+    "extras of a later version": forged(more=[{"late": 1, "later": {"a": [None]}}]),
+    "no extras": forged(more=[{}]),
 }
 NO_KEYS = [b"{}:notices", b"{a{b}}:notices", b"{" + b"k" * 700 + b"}:notices", b"{\xff\xfe}:notices", b"{a}b}:notices"]
 
@@ -114,6 +130,25 @@ def test_equal_paths_of_other_types_are_not_taken_for_each_other():
         with contextlib.suppress(BadData):
             (found,) = notices.decode(forged([7]).replace(b"[7]", b"[" + index + b"]"), SHIPS).path
             assert type(found) is int
+
+
+def test_extras_come_back_and_are_sent_only_if_there_are_any():
+    """Earlier versions of REEM refuse a ninth field, so a notice that has nothing to say there has none."""
+    slot, each = notices.Slot("host", 1, 2, 3, 4, 5), ("me", 1, 2.0, ("a",))
+    builders = [
+        partial(notices.announce, *each),
+        partial(notices.announce, *each, deleted=True),
+        partial(notices.with_value, *each, b"5", ()),
+        partial(notices.with_value, *each, b'"' + b"x" * notices.LARGEST_INLINE + b'"', ()),
+        partial(notices.in_slot, *each, slot, b"5", ()),
+        partial(notices.in_slot, *each, slot, b"5", [EncodedAttachment(f".{n}", "bytes", ()) for n in range(2000)]),
+    ]
+    for build in builders:
+        assert build() == build(extras=notices.Extras())
+        assert len(orjson.loads(build().partition(b"\n")[0])) == 8
+        for late, lease in ((1.5, 0), (0.0, 7), (0.25, (1 << 53) - 1)):
+            found = notices.decode(build(extras=notices.Extras(late, lease)), SHIPS)
+            assert found == notices.decode(build(), SHIPS)._replace(late=late, lease=lease)
 
 
 @pytest.mark.parametrize("name", NO_KEYS)

@@ -46,7 +46,18 @@ class Notice(NamedTuple):
     size: int = 0  # bytes of the value, document text and arrays; 0 where only the server knows (arithmetic)
     slot: Slot | None = None  # the place of a large value in the publisher's shared memory, or None
     early: bool = False  # whether it arrived before the server had the update
+    late: float = 0.0  # seconds between the publisher's call and its sending, if an outage was between them
+    lease: int = 0  # the fencing number of the lease under which it was written; 0 without one
 
+
+class Extras(NamedTuple):
+    """What only some notices have to say. A program of REEM ignores the extras that it does not know."""
+
+    late: float = 0.0  # as in `Notice`
+    lease: int = 0
+
+
+NO_EXTRAS = Extras()
 
 NOTE_KEPT = 60  # seconds for which the note of a last update is kept
 
@@ -88,8 +99,17 @@ def notify_path(path: Path) -> Path:
     return path
 
 
-def announce(publisher: str, sequence: int, time: float, path: Path, *, deleted: bool = False, size: int = 0) -> bytes:
-    return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], size)
+def announce(
+    publisher: str,
+    sequence: int,
+    time: float,
+    path: Path,
+    *,
+    deleted: bool = False,
+    size: int = 0,
+    extras: Extras = NO_EXTRAS,
+) -> bytes:
+    return _header(publisher, sequence, time, path, "delete" if deleted else "look", [], size, extras)
 
 
 def in_slot(
@@ -100,6 +120,7 @@ def in_slot(
     slot: Slot,
     text: bytes,
     attachments: Sequence[EncodedAttachment],
+    extras: Extras = NO_EXTRAS,
 ) -> bytes:
     """Return a notice with the slot of the value, which subscribers on other hosts ignore.
 
@@ -108,8 +129,11 @@ def in_slot(
     sizes = sizes_of_parts(text, attachments)
     parts: list[Any] = [[*slot, sizes[0]]]
     parts += [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
-    notice = _header(publisher, sequence, time, path, "look", parts, sum(sizes))
-    return notice if len(notice) <= LARGEST_INLINE else announce(publisher, sequence, time, path, size=sum(sizes))
+    size = sum(sizes)
+    notice = _header(publisher, sequence, time, path, "look", parts, size, extras)
+    if len(notice) <= LARGEST_INLINE:
+        return notice
+    return announce(publisher, sequence, time, path, size=size, extras=extras)
 
 
 def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> list[int]:
@@ -118,7 +142,13 @@ def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> lis
 
 
 def with_value(
-    publisher: str, sequence: int, time: float, path: Path, text: bytes, attachments: Sequence[EncodedAttachment]
+    publisher: str,
+    sequence: int,
+    time: float,
+    path: Path,
+    text: bytes,
+    attachments: Sequence[EncodedAttachment],
+    extras: Extras = NO_EXTRAS,
 ) -> bytes:
     """Return a notice that carries the value if it is small and made of bytes."""
     size, travels = len(text), True
@@ -126,17 +156,29 @@ def with_value(
         size += sum([len(piece) for piece in each.blob or ()])
         travels = travels and each.blob is not None
     if size > LARGEST_INLINE or not travels:
-        return announce(publisher, sequence, time, path, size=size)
+        return announce(publisher, sequence, time, path, size=size, extras=extras)
     parts: list[Any] = []
     blobs: list[bytes] = []
     for each in attachments:
         blobs.append(b"".join(each.blob or ()))
         parts.append([each.label, each.suffix, len(blobs[-1])])
-    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text)), text, *blobs])
+    return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text), extras), text, *blobs])
 
 
-def _header(publisher: str, sequence: int, time: float, path: Path, kind: str, parts: list[Any], size: int) -> bytes:
-    return orjson.dumps([VERSION, publisher, sequence, time, path, kind, size, parts]) + b"\n"
+def _header(
+    publisher: str,
+    sequence: int,
+    time: float,
+    path: Path,
+    kind: str,
+    parts: list[Any],
+    size: int,
+    extras: Extras,
+) -> bytes:
+    fields: list[Any] = [VERSION, publisher, sequence, time, path, kind, size, parts]
+    if extras is not NO_EXTRAS and (said := {name: value for name, value in extras._asdict().items() if value}):
+        fields.append(said)  # only then: earlier versions of REEM refuse a ninth field
+    return orjson.dumps(fields) + b"\n"
 
 
 def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
@@ -148,7 +190,7 @@ def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
         raise BadData(f"a notice has {len(payload)} bytes, REEM's have at most {_LARGEST}; it was not written by REEM")
     end = payload.find(b"\n")
     try:
-        version, publisher, sequence, time, path, kind, size, parts = orjson.loads(payload[: max(end, 0)])
+        version, publisher, sequence, time, path, kind, size, parts, *more = orjson.loads(payload[: max(end, 0)])
     except (orjson.JSONDecodeError, ValueError, TypeError):
         raise BadData(f"a notice begins with {payload[:60]!r}, which is not REEM's") from None
     _check(version, publisher, sequence, time, path, kind, size, parts)
@@ -160,7 +202,8 @@ def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:
         slot, text_size = found
         if view is not None:
             value = _value_in(slot, text_size, parts[1:], view, ships, _DEEPEST - len(place))
-    return Notice(publisher, sequence, float(time), place, kind == "delete", value, size, slot)
+    late, lease = _extras(more) if more else NO_EXTRAS
+    return Notice(publisher, sequence, float(time), place, kind == "delete", value, size, slot, False, late, lease)
 
 
 def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, kind: Any, size: Any, parts: Any) -> None:
@@ -181,6 +224,14 @@ def _check(version: Any, publisher: Any, sequence: Any, time: Any, path: Any, ki
     )
     if not sound:
         raise BadData("a notice has fields of wrong types or out of range; it was not written by REEM")
+
+
+def _extras(more: list[Any]) -> Extras:
+    if len(more) == 1 and type(more[0]) is dict:
+        late, lease = more[0].get("late", 0.0), more[0].get("lease", 0)
+        if type(late) in (int, float) and 0 <= late < _LATEST and type(lease) is int and 0 <= lease < _MOST:
+            return Extras(float(late), lease)
+    raise BadData(f"a notice has the extra fields {more!r:.60}, which cannot be; it was not written by REEM")
 
 
 def _path(path: list[Any]) -> Path:
