@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from reem_async.concurrency.queues import Policy
 from reem_async.errors import BadType, RedisError, ReemError
@@ -247,9 +247,15 @@ class Accessor(Handle):
         followed = core.rebuilt(kind, writer, self._interface._followers.session, self._core.full_path)
         return Watch(self._interface, followed.watch(policy, stored=stored))
 
-    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+    def mirror(
+        self,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
+    ) -> Mirror:
         """Return a local copy of the value here that follows every change: `with kvs["arm"].mirror() as arm:`."""
-        return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest)
+        return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest, stale=stale)
 
     def __enter__(self) -> Any:
         edit = self.edit()
@@ -287,9 +293,15 @@ class PublishAccessor(Accessor):
         """The publisher of the top-level key."""
         return Publisher(str(self.full_path[0]), self._interface)
 
-    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+    def mirror(
+        self,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
+    ) -> Mirror:
         """Raise WriteOnly."""
-        return self._core.mirror(max_age=max_age, largest=largest)  # type: ignore[return-value]
+        return self._core.mirror(max_age=max_age, largest=largest, stale=stale)  # type: ignore[return-value]
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
         """Raise WriteOnly."""

@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from reem_async.errors import InterfaceClosed
 from reem_async.plan.paths import Path
@@ -26,7 +26,8 @@ class Mirror(Following):
 
     `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
-    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
+    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
+    `stale="keep"` they return the last known value through an outage.
     Use it with `with`, or `listen()` and `close()`.
 
     Args:
@@ -36,15 +37,25 @@ class Mirror(Following):
             The server is probed three times in that time. Use at least three times the round trip.
         largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
+        stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
+            how old that is.
     """
 
     def __init__(
-        self, interface: RedisInterface, path: Path, *, max_age: float | None = None, largest: int | None = None
+        self,
+        interface: RedisInterface,
+        path: Path,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
     ) -> None:
         self._interface = interface
         session = interface._followers.session
-        self._core = core.Mirror(session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest)
-        self.channel, self.max_age = self._core.channel, max_age
+        self._core = core.Mirror(
+            session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest, stale=stale
+        )
+        self.channel, self.max_age, self.stale = self._core.channel, max_age, stale
 
     @property
     def age(self) -> float:

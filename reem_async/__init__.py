@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "BytesShip", "CallbackSubscriber",
-    "ClusterNode", "Conflict", "ConnectionLost", "Every", "InsecureConnection", "InterfaceClosed", "KeyValueStore",
-    "Last", "LoginRefused", "MissingKey", "Misuse", "Newest", "NoJsonSupport", "NotAllowed", "NotConnected",
-    "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite", "PathRefused", "PublishSpace", "Publisher",
-    "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "ServerFailed", "ServerFull",
-    "ServerMissing", "ServerNotReady", "ServerReadOnly", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
-    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
-    "WrongType",
+    "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection", "InterfaceClosed",
+    "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest",
+    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite",
+    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
+    "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
+    "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
+    "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
 ]  # fmt: skip
 

@@ -14,9 +14,12 @@
     |   +-- WriteOnly            also NotImplementedError: reading a PublishSpace
     |   +-- ReadOnly             also NotImplementedError: writing to a subscriber
     +-- MissingKey               also KeyError, redis ResponseError: nothing is stored there
+    |   +-- MissingDocument      not even the top-level key
     +-- PathRefused              also KeyError, redis ResponseError: the parent is missing or cannot hold the element
+    |   +-- MissingTop           there is no top-level key to write into
     +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
     +-- Conflict                 another client changed what was edited, or kept writing to the key; nothing written
+    |   +-- Contended            other clients kept writing to the key for the whole timeout
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     +-- QueueFull                a subscriber with the policy Every fell too far behind
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
@@ -61,10 +64,13 @@ __all__ = [
     "ClusterNode",
     "Conflict",
     "ConnectionLost",
+    "Contended",
     "InsecureConnection",
     "InterfaceClosed",
     "LoginRefused",
+    "MissingDocument",
     "MissingKey",
+    "MissingTop",
     "Misuse",
     "NoJsonSupport",
     "NotAllowed",

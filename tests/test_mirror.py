@@ -188,6 +188,7 @@ def test_a_stopped_server_makes_the_copy_too_old_and_a_dead_one_is_an_error(kind
         with contextlib.closing(front):
             front.write(("foo",), {"a": 1})
             fresh, any_age = Mirrored(front, ("foo",), max_age=0.3), Mirrored(front, ("foo",))
+            kept = Mirrored(front, ("foo",), stale="keep")
             os.kill(server.pid, signal.SIGSTOP)
             try:
 
@@ -202,6 +203,8 @@ def test_a_stopped_server_makes_the_copy_too_old_and_a_dead_one_is_an_error(kind
                 assert "copy" in eventually(lambda: raises(fresh.mirror))
                 assert fresh.mirror.age > 0.3
                 assert "connection is down" in eventually(lambda: raises(any_age.mirror))
+                assert kept.mirror.value() == {"a": kept.mirror["a"].read()} == kept.until(bool) == {"a": 1}
+                assert kept.mirror.age > 0.3
             finally:
                 os.kill(server.pid, signal.SIGCONT)
             assert any_age.until(lambda value: value == {"a": 1}, 10)
@@ -211,7 +214,17 @@ def test_a_stopped_server_makes_the_copy_too_old_and_a_dead_one_is_an_error(kind
                 fresh.mirror.value()
             with pytest.raises(InterfaceClosed):
                 fresh.until(lambda value: True)
+            assert eventually(lambda: kept.mirror.age < 0.3 or raises(kept.mirror)) is True
             any_age.close()
+            kept.close()
+            with pytest.raises(Stale, match="closed"):
+                kept.mirror.value()
+
+
+@pytest.mark.parametrize("options", [{"stale": "old"}, {"stale": None}, {"stale": "keep", "max_age": 1.0}])
+def test_a_mirror_refuses_what_cannot_be_meant(front, key, options):
+    with pytest.raises(BadValue, match="stale="):
+        front.at((key(),)).mirror(**options)
 
 
 def test_a_mirror_that_does_not_follow_yet_says_so(front, key):

@@ -7,6 +7,7 @@ import pytest
 
 import reem
 import reem_async
+import reem_async.errors as errors
 from reem import legacy, utilities
 from reem._twin import for_plain_code
 
@@ -172,5 +173,8 @@ def test_errors_policies_and_ships_are_the_very_same_objects():
         ours, theirs = getattr(reem, name), getattr(reem_async, name)
         if inspect.isclass(ours) and issubclass(ours, Exception):
             assert ours is theirs, name
+    for error in vars(errors).values():
+        if inspect.isclass(error) and issubclass(error, Exception) and error.__module__ == errors.__name__:
+            assert getattr(reem, error.__name__) is error, "programs cannot name what they catch"
     for name in ("Newest", "Last", "Every", "Update", "SpecialDatatypeShip", "NumpyShip"):
         assert getattr(reem, name) is getattr(reem_async, name)

@@ -9,10 +9,10 @@ import math
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, Literal, NamedTuple, NoReturn
 
 from ..concurrency.streams import Following
-from ..errors import BadType, InterfaceClosed, Stale
+from ..errors import BadType, BadValue, InterfaceClosed, Stale
 from ..plan.arguments import check_number
 from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, shorten, show
@@ -60,7 +60,8 @@ class Mirror(Following):
 
     `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
-    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value.
+    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
+    `stale="keep"` they return the last known value through an outage.
     Use it with `async with`, or `listen()` and `close()`.
 
     Args:
@@ -71,15 +72,32 @@ class Mirror(Following):
             The server is probed three times in that time. Use at least three times the round trip.
         largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
+        stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
+            how old that is.
+
+    Raises:
+        BadType, BadValue: An argument that cannot be used, or `max_age` with `stale="keep"`.
     """
 
     def __init__(
-        self, session: Session, keys: Keys, path: Path, *, max_age: float | None = None, largest: int | None = None
+        self,
+        session: Session,
+        keys: Keys,
+        path: Path,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
     ) -> None:
         if max_age is not None:
             check_number("max_age", max_age, f"use {_SHORTEST} seconds or more, or None", least=_SHORTEST)
+        if stale not in ("raise", "keep"):
+            raise BadValue(f'stale={shorten(stale)} is unknown; use "raise" or "keep"')
+        if stale == "keep" and max_age is not None:
+            raise BadValue(f'max_age={max_age:g} refuses old values and stale="keep" returns them; use one of the two')
         self.channel = show((keys.name, *path))
         self.max_age = max_age
+        self.stale = stale
         self._full_path: Path = (keys.name, *path)
         make = partial(
             Follower,
@@ -125,7 +143,7 @@ class Mirror(Following):
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call.
 
         Raises:
-            Stale: The connection is down, or the copy is older than `max_age`.
+            Stale: The connection is down (unless `stale="keep"`), or the copy is older than `max_age`.
         """
         self._check()
         follower = self._link.follower
@@ -157,6 +175,8 @@ class Mirror(Following):
         # Before the age: these say more than that the copy is old.
         if follower.failure is not None:
             return f"following has ended over an error: {follower.failure!r}; make a new mirror"
+        if self.stale == "keep":
+            return ""
         if follower.down:
             return f"the connection is down, and the copy {age:.3f} s old; it is being made again"
         if self.max_age is None or age <= self.max_age:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import builtins
 import operator
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 
@@ -423,7 +423,13 @@ class Accessor(Handle):
         """
         return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
 
-    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> Mirror:
+    def mirror(
+        self,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
+    ) -> Mirror:
         """Return a local copy of the value here that follows every change: `async with kvs["arm"].mirror() as arm:`.
 
         `arm.value()` and `arm["joint"].read()` answer from memory, `arm.age` says how old that may be, and
@@ -433,8 +439,11 @@ class Accessor(Handle):
             max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale.
             largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one.
                 `kvs["arm"]["image"].read()` fetches it.
+            stale: "keep" has answers return the last known value while the connection is down, instead of raising.
         """
-        return Mirror(self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest)
+        return Mirror(
+            self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest, stale=stale
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)

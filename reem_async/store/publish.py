@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NoReturn, Self
+from typing import Any, Literal, NoReturn, Self
 
 from ..errors import ConnectionLost, Contended, NotConnected, WriteOnly
 from ..local.path import LEAST
@@ -230,7 +230,13 @@ class PublishAccessor(Accessor):
         """Raise WriteOnly."""
         self._refuse()
 
-    def mirror(self, *, max_age: float | None = None, largest: int | None = None) -> NoReturn:
+    def mirror(
+        self,
+        *,
+        max_age: float | None = None,
+        largest: int | None = None,
+        stale: Literal["raise", "keep"] = "raise",
+    ) -> NoReturn:
         """Raise WriteOnly."""
         self._refuse()
 
