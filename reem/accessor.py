@@ -12,7 +12,7 @@ from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
 from reem_async.store import accessor as core
-from reem_async.store import publish as core_publish
+from reem_async.store import space as core_space
 from reem_async.store.catalog import Outline
 
 from ._twin import documented_by
@@ -51,11 +51,11 @@ class Writer:
         self.interface._run(self._core.send_to_redis(set_path, set_value))
 
 
-@documented_by(core_publish.Publisher)
+@documented_by(core_space.Publisher)
 class Publisher(Writer):
     """Writes one top-level key and notifies its subscribers, in the same transaction."""
 
-    _kind = core_publish.Publisher
+    _kind = core_space.Publisher
 
 
 @documented_by(core.Accessor)

@@ -7,7 +7,7 @@ from typing import Any
 
 from reem_async.concurrency.queues import Policy
 from reem_async.errors import RedisError, ReemError
-from reem_async.store import publish
+from reem_async.store import space
 from reem_async.store import store as core
 
 from ._twin import documented_by
@@ -110,7 +110,7 @@ class KeyValueStore:
         return f"<reem.{type(self).__name__} {self.interface.hostname}>"
 
 
-@documented_by(publish.PublishSpace)
+@documented_by(space.PublishSpace)
 class PublishSpace(KeyValueStore):
     """A store that can only be written, and that notifies subscribers of every change."""
 
@@ -120,7 +120,7 @@ class PublishSpace(KeyValueStore):
         super().__init__(interface, **options)
         self.outage = outage
         # In place of the one that KeyValueStore has made, which knows no outages; neither has sent anything.
-        self._core: publish.PublishSpace = publish.PublishSpace(self.interface._core, outage)
+        self._core: space.PublishSpace = space.PublishSpace(self.interface._core, outage)
 
     @property
     def dropped(self) -> int:

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from .pubsub.events import Origin, Update
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
     from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
-    from .store import KeyValueStore, Reader, Writer
-    from .store.publish import Publisher, PublishSpace
+    from .store.accessor import Reader, Writer
+    from .store.space import Publisher, PublishSpace
+    from .store.store import KeyValueStore
     from .transport.state import StateChange
 
 __all__ = [
@@ -44,8 +45,9 @@ _HOMES = {
     ".pubsub.events": ["Origin", "Update"],
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],
     ".ships": ["BlobShip", "BytesShip", "NumpyShip", "SpecialDatatypeShip"],
-    ".store": ["KeyValueStore", "Reader", "Writer"],
-    ".store.publish": ["PublishSpace", "Publisher"],
+    ".store.accessor": ["Reader", "Writer"],
+    ".store.space": ["PublishSpace", "Publisher"],
+    ".store.store": ["KeyValueStore"],
     ".transport.state": ["StateChange"],
 }
 """Where the names are that are no errors. Imported when first used: `reem --help` starts sooner."""

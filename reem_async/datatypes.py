@@ -1,9 +1,9 @@
 """The documented names: stores, subscribers, and what they are made of."""
 
 from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber, Update
-from .store import KeyValueStore, Reader, Writer
-from .store.accessor import Accessor
-from .store.publish import Publisher, PublishSpace
+from .store.accessor import Accessor, Reader, Writer
+from .store.space import Publisher, PublishSpace
+from .store.store import KeyValueStore
 
 __all__ = [
     "Accessor",
