@@ -1,6 +1,7 @@
 """What the page reads into its past goes between the updates where it belongs."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from conftest import aeventually, subscribed
 from reem_async.errors import ConnectionLost
 from reem_async.pubsub import finder
 from reem_async.pubsub.monitor import Monitor
+from reem_async.tools.browser import follower as follower_module
 from reem_async.tools.browser.follower import Follower
 from reem_async.tools.browser.history import History
 
@@ -73,5 +75,33 @@ async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs
             raw.client_kill_filter(_id=connection)
         await akvs[key()].write({"n": 2})
         await aeventually(lambda: history.tree((key(),), time.time()) == {"n": 2})
+    finally:
+        await follower.close()
+
+
+async def test_calls_that_waited_long_for_a_dead_link_delay_no_later_ones(key, akvs, binterface, monkeypatch):
+    """Neither reads nor searches rest for a multiple of it: they spare a server at work."""
+    waited = 0.0
+
+    def lost(*args, **options):
+        nonlocal waited
+        waited += 1000.0
+        raise ConnectionLost("gone")
+
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + waited, time=time.time)
+    monkeypatch.setattr(follower_module, "time", clock)
+    monkeypatch.setattr(finder, "time", clock)
+    await akvs[key()].write({"n": 1})
+    history = History(1000.0, 1 << 24)
+    follower = Follower(binterface, history)
+    await follower.start()
+    try:
+        await aeventually(lambda: follower.is_settled(key()))
+        with monkeypatch.context() as patched:
+            patched.setattr(binterface.session.transport, "roundtrip", lost)
+            patched.setattr(follower_module, "present_keys", lost)
+            await akvs[key()].write({"n": 2})
+            await aeventually(lambda: follower.lost and waited >= 2000.0)
+        await aeventually(lambda: history.tree((key(),), time.time()) == {"n": 2} and not follower.lost)
     finally:
         await follower.close()

@@ -9,7 +9,7 @@ from conftest import Loop, RawCluster, aeventually, assert_same
 
 import reem_async
 from reem_async import Last
-from reem_async.errors import BadKey, ConnectionLost, WriteOnly
+from reem_async.errors import BadKey, ConnectionLost, RedisError, WriteOnly
 from reem_async.plan import keys as key_plans
 from reem_async.plan.notices import announce
 from reem_async.plan.paths import show
@@ -189,7 +189,8 @@ async def test_a_look_for_keys_that_the_server_refuses_is_made_again(akvs, key, 
     async with akvs.watch(key("*")) as watch:
         with monkeypatch.context() as patched:
             patched.setattr(key_plans, "_PAGE", "none")  # "ERR value is not an integer"
-            await watch.look()
+            with pytest.raises(RedisError):
+                await watch.look()
         await akvs[key("a")].write(1)
         await watch.look()
         assert (await asyncio.wait_for(anext(watch), 10)).path == key("a")

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections.abc import Awaitable, Callable, Iterable
 
+from ..errors import Misuse, RedisError, ReemError
 from ..plan.paths import Pattern
 from ..session import Session
+
+logger = logging.getLogger("reem.subscribe")
 
 _PERIOD = 1.0  # seconds between searches
 _PAUSE = 10
@@ -23,11 +27,18 @@ async def present_keys(session: Session, tops: Iterable[str]) -> set[str]:
 async def find_regularly(find: Callable[[], Awaitable[bool]]) -> None:
     """Call `find` every second, less often where it takes long, until it returns False.
 
-    The first call is a second from now. An exception of `find` ends this.
+    The first call is a second from now. After a call that fails the next one is a second later: it may have waited
+    long for a server that is gone, which is no work for it. `Misuse` ends this, such as a closed interface.
     """
     while True:
         await asyncio.sleep(_PERIOD)
         began = time.monotonic()
-        if not await find():
-            return
+        try:
+            if not await find():
+                return
+        except Misuse:
+            raise
+        except (ReemError, RedisError, OSError) as error:
+            logger.debug("keys could not be listed: %s", error)
+            continue
         await asyncio.sleep(max(_PAUSE * (time.monotonic() - began) - _PERIOD, 0.0))

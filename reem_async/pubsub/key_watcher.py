@@ -135,11 +135,14 @@ class KeyWatcher:
 
     async def _look_for_all(self) -> bool:
         """Search for each listener; return whether any is left. The next one starts this again."""
+        failure: Exception | None = None
         for listener in list(self._new_keys):
             try:
                 await self._look(listener, late=True)
             except (RedisError, OSError) as error:
-                logger.debug("new keys could not be looked for: %s", error)
+                failure = error
+        if failure is not None:
+            raise failure
         return bool(self._followed)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:

@@ -204,18 +204,15 @@ class PatternWatch(PatternStream[Update]):
 
     async def look(self) -> None:
         followed = list(self._followed)
-        try:
-            found = await present_keys(self._session, self.tops)
-            self._failed &= found
-            for name in self._unreadable.keys() - found:
-                del self._unreadable[name]
-            self._warned = {each for each in self._warned if each[0] in found}
-            for name in followed:  # of a place in a key, no update says that all of the key is gone
-                if name not in found:
-                    self._drop_if_gone(name)
-            await self._follow_late(self._new(found))
-        except (ReemError, RedisError, OSError) as error:
-            logger.debug("keys could not be listed: %s", error)
+        found = await present_keys(self._session, self.tops)
+        self._failed &= found
+        for name in self._unreadable.keys() - found:
+            del self._unreadable[name]
+        self._warned = {each for each in self._warned if each[0] in found}
+        for name in followed:  # of a place in a key, no update says that all of the key is gone
+            if name not in found:
+                self._drop_if_gone(name)
+        await self._follow_late(self._new(found))
 
 
 def _searching(reference: weakref.ref[PatternWatch]) -> Callable[[], Awaitable[bool]]:
@@ -225,7 +222,10 @@ def _searching(reference: weakref.ref[PatternWatch]) -> Callable[[], Awaitable[b
         watch = reference()
         if watch is None or watch._closed:
             return False
-        await watch.look()
+        try:
+            await watch.look()
+        except InterfaceClosed:
+            return False
         return True
 
     return search

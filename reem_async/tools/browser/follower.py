@@ -46,6 +46,7 @@ _RECENT = 16  # updates that are known again if they come twice, where there may
 # Documents that are asked for at the same time.
 _BATCH = 100
 _REST = 4  # how many times as long as reading took none are read: others ask the server, and this program, too
+_LONGEST_REST = 1.0  # seconds of such a rest: a read over a dead link takes long, and is no work for the server
 _PAUSE = 0.1  # seconds after a read that failed
 _SHARE = 4  # a key may take one in so many of the bytes that are read
 
@@ -74,6 +75,11 @@ class Allowance:
         self._saved = min(self._saved + (now - self._then) * self._rate, self.most)
         self._then = now
         return math.inf if size > self.most else max((size - self._saved) / self._rate, 0.0)
+
+
+def _rest(took: float) -> float:
+    """Return for how many seconds nothing is read after reading took so many."""
+    return min(_REST * took, _LONGEST_REST)
 
 
 class FollowedKey:
@@ -429,7 +435,7 @@ class Follower:
                     await asyncio.sleep(_PAUSE)
                 took, size = time.monotonic() - began, sum(filter(None, sizes))
                 # At the beginning the page waits for it; what it asks for goes first.
-                await asyncio.sleep(0.002 if self.unread else max(_REST * took, size / BACKGROUND_RATE))
+                await asyncio.sleep(0.002 if self.unread else max(_rest(took), size / BACKGROUND_RATE))
 
     async def _read(self, key: FollowedKey) -> int | None:
         """Read a document; return how many bytes it has, None if that failed."""
@@ -465,7 +471,7 @@ class Follower:
             except (RedisError, ReemError, OSError):
                 key.doubt()
                 await asyncio.sleep(_PAUSE)
-            rested = time.monotonic() + _REST * (time.monotonic() - began)
+            rested = time.monotonic() + _rest(time.monotonic() - began)
 
     # --- which keys there are
 
@@ -474,8 +480,8 @@ class Follower:
             await self._find()
         except (RedisError, ReemError, OSError) as error:
             self.lost = str(error)
-        else:
-            self.lost = self._ended()
+            raise
+        self.lost = self._ended()
         return True
 
     async def _present(self) -> set[str]:

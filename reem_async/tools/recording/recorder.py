@@ -351,9 +351,8 @@ class Recorder:
 
     async def _search(self) -> bool:
         """Follow new keys, if the server reports changes: else keys are read at each keyframe."""
-        with contextlib.suppress(RedisError, OSError):  # no connection now: it is made again
-            if self.hears_of_changes:
-                self._keys.follow(await self._keys.present())
+        if self.hears_of_changes:
+            self._keys.follow(await self._keys.present())
         return True
 
     def _catch_up(self) -> None:
