@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 import urllib.parse
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -76,24 +77,16 @@ def test_leaving_a_with_block_closes_the_interface(server_url, key):
 def test_several_threads_share_one_interface(kvs, key, raw):
     """Each gets its own values, and no increment is lost."""
     kvs[key()] = {"count": 0}
-    failures = []
 
     def work(me):
-        try:
-            for n in range(40):
-                value = {"me": me, "n": n, "image": np.full((3, me + 1), n)}
-                kvs[key()][f"t{me}"] = value
-                assert_same(kvs[key()][f"t{me}"].read(), value)
-                kvs[key()]["count"] += 1
-        except BaseException as failure:
-            failures.append(failure)
+        for n in range(40):
+            value = {"me": me, "n": n, "image": np.full((3, me + 1), n)}
+            kvs[key()][f"t{me}"] = value
+            assert_same(kvs[key()][f"t{me}"].read(), value)
+            kvs[key()]["count"] += 1
 
-    threads = [threading.Thread(target=work, args=(me,)) for me in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not failures
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(work, range(8)))
     assert kvs[key()]["count"].read() == 320
     assert_no_orphans(raw, key())
 

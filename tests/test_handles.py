@@ -6,7 +6,7 @@ import contextlib
 import copy
 import operator
 import pickle
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from unittest import mock
 
 import numpy as np
@@ -176,7 +176,7 @@ def test_of_many_who_pop_one_gets_each(kvs, key, server_url):
     kvs[key()] = list(range(40))
     got: list[int] = []
 
-    def take():
+    def take(_):
         with contextlib.closing(reem.RedisInterface(server_url)) as interface:
             place = reem.KeyValueStore(interface)[key()]
             while True:
@@ -188,11 +188,8 @@ def test_of_many_who_pop_one_gets_each(kvs, key, server_url):
                     return
                 got.append(item)
 
-    threads = [threading.Thread(target=take) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(30)
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(take, range(3)))
     assert sorted(got) == list(range(40))
 
 

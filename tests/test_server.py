@@ -15,8 +15,8 @@ import stat
 import subprocess
 import sys
 import textwrap
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import anyio
 import anyio.to_thread
@@ -157,19 +157,13 @@ class TestUse:
 
     def test_from_many_threads_one_server(self):
         server = EmbeddedServer()
-        pids = []
 
-        def use() -> None:
+        def use(_: int) -> int:
             server.start()
-            pids.append(server.pid)
+            return server.pid
 
-        threads = [threading.Thread(target=use) for _ in range(8)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        assert len(pids) == 8
-        assert len(set(pids)) == 1
+        with ThreadPoolExecutor(8) as pool:
+            assert len(set(pool.map(use, range(8)))) == 1
         time.sleep(0.1)
         assert server.running  # though the thread that started it has ended
         server.stop()

@@ -7,10 +7,10 @@ import contextlib
 import copy
 import faulthandler
 import random
-import threading
 import time
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -188,31 +188,16 @@ class Hunter:
         """Let some clients call at once, each on a key of its own."""
         self.counts["crowd"] += 1
         clients = self.rng.sample([self.blocking[0], self.blocking[1], *self.asyncio], 3)
-        wrong: list[BaseException] = []
-        threads = []
-        taken: set[str] = set()
-        for client in clients:
-            full = client.namespace + self.rng.choice(TOPS)
-            if full in taken:
-                continue
-            taken.add(full)
-            threads.append(threading.Thread(target=self._crowded, args=(client, full, self.rng.random(), wrong)))
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if wrong:
-            raise wrong[0]
+        crowd = {client.namespace + self.rng.choice(TOPS): (client, self.rng.random()) for client in clients}
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(self._crowded, crowd, *zip(*crowd.values(), strict=True)))
 
-    def _crowded(self, client: Client, full: str, seed: float, wrong: list[BaseException]) -> None:
+    def _crowded(self, full: str, client: Client, seed: float) -> None:
         inputs = Inputs(random.Random(seed))
-        try:
-            for _ in range(8):
-                top = full[len(client.namespace) :]
-                op = inputs.op(top, self.documents.get(full, ABSENT))
-                self._take(client, op, full, " in a crowd")
-        except BaseException as error:
-            wrong.append(error)
+        for _ in range(8):
+            top = full[len(client.namespace) :]
+            op = inputs.op(top, self.documents.get(full, ABSENT))
+            self._take(client, op, full, " in a crowd")
 
     def _together(self) -> None:
         """Let some clients count, append, and put arrays into one document at once: nothing is lost."""
@@ -221,27 +206,20 @@ class Hunter:
         clients = [self.blocking[0], Blocking("another", self.blocking[0].address, ""), self.asyncio[0]]
         start = {"n": 0, "list": [], "a": {str(number): None for number in range(3)}}
         self._take(clients[0], Op("write", (full,), start), full)
-        wrong: list[BaseException] = []
 
         def work(number: int, client: Client) -> None:
             place = (full, "a", str(number))
-            try:
-                for count in range(5):
-                    client.perform(Op("increment", (full, "n"), 1), _published(full))
-                    client.perform(Op("append", (full, "list"), [number, count, np.arange(count)]), _published(full))
-                    client.perform(Op("write", place, [np.full(count, number), {"x": np.arange(3)}]), _published(full))
-                    client.perform(Op("write", place, {"x": np.arange(count)}), _published(full))
-            except BaseException as error:
-                wrong.append(error)
+            for count in range(5):
+                client.perform(Op("increment", (full, "n"), 1), _published(full))
+                client.perform(Op("append", (full, "list"), [number, count, np.arange(count)]), _published(full))
+                client.perform(Op("write", place, [np.full(count, number), {"x": np.arange(3)}]), _published(full))
+                client.perform(Op("write", place, {"x": np.arange(count)}), _published(full))
 
-        threads = [threading.Thread(target=work, args=pair) for pair in enumerate(clients)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        clients[1].close()
-        if wrong:
-            raise Difference(f"together: {wrong[0]!r}") from wrong[0]
+        try:
+            with contextlib.closing(clients[1]), ThreadPoolExecutor() as pool:
+                list(pool.map(work, range(3), clients))
+        except Exception as error:
+            raise Difference(f"together: {error!r}") from error
         stored = clients[0].perform(Op("read", (full,)), False)
         items = [[number, count, np.arange(count)] for number in range(3) for count in range(5)]
         compare(sorted(stored["list"], key=lambda item: item[:2]), items, "what was appended together")
