@@ -20,6 +20,7 @@ from reem_async.pubsub.events import Origin, Update
 from .accessor import Accessor, Publisher, Reader, Writer
 from .connection import RedisInterface
 from .errors import *
+from .parameters import Parameter
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 from .store import KeyValueStore, PublishSpace
 from .subscribe import CallbackSubscriber, SilentSubscriber
@@ -56,9 +57,9 @@ __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "BytesShip", "CallbackSubscriber",
     "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection", "InterfaceClosed",
     "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest",
-    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite",
-    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
-    "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
+    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter",
+    "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
+    "ReemError", "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
     "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
     "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import builtins
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal, Self
 
 from reem_async.concurrency.queues import Policy
+from reem_async.coordination.parameters import prepared
 from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
@@ -18,6 +19,7 @@ from reem_async.store.catalog import Outline
 from ._twin import documented_by
 from .connection import RedisInterface
 from .mirror import Mirror
+from .parameters import Parameter, declared
 from .subscribe import Watch
 
 
@@ -257,6 +259,23 @@ class Accessor(Handle):
         """Return a local copy of the value here that follows every change: `with kvs["arm"].mirror() as arm:`."""
         return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest, stale=stale)
 
+    def parameter(
+        self,
+        name: str,
+        default: Any,
+        *,
+        low: Any = None,
+        high: Any = None,
+        unit: str = "",
+        help: str = "",  # noqa: A002
+        choices: Iterable[Any] | None = None,
+        on_change: Callable[[Any], Any] | None = None,
+    ) -> Parameter:
+        """Declare a parameter in the dict here, and return it: `float(kp)` and `kp.value` are always current."""
+        specification = {"low": low, "high": high, "unit": unit, "help": help, "choices": choices}
+        declaration = prepared(self.full_path, name, default, on_change=on_change, **specification)
+        return declared(self._interface, declaration)
+
     def __enter__(self) -> Any:
         edit = self.edit()
         value = edit.__enter__()
@@ -302,6 +321,10 @@ class PublishAccessor(Accessor):
     ) -> Mirror:
         """Raise WriteOnly."""
         return self._core.mirror(max_age=max_age, largest=largest, stale=stale)  # type: ignore[return-value]
+
+    def parameter(self, name: str, default: Any, **specification: Any) -> Parameter:
+        """Raise WriteOnly."""
+        return self._interface._run(self._core.parameter(name, default, **specification))  # type: ignore[return-value]
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
         """Raise WriteOnly."""

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .concurrency.queues import Every, Last, Newest
     from .concurrency.timeouts import timeout
     from .connection import RedisInterface
+    from .coordination.parameters import Parameter
     from .errors import *
     from .plan.placeholders import Unreadable
     from .pubsub.events import Origin, Update
@@ -29,9 +30,9 @@ __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "BytesShip", "CallbackSubscriber",
     "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection", "InterfaceClosed",
     "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest",
-    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "PartialWrite",
-    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
-    "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
+    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter",
+    "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
+    "ReemError", "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
     "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
     "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
@@ -41,6 +42,7 @@ _HOMES = {
     ".concurrency.queues": ["Every", "Last", "Newest"],
     ".concurrency.timeouts": ["timeout"],
     ".connection": ["RedisInterface"],
+    ".coordination.parameters": ["Parameter"],
     ".plan.placeholders": ["Unreadable"],
     ".pubsub.events": ["Origin", "Update"],
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],

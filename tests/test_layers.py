@@ -122,7 +122,7 @@ ORDER = [
     {"session"},
     {"connection"},
     {"pubsub"},
-    {"store"},
+    {"store", "coordination"},
     {"tools.jsontext", "tools.partfile", "tools.snapshots", "tools.recording", "legacy"},
     {"server"},
     {"tools.browser", "tools.demo"},

@@ -13,7 +13,7 @@ from reem._twin import for_plain_code
 
 CLASSES = [
     "RedisInterface", "KeyValueStore", "PublishSpace", "SilentSubscriber", "CallbackSubscriber",
-    "Writer", "Reader", "Publisher", "accessor", "watch", "mirror",
+    "Parameter", "Writer", "Reader", "Publisher", "accessor", "watch", "mirror",
 ]  # fmt: skip
 
 SYNTAX = {
@@ -100,7 +100,7 @@ def test_every_method_has_its_twin(name):
 @pytest.mark.parametrize("name", CLASSES)
 def test_twins_take_the_same_parameters(name):
     blocking, core = made(reem, name), made(reem_async, name)
-    if name not in ("accessor", "watch", "mirror"):
+    if name not in ("Parameter", "accessor", "watch", "mirror"):
         assert parameters(blocking.__init__) == parameters(core.__init__)
     for method in public(core).keys() & public(blocking).keys():
         ours, theirs = getattr(blocking, method), getattr(core, method)
@@ -129,10 +129,11 @@ def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():
         "RedisInterface": {"initialize", "close"},
         "KeyValueStore": {"get", "set"},
         "accessor": {"read", "write", "get", "delete", "length", "type", "increment", "multiply", "divide"}
-        | {"append", "extend"},
+        | {"append", "extend", "parameter"},
         "SilentSubscriber": {"listen", "close"},
         "CallbackSubscriber": {"listen", "close"},
         "mirror": {"listen", "close", "wait_until"},
+        "Parameter": {"write"},
         "Writer": {"send_to_redis"},
         "Reader": {"read_from_redis"},
         "Publisher": {"send_to_redis"},

@@ -72,6 +72,7 @@ class SubscriptionManager:
         self._subscribing = Subscribing(transport, local.host, self._confirmed)
         self.invalidations = Invalidations()  # what has servers say which keys were changed
         self._heartbeats = Heartbeats(self)
+        self.parameters: dict[str, Any] = {}  # by top-level key, the groups of coordination/parameters.py
         self.callers: set[Any] = set()  # what makes calls for updates, kept here although the program may not hold it
         self.place = os.getpid(), asyncio.get_running_loop()  # the process and the event loop it belongs to
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import builtins
 import operator
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 import numpy as np
 
 from ..concurrency.queues import Newest, Policy, chosen
 from ..connection import RedisInterface
+from ..coordination.parameters import Parameter, declared, prepared
 from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey, WrongType
 from ..plan.arguments import Handle
 from ..plan.documents import number_text
@@ -444,6 +445,53 @@ class Accessor(Handle):
         return Mirror(
             self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest, stale=stale
         )
+
+    async def parameter(
+        self,
+        name: str,
+        default: Any,
+        *,
+        low: Any = None,
+        high: Any = None,
+        unit: str = "",
+        help: str = "",  # noqa: A002
+        choices: Iterable[Any] | None = None,
+        on_change: Callable[[Any], Any] | None = None,
+    ) -> Parameter:
+        """Declare a parameter in the dict here, and return it: `float(kp)` and `kp.value` are always current.
+
+        Example:
+            kp = await kvs["control"].parameter("kp", 2.0, low=0.0, high=10.0, unit="1/s")
+
+        The value is stored at `control.kp`. A stored value wins over the default; where none is stored, the default is
+        stored. Values that other programs store there are used if they are of the type and in range; others are
+        ignored, logged once each ("reem.parameters") and shown in `kp.invalid`. In an outage the last value stays.
+
+        Two to six round trips, more for the first parameter of a server. Declared again with equal arguments, it is the
+        same parameter; `on_change` of each declaration is called.
+
+        Args:
+            name: The key in the dict here, which is made if it is missing.
+            default: A bool, int, float, str, or a list or array of up to 64 numbers. It decides the type: a parameter
+                with the default 2 takes no 2.5.
+            low: The least number; of a vector also a vector. None for no bound.
+            high: The greatest number, likewise.
+            unit: Such as "1/s"; for people.
+            help: What it does; for people.
+            choices: The values that it may have.
+            on_change: A function, called with each new value (the newest only, if it is slow), also after this
+                program's own writes, and not with the first value. In asyncio a plain or a coroutine function, on the
+                event loop; in plain programs on a thread of its own.
+
+        Raises:
+            BadType, BadValue, BadKey: It cannot be declared so, or was declared differently in this program.
+            PathRefused: The place here holds something that is not a dict.
+            NotConnected: No server listens there.
+            NotAllowed: The user may not read or follow the key. Without the right to write, the parameter can be read.
+        """
+        specification = {"low": low, "high": high, "unit": unit, "help": help, "choices": choices}
+        declaration = prepared(self.full_path, name, default, on_change=on_change, **specification)
+        return await declared(self._reader.session, declaration)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)

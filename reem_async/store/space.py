@@ -68,6 +68,10 @@ class PublishAccessor(Accessor):
         """Raise WriteOnly."""
         self._refuse()
 
+    async def parameter(self, name: str, default: Any, **specification: Any) -> NoReturn:
+        """Raise WriteOnly."""
+        self._refuse()
+
     def watch(self, policy: Any = None, *, stored: bool = True) -> NoReturn:
         """Raise WriteOnly."""
         self._refuse()

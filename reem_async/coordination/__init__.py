@@ -1,0 +1,1 @@
+"""What programs of a robot agree on: parameters."""
