@@ -36,11 +36,11 @@ class RedisInterface:
             separator, any character but a letter or digit: "robot1:", "robots/r1:".
         timeout: Seconds without a byte moving after which a call times out; `reem_async.timeout` sets
             another limit for some calls.
-        local: How updates with arrays or bytes of 64 KB and more get to subscribers of the same host and user. "auto":
-            through shared memory, if available; the server stores every update too, and a subscriber that cannot read
-            the memory fetches it there. "off": always from the server. "early": updates of this interface reach
-            subscribers on this host before the server has stored them (`update.early`); if the server never gets an
-            update, they get the server's value, with `gap`. See docs/guarantees.md.
+        local: How updates get to subscribers of the same host and user. "auto": those with arrays or bytes of 64 KB and
+            more through shared memory, if available; the server stores every update too, and a subscriber that cannot
+            read the memory fetches it there. "off": always from the server. "early": updates of this interface reach
+            subscribers on this host directly, before the server has stored them (`update.early`); if the server never
+            gets an update, they get the server's value, with `gap`. See docs/guarantees.md.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`

@@ -250,7 +250,7 @@ STEPS = {
     "in the middle of writing": lambda: setattr(segment, "np", Numpy()),
     "written and locked": lambda: killing(segment.Segment, "_write"),
     "in the slot": lambda: killing(path.LocalPath, "put"),
-    "told early, not stored": lambda: killing(publish.ValueAnnouncement, "_notify_host"),
+    "told early, not stored": lambda: killing(publish.ValueAnnouncement, "_notify_early"),
     "not stored": lambda: killing(publish.ValueAnnouncement, "share"),
     "stored": lambda: None,
 }

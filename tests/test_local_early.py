@@ -1,7 +1,8 @@
-"""`local="early"`: what subscribers near by are told before the server has it, and how that is put right."""
+"""`local="early"`: of what subscribers near by are notified before the server has it, and how that is put right."""
 
 import asyncio
 import contextlib
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import redis
 from conftest import PATIENCE, aeventually, assert_same
 
 import reem_async
-from reem_async.errors import ServerFull
+from reem_async.errors import ServerFull, Stale
 from reem_async.local.host import reason_against
 from reem_async.server import EmbeddedServer
 from reem_async.store import publish
@@ -48,28 +49,51 @@ async def test_early_what_the_server_refuses_is_put_right_with_a_gap():
             admin.config_set("maxmemory", "1")
             with pytest.raises(ServerFull):
                 await spaces[0]["cam"].write({"n": 2, "image": IMAGE})
-            update = await next_of(told)
-            assert update.early
-            assert_same(update.data, {"n": 2, "image": IMAGE})
             assert (await kvs["cam"].read()) == {"n": 1}
-            update = await next_of(told)
-            assert (update.early, update.gap, update.data) == (False, True, {"n": 1})
+            for updates in (told, stored):
+                update = await next_of(updates)
+                assert update.early
+                assert_same(update.data, {"n": 2, "image": IMAGE})
+                update = await next_of(updates)
+                assert (update.early, update.gap, update.data) == (False, True, {"n": 1})
             admin.config_set("maxmemory", "0")
             await spaces[0]["cam"].write({"n": 3})
-            assert (await next_of(told)).data == {"n": 3}
-            # Who follows the store has heard of nothing that it never had.
-            assert (await next_of(stored)).data == {"n": 3}
+            for updates in (told, stored):
+                assert (await next_of(updates)).data == {"n": 3}
 
 
-async def test_what_follows_the_store_is_never_told_early(server_url, key):
-    async with parties(server_url, key("cam")) as (spaces, _, told, stored):
+@pytest.mark.parametrize("size", [0, 1000, 5000, 30_000])
+async def test_early_updates_of_all_sizes_reach_subscribers_watches_and_mirrors(size, server_url, key):
+    """In one datagram, also where the notice of the update itself has no value, or in shared memory."""
+    async with parties(server_url, key("cam")) as (spaces, kvs, told, stored), kvs[key("cam")].mirror() as mirror:
         for number in range(2, 12):
-            await spaces[0][key("cam")].write({"n": number, "image": IMAGE})
-        assert [(await next_of(told)).early for _ in range(10)] == [True] * 10
-        update = await next_of(stored)
-        while update.data["n"] < 11:
-            assert not update.early
+            value = {"n": number, "image": IMAGE[:size]} if size else {"n": number}
+            await spaces[0][key("cam")].write(value)
+            early = await next_of(told)
+            assert_same(early.data, value)
+            assert (early.early, early.gap) == (True, False)
             update = await next_of(stored)
+            assert_same(update.data, value)
+            assert not update.gap
+            assert_same(await mirror.wait_until(lambda tree, number=number: tree["n"] == number, PATIENCE), value)
+
+
+async def test_a_mirror_is_as_old_as_what_the_server_has_not_confirmed():
+    """Its age counts from when a refused update has arrived."""
+    with EmbeddedServer() as server, redis.Redis.from_url(server.url) as admin:
+        async with parties(server.url, "cam") as (spaces, kvs, _, _), kvs["cam"].mirror(max_age=0.2) as mirror:
+            admin.config_set("maxmemory", "1")
+            with pytest.raises(ServerFull):
+                await spaces[0]["cam"].write({"n": 2})
+            answered, value = [], {"n": 2}
+            while value == {"n": 2}:
+                now = time.monotonic()
+                with contextlib.suppress(Stale):
+                    value = mirror.value()
+                    answered.append(now)
+                await asyncio.sleep(0.01)
+            assert value == {"n": 1}
+            assert 0 < answered[-2] - answered[0] <= 0.2
 
 
 async def test_early_what_another_publisher_overtook_is_put_right(server_url, key, monkeypatch):

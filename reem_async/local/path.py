@@ -17,6 +17,7 @@ from ..plan.notices import Slot, starts
 
 if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from .host import host
+    from .mailbox import Subscribers
     from .reader import LocalReader
     from .segment import HEAD, SLOTS, Segment
 
@@ -50,6 +51,7 @@ class LocalPath:
         self._pid = os.getpid()
         self._segments: dict[str, Segment] = {}
         self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
+        self._subscribers: Subscribers | None = None
 
     @property
     def reader(self) -> LocalReader:
@@ -73,21 +75,34 @@ class LocalPath:
         """Return the first bytes of a slot, so many, read-only; None if they are not to be had, or not near by."""
         return self.reader.view(slot, size) if slot.host == self.host else None
 
+    @property
+    def subscribers(self) -> Subscribers:
+        """The subscribers that are notified early; only where there is a `host`."""
+        if self._subscribers is None:
+            self._subscribers = Subscribers()
+        return self._subscribers
+
     def is_to_ask(self, keys: Keys) -> bool:
         """Return whether it is not known any more how many near by listen to a key."""
+        if self.early:
+            for channel in self.subscribers.take_answers():
+                self._audiences.pop(channel.decode(errors="replace"), None)
         _, until = self._audiences.get(keys.channel, (0, 0.0))
         return time.monotonic() > until
 
-    def answered(self, keys: Keys, count: object) -> None:
-        """Note how many near by listen; anything but a number says that it cannot be known."""
+    def answered(self, keys: Keys, count: object) -> int:
+        """Note how many near by listen; anything but a number says that it cannot be known. Returns how many did."""
+        was = self.audience(keys)
         self._give_up(before=time.monotonic() - _IDLE)  # once a second is enough
         holds, number = (_ASKED, count) if type(count) is int else (_REFUSED, 0)
         self._audiences[keys.channel] = number, time.monotonic() + holds
         while len(self._audiences) > _KEYS:
             self._audiences.popitem(last=False)
+        return was
 
-    def has_audience(self, keys: Keys) -> bool:
-        return self._audiences.get(keys.channel, (0, 0.0))[0] > 0
+    def audience(self, keys: Keys) -> int:
+        """Return how many connections of this host listened to a key when last asked."""
+        return self._audiences.get(keys.channel, (0, 0.0))[0]
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:
         """Copy an update of a key into shared memory; None if there is no room for it now, or memory is not to be had.
@@ -137,4 +152,6 @@ class LocalPath:
         self._off = True
         if self._reader is not None:
             self._reader.close()
+        if self._subscribers is not None:
+            self._subscribers.close()
         self._segments = {}

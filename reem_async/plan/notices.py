@@ -149,13 +149,15 @@ def with_value(
     text: bytes,
     attachments: Sequence[EncodedAttachment],
     extras: Extras = NO_EXTRAS,
+    *,
+    largest: int = LARGEST_INLINE,
 ) -> bytes:
-    """Return a notice that carries the value if it is small and made of bytes."""
+    """Return a notice that carries the value if it has at most so many bytes and is made of bytes."""
     size, travels = len(text), True
     for each in attachments:
         size += sum([len(piece) for piece in each.blob or ()])
         travels = travels and each.blob is not None
-    if size > LARGEST_INLINE or not travels:
+    if size > largest or not travels:
         return announce(publisher, sequence, time, path, size=size, extras=extras)
     parts: list[Any] = []
     blobs: list[bytes] = []

@@ -121,9 +121,8 @@ class Follower(Listener):
 
     @contained
     def on_early(self, notice: Notice) -> None:
-        if not self.stored:  # a copy of the store is never ahead of it, whether or not its server reports changes
-            self._replica.on_early(notice)
-            self._perform()
+        self._replica.on_early(notice, time.monotonic())
+        self._perform()
 
     @contained
     def changed(self, key: str | None) -> None:
@@ -171,9 +170,10 @@ class Follower(Listener):
 
         Counts from when the last question was sent whose answer confirmed the copy: replies are in order with notices
         and invalidation messages, so all that was changed before the question has been applied. If the server does not
-        report what is only stored, only a read confirms the copy.
+        report what is only stored, only a read confirms the copy. An early update that the server does not confirm
+        counts from its arrival.
         """
-        return time.monotonic() - self._valid_at
+        return time.monotonic() - min(self._valid_at, self._replica.unconfirmed_since)
 
     @property
     def untrusted(self) -> str:

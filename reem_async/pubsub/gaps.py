@@ -109,9 +109,9 @@ class GapDetector:
         return missing
 
     def is_next(self, update: Numbered) -> bool:
-        """Return whether an update comes directly behind what was heard of its publisher, as far as is known."""
+        """Return whether an update comes directly behind what was heard of its publisher over this connection."""
         last = self._heard.last.get(update.publisher)
-        return last is None or update.sequence == last + 1
+        return last is not None and update.sequence == last + 1
 
     def has(self, note: Reply) -> bool:
         """Return whether the update that a note names was heard of: then so were those before it."""

@@ -20,6 +20,7 @@ from ..plan.paths import names_key, shorten
 from ..ships.registry import Ships
 from ..transport import Transport
 from ..transport.wire import Wire
+from .early import EarlyInbox
 
 logger = logging.getLogger("reem.subscribe")
 
@@ -170,9 +171,11 @@ class Inbox:
         self._ships = ships
         self._topics = topics
         self._view = local.view if local.host else None
-        self._early = f"@{local.host}".encode() if local.host else None
+        # The end of the channels on which publishers of this host ask for subscribers; None if that is off
+        self._asks = f"@{local.host}".encode() if local.host else None
         self._moved = moved  # called with topics that their server does not have any more, and why
         self._empty = empty  # called with a topic that has no listener any more
+        self.early = EarlyInbox(self._take_early)
         self._warned: set[bytes] = set()
         # Notified of every key that the server says was changed, whichever listener read it
         self.watchers = ListenerGroup()
@@ -191,9 +194,10 @@ class Inbox:
             self._moved([Topic(*topic)], "its slot has moved to another node")
             return
         channel, payload = message[-2:]
-        if self._early is not None and channel.endswith(self._early) and not topic[1]:
-            self._take_early(channel.removesuffix(self._early), payload)
+        if self._asks is not None and channel.endswith(self._asks) and not topic[1]:
+            self.early.answer(channel.removesuffix(self._asks), payload)  # empty if its publisher is not an early one
             return
+        self.early.read()  # first what was sent before: a busy program finds both at once
         listeners = self._topics.get(topic, NO_LISTENERS).present()
         if not listeners:  # all were dropped without closing
             self._empty(Topic(*topic))
@@ -218,10 +222,10 @@ class Inbox:
                 listener.invalidate(channel)
 
     def _take_early(self, channel: bytes, payload: bytes) -> None:
-        """Take an update that a publisher on this host sent ahead of the server; an empty message is only a probe."""
+        """Take an update that a publisher on this host sent ahead of the server."""
         topic: Any = (channel, False)
         listeners = [listener for listener in self._topics.get(topic, NO_LISTENERS).present() if listener.local]
-        if not payload or not listeners:
+        if not listeners:
             return
         try:
             notice = decode(payload, self._ships, self._view)._replace(early=True)

@@ -69,7 +69,7 @@ class SubscriptionManager:
         self._pace = 0.0
         self._closed = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
-        self._subscribing = Subscribing(transport, local.host, self._confirmed)
+        self._subscribing = Subscribing(transport, local.host, self._confirmed, self._inbox.early.joined)
         self.invalidations = Invalidations()  # what has servers say which keys were changed
         self._heartbeats = Heartbeats(self)
         self.parameters: dict[str, Any] = {}  # by top-level key, the groups of coordination/parameters.py
@@ -410,6 +410,8 @@ class SubscriptionManager:
     async def close(self) -> None:
         """End all listeners and the connections. Idempotent."""
         self._closed = True
+        if self.is_here:
+            self._inbox.early.close()
         if self.place != (os.getpid(), asyncio.get_running_loop()):
             return  # its connections are the parent's, or went with their event loop
         # First, since a task may be slow to end: loops over what is followed do not wait for it.

@@ -38,15 +38,16 @@ the next change. What a snapshot differs in from the copy, the notices in it app
 - Attachments whose keys were not changed since they were read are not fetched again. In a snapshot
   that was taken aside they belong together with the rest only if no change of theirs comes before its fence.
 
-An update may be told early, before the server has it (`on_early`), to a copy that is CURRENT. The update itself
-confirms it, is recognized by its slot, and is not reported again. What is not confirmed, or comes in between at
-the same place, has the place read, and reported with a gap. After a read that begins for another reason the update is
-reported again. `EarlyUpdates` draws it.
+An update may be reported early, before the server has it (`on_early`), to a copy that is CURRENT. The update itself
+confirms it and is not reported again. If it is not confirmed, or another update of the same place comes first, the
+place is read and reported with a gap. A look waits until all early updates are confirmed. After a read that begins for
+another reason the update is reported again. `EarlyUpdates` draws it.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import math
 from collections.abc import Callable
 from enum import Enum, auto
@@ -74,6 +75,7 @@ __all__ = [
 ]  # fmt: skip
 
 
+_NONE = object()
 _PATIENT = 3  # notes, one a second, after which what was told early should have been confirmed: at least two seconds
 
 
@@ -131,7 +133,7 @@ class Replica:
         self._division = self._feed.division
         self._gaps = self._division.gaps
         self._begins = True  # nothing was read over this connection yet
-        self._early = EarlyUpdates()
+        self._early = EarlyUpdates(self.path)
 
     def at(self, inner: Path = ()) -> Any:
         """Return what is at `inner` below what is followed, or MISSING; not to be changed. Any thread may."""
@@ -178,17 +180,22 @@ class Replica:
         elif missing is not None:  # else it was heard before
             self._take(Heard(notice, max(missing, 0), missing >= 0))
 
-    def on_early(self, notice: Notice) -> None:
-        """A publisher says what it is about to publish: told now, if this copy can be sure that it comes next.
+    @property
+    def unconfirmed_since(self) -> float:
+        """When the oldest early update in the copy was received; infinite if there is none. Any thread may ask."""
+        return self._early.since
 
-        Not to a copy that also follows what is stored: that is never ahead of the server.
-        """
-        if self.state is not _CURRENT or self._feed.tracked or not self._early.fits(notice):
+    def on_early(self, notice: Notice, moment: float = 0.0) -> None:
+        """A publisher says at this moment what it is about to publish: reported if it certainly comes next."""
+        early = self._early
+        if self.state is not _CURRENT or notice.value is ANNOUNCED or not early.fits(notice):
             return
-        if notice.value is ANNOUNCED or not concerns(notice, self.path) or not self._gaps.is_next(notice):
+        last = early.last(notice.publisher)
+        if not (self._gaps.is_next(notice) if last is None else notice.sequence == last + 1):
             return
-        if self._changes(notice):
-            self._early.told(notice)
+        before = self.tree
+        if not concerns(notice, self.path) or self._changes(notice):
+            early.told(notice, before, moment)
 
     def _settles(self, notice: Notice, missing: int) -> bool:
         """Compare an update with what was told early; return whether there is nothing more to do for it."""
@@ -196,6 +203,8 @@ class Replica:
         if outcome is Outcome.WRONG:
             self._early.clear()
             self._take(Heard(notice, None))
+        elif self._early.look_waits and not self._early:
+            self.look()
         return outcome is not Outcome.NEW
 
     def unreadable(self) -> None:
@@ -230,7 +239,11 @@ class Replica:
             self.outputs.append(Look())
 
     def look(self) -> None:
-        if self._feed.dirty and self.state in _AT_REST:
+        if not self._feed.dirty or self.state not in _AT_REST:
+            return
+        if self._early:  # the server may not have these yet: they would be taken back, and reported again
+            self._early.look_waits = True
+        else:
             self._read()
 
     def armed(self, number: int, error: Exception | None = None) -> None:
@@ -337,7 +350,7 @@ class Replica:
         if number != self._feed.number or self.state is not State.OPENING:
             return
         covered, later = self._feed.take()
-        before, self.tree, self.state = self.tree, tree, State.CURRENT
+        before, self.tree, self.state = self._early.confirmed(self.tree), tree, State.CURRENT
         self._events.snapshot(before, tree, covered, stored=self._feed.tracked)
         if self._begins:
             self._begins = False
@@ -368,50 +381,89 @@ class Replica:
 
 
 class EarlyUpdates:
-    """Updates that were told before the server had them, one of each publisher at most.
+    """Updates that were reported before the server had them, in the order of each publisher.
 
             told()                                   settle(): the update itself comes
-        ----------> in the copy --------------------------------------------------------> confirmed, told already
+        ----------> in the copy --------------------------------------------------------> confirmed, already reported
                        |  |                          settle(): something else comes first
-                       |  +-------------------------------------------------------------> wrong, told with a gap
+                       |  +-------------------------------------------------------------> wrong, reported with a gap
                        | read(): a snapshot takes the copy's place, and may not have it
                        v
-                    awaited ------------------------------------------------------------> told again by its notice
+                    awaited ------------------------------------------------------------> reported again by its notice
                           |                          settle(): something else comes first
-                          +-------------------------------------------------------------> wrong, told with a gap
+                          +-------------------------------------------------------------> wrong, reported with a gap
 
     In both states it is wrong, too, if it does not come for long (`overdue`): the server has refused it, or its
     publisher is dead.
+
+    Args:
+        path: What the copy holds.
+
+    Attributes:
+        look_waits: The copy is to be read once all are confirmed; until then no other one is reported early.
+        since: When the oldest of those in the copy was received; infinite if there is none.
     """
 
-    def __init__(self) -> None:
-        self._told: dict[str, Notice] = {}
-        self._in_copy: set[str] = set()
-        self._notes: dict[str, int] = {}  # that have come since each of them
+    def __init__(self, path: Path) -> None:
+        self.look_waits = False
+        self.since = math.inf
+        self._path = path
+        self._told: dict[str, collections.deque[tuple[Notice, float]]] = {}  # and when each was received
+        self._in_copy = False  # else all are awaited
+        self._base: Any = _NONE  # the copy without them, until they are confirmed or a snapshot is opened
+        self._notes: dict[str, int] = {}  # that have come since the first of each publisher was told or confirmed
 
     def __bool__(self) -> bool:
         return bool(self._told)
 
     def fits(self, notice: Notice) -> bool:
-        """Return whether an update may be reported: its slot identifies it, and it depends on none of the others."""
-        return notice.slot is not None and notice.publisher not in self._told and not self._touches(notice)
+        """Return whether an update may be reported: it is known again, and depends on no other publisher's."""
+        if self.look_waits or (self._told and not self._in_copy):
+            return False
+        return not self._touches(notice)
 
-    def told(self, notice: Notice) -> None:
-        self._told[notice.publisher] = notice
-        self._notes[notice.publisher] = 0
-        self._in_copy.add(notice.publisher)
+    def last(self, publisher: str) -> int | None:
+        """Return the number of the last one of a publisher."""
+        chain = self._told.get(publisher)
+        return chain[-1][0].sequence if chain else None
+
+    def told(self, notice: Notice, before: Any, moment: float) -> None:
+        """An update was reported, and applied to the copy, which was `before` until then."""
+        if not self._told:
+            self._base, self._in_copy = before, True
+        self._notes.setdefault(notice.publisher, 0)
+        self._told.setdefault(notice.publisher, collections.deque()).append((notice, moment))
+        self.since = min(self.since, moment)
 
     def settle(self, notice: Notice, missing: int) -> Outcome:
         """Compare with an update that the server has, before which so many of its publisher are missing."""
-        early = self._told.pop(notice.publisher, None)
-        is_in_copy = notice.publisher in self._in_copy
-        self._in_copy.discard(notice.publisher)
-        self._notes.pop(notice.publisher, None)
-        if early is None:
-            return Outcome.WRONG if self._touches(notice) else Outcome.NEW
-        if missing != 0 or (early.sequence, early.slot, early.path) != (notice.sequence, notice.slot, notice.path):
-            return Outcome.WRONG
-        return Outcome.CONFIRMED if is_in_copy else Outcome.NEW
+        publisher, outcome = notice.publisher, Outcome.NEW
+        chain = self._told.get(publisher)
+        if chain is None:
+            if self._touches(notice):
+                return Outcome.WRONG
+        else:
+            early, _ = chain.popleft()
+            if missing != 0 or _identity(early) != _identity(notice):
+                return Outcome.WRONG
+            if chain:
+                self._notes[publisher] = 0
+            else:
+                del self._told[publisher], self._notes[publisher]
+            if self._in_copy:
+                outcome = Outcome.CONFIRMED
+        if self._in_copy:
+            self.since = min([each[0][1] for each in self._told.values()], default=math.inf)
+            self._confirm(notice, missing)
+        return outcome
+
+    def _confirm(self, notice: Notice, missing: int) -> None:
+        """Apply what the server has to the copy without early updates."""
+        if not self._told:
+            self._base = _NONE
+        elif missing == 0 and concerns(notice, self._path) and is_whole(notice, self._path, self._base):
+            with contextlib.suppress(CannotApply):  # the copy itself is read in this case
+                self._base = applied(self._base, notice, self._path)
 
     def overdue(self) -> bool:
         """The server was asked for its note; return whether one of them should have been confirmed by now."""
@@ -420,14 +472,28 @@ class EarlyUpdates:
         return any(notes >= _PATIENT for notes in self._notes.values())
 
     def read(self) -> None:
-        """A snapshot takes the place of the copy. It is reported without a gap as far as this goes."""
-        self._in_copy.clear()
+        """A snapshot will take the place of the copy. It is reported without a gap as far as this goes."""
+        self._in_copy = self.look_waits = False
+
+    def confirmed(self, tree: Any) -> Any:
+        """Return the copy, which a snapshot replaces, without the updates that the server may not have yet."""
+        base, self._base, self.since = self._base, _NONE, math.inf
+        return tree if base is _NONE else base
 
     def clear(self) -> None:
         self._told.clear()
-        self._in_copy.clear()
         self._notes.clear()
+        self._in_copy = self.look_waits = False
 
     def _touches(self, notice: Notice) -> bool:
-        """Return whether what an update changes depends on whether one of these came before it."""
-        return any(concerns(notice, other.path) or concerns(other, notice.path) for other in self._told.values())
+        """Return whether what an update changes depends on whether another publisher's of these came before it."""
+        return concerns(notice, self._path) and any(
+            concerns(other, self._path) and (concerns(notice, other.path) or concerns(other, notice.path))
+            for publisher, chain in self._told.items()
+            if publisher != notice.publisher
+            for other, _ in chain
+        )
+
+
+def _identity(notice: Notice) -> tuple[object, ...]:
+    return notice.sequence, notice.time, notice.path, notice.deleted, notice.slot

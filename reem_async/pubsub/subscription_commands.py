@@ -26,11 +26,19 @@ _PERIOD = 1.0  # seconds between looks at a connection; one that is dead shows a
 class Subscribing:
     """Subscribes to topics over connections that the caller chooses."""
 
-    def __init__(self, transport: Transport, host: str | None, confirmed: Callable[[Topic, Wire], None]) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        host: str | None,
+        confirmed: Callable[[Topic, Wire], None],
+        joined: Callable[[bytes], None],
+    ) -> None:
         self._transport = transport
         self._host = host  # what names this host to publishers that share memory with it; none if that is off
         # Called with a topic and the connection when the server has confirmed a subscription
         self._on_confirmed = confirmed
+        # Called with a channel of which publishers on this host can count the listeners now
+        self._on_joined = joined
         self._invited: set[Topic] = set()  # publishers of this host know of a listener
 
     async def subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
@@ -63,7 +71,7 @@ class Subscribing:
         """Have publishers of this host know that a listener reads their memory; a refusal means that they do not."""
         if self._host:
             self._invited.add(topic)
-            wire.send([self._command(self._near(topic))], lambda _: None)
+            wire.send([self._command(self._near(topic))], lambda _: self._on_joined(topic.name))
 
     def leave(self, wire: Wire | None, topic: Topic) -> None:
         left = [topic, self._near(topic)] if topic in self._invited else [topic]

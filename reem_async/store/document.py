@@ -269,7 +269,7 @@ class DocumentWriter:
             if attachments:
                 await self._check_place(path, attachments)
             it = self._setting(turn, path, text, attachments)
-            if attachments:
+            if attachments or self.session.local.early:
                 await it.announcement.share(path)
             await self.session.run(change(it, self.session.cache))
         except MissingTop:
@@ -289,7 +289,7 @@ class DocumentWriter:
         if shipped is not None:
             await self._check_place(shipped.path, shipped.attachments)
         changes = [self._setting(turn, path, text or b"", attachments) for path, text, attachments, _ in assignments]
-        if shipped is not None:
+        if shipped is not None or self.session.local.early:
             for each in changes:
                 await each.announcement.share(each.path)
         await self.session.run(together(changes, self.session.cache))

@@ -12,11 +12,14 @@ from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys
-from ..plan.notices import Slot, announce, in_slot, notify_path, published, sizes_of_parts, with_value
+from ..plan.notices import LARGEST_INLINE, Slot, announce, in_slot, notify_path, published, sizes_of_parts, with_value
 from ..plan.paths import Path, counts_from_end
 from ..session import Session
 from .document import Attachments, DocumentWriter, Turn
 from .outage import Outage
+
+_ANSWERS, _ANSWER = 5, 0.001
+"""How often an early publisher looks for the answers of new subscribers on this host, and seconds between two looks."""
 
 _Stamp = tuple[str, int]  # publisher and number of an update
 
@@ -119,50 +122,73 @@ class ValueAnnouncement(UpdateAnnouncement):
     If the server refuses the value, another notice has subscribers read the stored one.
     """
 
-    __slots__ = ("_attachments", "_slot", "_text")
+    __slots__ = ("_attachments", "_early", "_slot", "_text")
 
     def __init__(self, session: Session, keys: Keys, time: float | None, text: bytes, attachments: Attachments) -> None:
         super().__init__(session, keys, time)
         self._text = text
         self._attachments = attachments
         self._slot: Slot | None = None
+        self._early: tuple[_Stamp, bytes] | None = None  # the notice that subscribers near by have, with its number
 
     async def share(self, path: Path) -> None:
         """Put the value into shared memory if it is large and there is a subscriber on this host.
 
-        In early mode, notify it now. One more round trip for each early update, else for one update a second.
+        In early mode, notify the subscribers on this host now. One more round trip for one update a second.
         """
-        sizes = sizes_of_parts(self._text, self._attachments)
-        if sum(sizes) < LEAST or any(each.blob is None for each in self._attachments) or notify_path(path) is not path:
+        local, sizes = self._session.local, sizes_of_parts(self._text, self._attachments)
+        is_large = sum(sizes) >= LEAST
+        # An index from the end is resolved by the server, so such an update cannot be early.
+        is_early = local.early and not counts_from_end(path)
+        if not (is_large or is_early) or not local.host or notify_path(path) is not path:
             return
-        local = self._session.local
-        if not local.host:
+        if any(each.blob is None for each in self._attachments):
             return
         if local.is_to_ask(self._keys):
-            await self._notify_host(b"")
-        if not local.has_audience(self._keys):
-            return
-        pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
-        self._slot = local.put(self._keys, pieces, sizes)
-        # An index from the end is resolved by the server, so such an update cannot be early.
-        if self._slot is not None and local.early and not counts_from_end(path):
-            await self._notify_host(self._payload(self._reserved[0], path))
+            await self._ask_host()
+        if is_large and local.audience(self._keys):
+            pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
+            self._slot = local.put(self._keys, pieces, sizes)
+        if is_early and (self._slot is not None or not is_large):
+            self._notify_early(self._reserved[0], path)
 
-    async def _notify_host(self, payload: bytes) -> None:
-        """Publish to the subscribers on this host and note their number; raises NotConnected."""
-        session, keys = self._session, self._keys
-        channel = session.local.channel(keys)
+    async def _ask_host(self) -> None:
+        """Ask for the subscribers on this host; raises NotConnected."""
+        session, keys, local = self._session, self._keys, self._session.local
+        channel = keys.channel.encode()
+        address = local.subscribers.ask(channel) if local.early else b""
         try:
-            (count,) = await session.transport.roundtrip([(keys.publish, channel, payload)])
+            (count,) = await session.transport.roundtrip([(keys.publish, local.channel(keys), address)])
         except ConnectionLost as error:
             raise NotConnected(f"{error}; the update itself was not sent, so nothing was applied") from error
-        session.local.answered(keys, count)
+        before = local.answered(keys, count)
+        # A new subscriber has to be notified early of this update. Those of older versions of REEM do not answer.
+        for _ in range(_ANSWERS if address and count != before else 0):
+            local.subscribers.take_answers()
+            if local.subscribers.count(channel) >= local.audience(keys):
+                break
+            await session.transport.pause(_ANSWER)
+
+    def _notify_early(self, stamp: _Stamp, path: Path) -> None:
+        channel, subscribers = self._keys.channel.encode(), self._session.local.subscribers
+        if not subscribers.count(channel):
+            return
+        self._time = self._time or time.time()  # the update itself has the same, which identifies it
+        if self._slot is None:
+            payload = with_value(*stamp, self._time, path, self._text, self._attachments, largest=LEAST)
+        else:
+            payload = self._payload(stamp, path)
+        if len(payload) <= LARGEST_INLINE:
+            self._early = stamp, payload
+        subscribers.notify(channel, payload)
 
     def retract(self, path: Path) -> Sequence[Command]:
         # Without a value, so that subscribers read the stored one.
         return self._numbered(path, super()._payload)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
+        if self._early is not None and self._early[0] == stamp:
+            return self._early[1]
         moment = self._time or time.time()
         if self._slot is not None:
             return in_slot(*stamp, moment, path, self._slot, self._text, self._attachments)

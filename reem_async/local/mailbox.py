@@ -1,0 +1,215 @@
+"""Datagrams between programs of one user on one host, ahead of the server.
+
+A publisher with `local="early"` has a mailbox, and so has each subscriber's event loop that such a publisher has asked.
+A mailbox is a Unix socket in a folder that only the user can enter, and the kernel names the user of each sender.
+
+    subscriber -- JOINED channel ------------------> all publishers    it has subscribed to channel@host at the server
+    publisher  -- PUBLISH channel@host address ----> the server        so that only subscribers on this server answer
+    subscriber -- FOLLOWS channel address ---------> that publisher
+    publisher  -- UPDATE channel notice -----------> those subscribers
+
+What is lost here, or arrives late, arrives through the server as well.
+"""
+
+from __future__ import annotations
+
+import array
+import collections
+import contextlib
+import os
+import re
+import secrets
+import socket
+import stat
+import struct
+import time
+import weakref
+from typing import NamedTuple
+
+from ..concurrency.locks import Inherited
+from ..concurrency.wakeup import Descriptor
+from .host import host
+
+JOINED, FOLLOWS, UPDATE = b"J", b"F", b"U"
+PUBLISHER, SUBSCRIBER = "p", "s"
+
+_LARGEST = 1 << 17  # bytes of a datagram: twice the largest value that is not in a slot; Linux sends up to 200,000
+_HEAD = struct.Struct("!cH")  # the kind, and the bytes of the channel
+_CREDENTIALS = struct.Struct("3i")  # struct ucred of <sys/socket.h>: process, user, group
+_ADDRESS = re.compile(r"[0-9a-f]{16}[ps][0-9a-f]{16}")
+_PARENT = "/tmp"  # noqa: S108 - the owner of what is below is checked
+_ANSWERED = 2.5  # seconds for which the answer of a subscriber holds: publishers ask each second
+_CHANNELS = 1000  # of one publisher, whose subscribers are remembered
+_SUBSCRIBERS = 256  # of one channel that are notified early
+
+
+class Datagram(NamedTuple):
+    kind: bytes
+    channel: bytes
+    content: bytes
+
+
+class Mailbox:
+    """A datagram socket of this process.
+
+    Args:
+        role: PUBLISHER or SUBSCRIBER.
+
+    Raises:
+        OSError: No descriptor is left, or another user owns the folder.
+
+    Attributes:
+        address: Its name in the folder.
+        descriptor: Readable when a datagram has arrived.
+        close: Closes it and removes its file; idempotent. Called when the mailbox is dropped, and in a forked child.
+    """
+
+    def __init__(self, role: str) -> None:
+        self._folder = _folder()
+        _remove_dead(self._folder)
+        self.address = f"{host()}{role}{secrets.token_hex(8)}"
+        path = f"{self._folder}/{self.address}"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+        self.descriptor = self._socket.fileno()
+        owner = Descriptor(self.descriptor)
+        self.close = weakref.finalize(self, _close, self._socket, owner, path, os.getpid())
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+        self._socket.bind(path)
+        _all.add(self)
+
+    def send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> bool:
+        """Send without waiting; return False if that address does not exist any more."""
+        try:
+            self._socket.sendto(_HEAD.pack(kind, len(channel)) + channel + content, f"{self._folder}/{address}")
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:  # its queue is full, this mailbox is closed, or the system has no memory for it now
+            pass
+        return True
+
+    def receive(self) -> Datagram | None:
+        """Return the next valid datagram of the same user; None if there is none."""
+        room = socket.CMSG_SPACE(_CREDENTIALS.size) + socket.CMSG_SPACE(4)
+        while True:
+            try:
+                data, ancillary, flags, _ = self._socket.recvmsg(_LARGEST, room, socket.MSG_CMSG_CLOEXEC)
+            except OSError:
+                return None
+            user = None
+            for _, kind, content in ancillary:
+                if kind == socket.SCM_CREDENTIALS and len(content) == _CREDENTIALS.size:
+                    _, user, _ = _CREDENTIALS.unpack(content)
+                elif kind == socket.SCM_RIGHTS:  # REEM sends no descriptors
+                    for number in array.array("i", content[: len(content) // 4 * 4]):
+                        os.close(number)
+            if user == os.getuid() and len(data) >= _HEAD.size and not flags & socket.MSG_TRUNC:
+                kind, length = _HEAD.unpack_from(data)
+                end = _HEAD.size + length
+                if end <= len(data):
+                    return Datagram(kind, data[_HEAD.size : end], data[end:])
+
+
+_all = Inherited[Mailbox](lambda mailbox: mailbox.close())
+
+
+def _close(owner: socket.socket, descriptor: Descriptor, path: str, process: int) -> None:
+    owner.detach()  # the descriptor is closed with the last reference to its `Descriptor`
+    if os.getpid() == process:  # the file is not a forked child's
+        with contextlib.suppress(OSError):
+            os.unlink(path)
+
+
+def _path() -> str:
+    # Not $XDG_RUNTIME_DIR: services that the system starts have none, and it is removed when the user logs out.
+    return f"{_PARENT}/reem-{os.getuid()}"
+
+
+def _folder() -> str:
+    """Return the folder of the mailboxes, made if need be; raises OSError if others than this user can enter it."""
+    folder = _path()
+    with contextlib.suppress(FileExistsError):
+        os.mkdir(folder, 0o700)
+    found = os.lstat(folder)
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise OSError(f"{folder} can be entered by other users")
+    return folder
+
+
+def _remove_dead(folder: str) -> None:
+    """Remove the mailboxes of processes that were killed."""
+    for name in os.listdir(folder):
+        if not is_address(name):
+            continue
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect(f"{folder}/{name}")
+            except ConnectionRefusedError:  # its process has ended: a file is bound as soon as it exists
+                with contextlib.suppress(OSError):
+                    os.unlink(f"{folder}/{name}")
+            except OSError:
+                pass
+
+
+def publishers() -> list[str]:
+    """Return the addresses of the early publishers of this host."""
+    beginning = host() + PUBLISHER
+    try:
+        return [name for name in os.listdir(_path()) if name.startswith(beginning) and is_address(name)]
+    except OSError:  # there has been no early publisher, or the folder is another user's
+        return []
+
+
+def is_address(text: str) -> bool:
+    return _ADDRESS.fullmatch(text) is not None
+
+
+class Subscribers:
+    """The subscribers near an early publisher, by channel."""
+
+    def __init__(self) -> None:
+        self._mailbox: Mailbox | None = None
+        # Until when the answer of each address holds; of the channels that were asked for, the latest last
+        self._known: collections.OrderedDict[bytes, dict[str, float]] = collections.OrderedDict()
+
+    def ask(self, channel: bytes) -> bytes:
+        """Return the address at which the subscribers of a channel are to answer; empty if there is none now."""
+        if self._mailbox is None or not self._mailbox.close.alive:  # a forked child needs its own
+            try:
+                self._mailbox = Mailbox(PUBLISHER)
+            except OSError:
+                return b""
+        self._known.setdefault(channel, {})
+        while len(self._known) > _CHANNELS:
+            self._known.popitem(last=False)
+        return self._mailbox.address.encode()
+
+    def take_answers(self) -> list[bytes]:
+        """Note the answers that have arrived; return the channels that a subscriber has joined."""
+        joined: list[bytes] = []
+        while self._mailbox is not None and (it := self._mailbox.receive()) is not None:
+            address, known = it.content.decode(errors="replace"), self._known.get(it.channel)
+            if it.kind == JOINED:
+                joined.append(it.channel)
+            elif it.kind == FOLLOWS and known is not None and is_address(address):
+                known[address] = time.monotonic() + _ANSWERED
+                if len(known) > _SUBSCRIBERS:
+                    del known[address]
+        return joined
+
+    def count(self, channel: bytes) -> int:
+        return len(self._known.get(channel, ()))
+
+    def notify(self, channel: bytes, notice: bytes) -> None:
+        """Send an update to the subscribers of a channel."""
+        known, mailbox, now = self._known.get(channel, {}), self._mailbox, time.monotonic()
+        if mailbox is None or len(notice) > _LARGEST - _HEAD.size - len(channel):
+            return
+        for address, until in [*known.items()]:
+            if until < now or not mailbox.send(address, UPDATE, channel, notice):
+                known.pop(address, None)
+
+    def close(self) -> None:
+        if self._mailbox is not None:
+            self._mailbox.close()
+        self._mailbox = None
+        self._known.clear()
