@@ -204,10 +204,11 @@ class RedisInterface:
         timeout: float = 1.0,
         local: Literal["auto", "off", "early"] = "auto",
         local_memory: int = MEMORY,
+        wait: float = 0.0,
         **options: Any,
     ) -> None:
         settings = {"namespace": namespace, "timeout": timeout, **options}
-        settings |= {"local": local, "local_memory": local_memory}
+        settings |= {"local": local, "local_memory": local_memory, "wait": wait}
         self._direct = _OnThread(host, ships, **settings)
         self._direct.session.tasks = Threads()
         self._background = _Background(self._direct)

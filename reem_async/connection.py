@@ -43,13 +43,17 @@ class RedisInterface:
             gets an update, they get the server's value, with `gap`. See docs/guarantees.md.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
+        wait: Seconds for which the first connection is tried again if the server is not up yet, for programs that start
+            at boot. Each call waits up to this long, counted from the first one that found no server; then it raises
+            NotConnected. What waiting cannot cure is raised at once: a wrong password or certificate, a missing right,
+            something that is no server of Redis. Once connected, calls to a lost server raise at once.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
             is another name of `timeout`. Besides, `largest_value`: the bytes that a string in a reply may have
             (an array, or the text of a document); 512 MB if not given, as a server's own `proto-max-bulk-len`. What is
             larger, or over eight times that in one reply, closes the connection: ConnectionLost.
 
     Raises:
-        BadType, BadValue: An option or URL that means nothing.
+        BadType, BadValue: An option or URL that means nothing, or a `wait` that is no number of seconds.
     """
 
     _new_transport: NewTransport = AsyncTransport
@@ -63,6 +67,7 @@ class RedisInterface:
         timeout: float = 1.0,
         local: Literal["auto", "off", "early"] = "auto",
         local_memory: int = MEMORY,
+        wait: float = 0.0,
         **options: Any,
     ) -> None:
         ships = options.pop("marshallers", ships)  # what REEM 0.1 called them
@@ -72,10 +77,10 @@ class RedisInterface:
         if host is None:
             host = os.environ.get("REEM_URL") or "localhost"
         settings = {"namespace": namespace, "timeout": timeout}
-        settings |= {"local": local, "local_memory": local_memory}
+        settings |= {"local": local, "local_memory": local_memory, "wait": wait}
         self._given = (getattr(host, "url", host), ships, {**settings, **options})
         shared = LocalPath(local, local_memory)
-        self.session = Session(host, ships, namespace, timeout, options, self._new_transport, shared)
+        self.session = Session(host, ships, namespace, timeout, options, self._new_transport, shared, wait)
         self.session.interface = self
         self._client: Any = None
         # An event loop that ends without `close` (asyncio.run of a script) takes its connections and tasks with it.
@@ -149,7 +154,7 @@ class RedisInterface:
         """Connect now, and check that the server can be used. Optional; one round trip, idempotent.
 
         Raises:
-            NotConnected: No server listens there.
+            NotConnected: No server listens there, also after `wait` seconds.
             redis.exceptions.AuthenticationError: Wrong user or password.
         """
         try:

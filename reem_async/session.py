@@ -15,9 +15,11 @@ from operator import attrgetter
 from typing import Any
 
 from .concurrency.tasks import Tasks
+from .concurrency.timeouts import LONGEST
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
 from .local.path import LocalPath
 from .plan import Plan
+from .plan.arguments import check_number
 from .plan.keys import DOCUMENT, Keys, keys_of
 from .plan.paths import LONGEST_TOP_KEY, Pattern, check_namespace, check_top_key, escaped
 from .plan.shapes import ShapeCache
@@ -27,6 +29,7 @@ from .transport import Transport, drive, scanned
 from .transport.composite import NewTransport
 from .transport.options import Options, look_nearby
 from .transport.packing import CommandRecorder
+from .transport.startup import StartupWait
 
 _FRESH = 3.0  # seconds for which the first notices of a publisher about a key go to all nodes of a cluster
 QUIET = 60.0
@@ -111,13 +114,16 @@ class Session:
         options: dict[str, Any],
         new_transport: NewTransport,
         local: LocalPath,
+        wait: float,
     ) -> None:
+        check_number("wait", wait, "use seconds, 0 or more")
         self.namespace = check_namespace(namespace)
         # A key on the server has at most 512 bytes, the namespace included.
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
         self.options, self.transport = _transport_to(host, timeout, options, new_transport)
+        self.transport.states.startup = StartupWait(min(float(wait), LONGEST))
         self.local = local
         self.interface: Any = None  # the interface this belongs to: pickled in its place
         self._numbers = _Numbers()
@@ -177,6 +183,9 @@ class Session:
 
     async def initialize(self) -> None:
         await self.ships.ready()
+        await self.transport.states.startup.retried(self.transport, self._check_server)
+
+    async def _check_server(self) -> None:
         # Any key will do: the test is whether the server knows the command and the user may send it.
         (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
         # A missing right to JSON commands is an error; a missing right to this key is not.

@@ -286,8 +286,9 @@ def test_a_server_that_is_loading_says_so(slow_to_load):
                     with refused(reem.ServerNotReady, "loading"):
                         made(call)
         assert process.ask("PING").startswith(b"-LOADING"), "it was still loading all the while"
-        with process.admin() as client:
+        with process.admin() as client, caller("blocking", process.url, wait=30) as patient:
             client.config_set("key-load-delay", 0)
+            patient(patient.calls[1])
             eventually(lambda: process.ask("PING") == b"+PONG\r\n")
         with opened("blocking", process.url) as front:
             front.write(["foo"], 1)

@@ -165,6 +165,8 @@ class SubscriptionManager:
                 await self._follow(listener, retry=retry)
                 return
             except RedisError as error:
+                if await self.transport.states.startup.allows(self.transport, error):
+                    continue
                 unapplied = is_unapplied(error) or isinstance(error, NotConnected | ClusterNode)
                 if not self.transport.sharded or not unapplied or self._closed:
                     raise

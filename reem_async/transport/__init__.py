@@ -154,6 +154,8 @@ async def drive(transport: Transport, plan: Plan) -> Any:
         except WrongKind as error:
             raise await _named(transport, error) from None
         except _UNAPPLIED as error:
+            if await transport.states.startup.allows(transport, error):
+                continue
             told = _told(plan, error)
             # These errors say all there is to know; our own frames and those of redis-py would only stand before them.
             raise told.with_traceback(None) from (None if told is error else error)

@@ -56,7 +56,8 @@ class _Line:
             self._connection.disconnect()
             if not isinstance(error, Exception):  # Ctrl-C
                 raise
-            raise options.refused(error) from error
+            refused = options.refused(error)
+            raise refused from (refused.__cause__ if refused is error else error)
         if not self._tls:
             self._out.settimeout(0.0)
         self._timeout = options.timeout

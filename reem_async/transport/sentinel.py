@@ -155,7 +155,10 @@ class SentinelOptions(Options):
             try:
                 return self._named(await ask(sentinel, limit), address)
             except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
-                problems.append(sentinel.refused(error))
+                problem = sentinel.refused(error)
+                if problem is not error:
+                    problem.__cause__ = error
+                problems.append(problem)
         raise self._nowhere(problems)
 
     def _named(self, masters: Any, sentinel: Address) -> Address:
@@ -175,7 +178,9 @@ class SentinelOptions(Options):
             if found := [problem for problem in problems if isinstance(problem, kind)]:
                 return found[-1]
         said = "; ".join(dict.fromkeys(str(problem).partition("; start one")[0] for problem in problems))
-        return NotConnected(f"no sentinel of {self.address} names a primary: {said}")
+        error = NotConnected(f"no sentinel of {self.address} names a primary: {said}")
+        error.__cause__ = problems[-1] if problems else None
+        return error
 
 
 async def _ask(sentinel: Options, limit: float) -> Any:

@@ -15,6 +15,7 @@ from ..concurrency.locks import Inherited, WeakList
 from ..concurrency.queues import BoundedQueue, Last
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed
+from .startup import StartupWait
 
 logger = logging.getLogger("reem.connection")
 
@@ -74,6 +75,8 @@ class States:
     """
 
     def __init__(self) -> None:
+        self.startup = StartupWait(0.0)  # `RedisInterface(wait=)`
+        self.first_opened: float | None = None  # when the first connection was made, on this machine's monotonic clock
         self.unreadable = 0  # how many messages on followed channels could not be read
         self.last = StateChange("idle", "", time.time())
         self._lock = threading.RLock()
@@ -103,6 +106,8 @@ class States:
     def opened(self, address: str, server: str | None) -> None:
         """Note a new connection to the server at `address`, whose process calls itself `server` (if it says so)."""
         with self._lock:
+            if self.first_opened is None:
+                self.first_opened = time.monotonic()
             # Per address: another node of a cluster is another process without anything having been restarted.
             before = self._servers.get(address, server)
             restarted = before != server and server is not None

@@ -402,7 +402,8 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
             await connection.connect()
     except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
         await connection.disconnect(nowait=True)
-        raise options.refused(error) from error
+        refused = options.refused(error)
+        raise refused from (refused.__cause__ if refused is error else error)
     wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
     wire.take_over(connection)
     if not lists_json(connection.handshake_metadata):

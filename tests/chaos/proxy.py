@@ -31,17 +31,17 @@ class _Link:
 
 
 class Proxy:
-    """Stands between clients and the server at `port`; faults are set from any thread.
+    """Stands between clients and the server at `target`; faults are set from any thread.
 
     Attributes:
-        port: Where it listens, on 127.0.0.1.
+        port: Where it listens, on 127.0.0.1; a free one if none is given.
         delay: Seconds by which each chunk, either way, is held back.
         lost: How many replies were dropped.
     """
 
-    def __init__(self, port: int) -> None:
-        self._target = port
-        self.port = 0
+    def __init__(self, target: int, port: int = 0) -> None:
+        self._target = target
+        self.port = port
         self.delay = 0.0
         self.lost = 0
         self._marker: bytes | None = None
@@ -130,7 +130,7 @@ class Proxy:
             task.add_done_callback(tasks.discard)
             task.add_done_callback(lambda _: writer.transport.abort())  # even if it never began
 
-        server = await asyncio.start_server(connected, "127.0.0.1", 0, backlog=1000)
+        server = await asyncio.start_server(connected, "127.0.0.1", self.port, backlog=1000)
         self.port = server.sockets[0].getsockname()[1]
         self._ready.set()
         await self._over.wait()
