@@ -1,5 +1,6 @@
 """What the page reads into its past goes between the updates where it belongs."""
 
+import contextlib
 import time
 from types import SimpleNamespace
 
@@ -58,25 +59,31 @@ async def test_what_cannot_be_told_from_the_rest_is_not_shown(key, apspace, bint
     assert history.tree((key(),), time.time()) == {}
 
 
+@contextlib.asynccontextmanager
+async def followed_all(interface, name, akvs):
+    """A follower of all keys that has read one, and its history."""
+    await akvs[name].write({"n": 1})
+    follower = Follower(interface, history := History(1000.0, 1 << 24))
+    await follower.start()
+    try:
+        await aeventually(lambda: follower.is_settled(name))
+        yield follower, history
+    finally:
+        await follower.close()
+
+
 async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs, binterface, raw, monkeypatch):
     """It broke before it was followed, but keys were touched over it: the server reports nothing of them any more.
 
     The next search for keys is far, as after one that had no answer.
     """
     monkeypatch.setattr(finder, "_PERIOD", 600.0)
-    await akvs[key()].write({"n": 1})
-    history = History(1000.0, 1 << 24)
-    follower = Follower(binterface, history)
-    await follower.start()
-    try:
-        await aeventually(lambda: follower.is_settled(key()))
+    async with followed_all(binterface, key(), akvs) as (follower, history):
         follower._monitor.broken = lambda: None
         for connection in subscribed(raw):
             raw.client_kill_filter(_id=connection)
         await akvs[key()].write({"n": 2})
         await aeventually(lambda: history.tree((key(),), time.time()) == {"n": 2})
-    finally:
-        await follower.close()
 
 
 async def test_calls_that_waited_long_for_a_dead_link_delay_no_later_ones(key, akvs, binterface, monkeypatch):
@@ -91,17 +98,10 @@ async def test_calls_that_waited_long_for_a_dead_link_delay_no_later_ones(key, a
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + waited, time=time.time)
     monkeypatch.setattr(follower_module, "time", clock)
     monkeypatch.setattr(finder, "time", clock)
-    await akvs[key()].write({"n": 1})
-    history = History(1000.0, 1 << 24)
-    follower = Follower(binterface, history)
-    await follower.start()
-    try:
-        await aeventually(lambda: follower.is_settled(key()))
+    async with followed_all(binterface, key(), akvs) as (follower, history):
         with monkeypatch.context() as patched:
             patched.setattr(binterface.session.transport, "roundtrip", lost)
             patched.setattr(follower_module, "present_keys", lost)
             await akvs[key()].write({"n": 2})
             await aeventually(lambda: follower.lost and waited >= 2000.0)
         await aeventually(lambda: history.tree((key(),), time.time()) == {"n": 2} and not follower.lost)
-    finally:
-        await follower.close()
