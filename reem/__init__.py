@@ -60,7 +60,7 @@ __all__ = [
     "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter",
     "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
     "ReemError", "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
-    "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
+    "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
     "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
 ]  # fmt: skip

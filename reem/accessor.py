@@ -242,12 +242,12 @@ class Accessor(Handle):
         """Return a context manager that reads, lets you change, and writes back; also `with accessor:`."""
         return Edit(self._interface, self._core.edit())
 
-    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+    def watch(self, policy: Policy | None = None, *, stored: bool = True, ttl: float | None = None) -> Watch:
         """Return an iterator over the value here and its changes."""
         # What follows lives on the background loop: the connections of the caller's thread only ask and answer.
         kind, writer = type(self._core), self._core._writer.maker()
         followed = core.rebuilt(kind, writer, self._interface._followers.session, self._core.full_path)
-        return Watch(self._interface, followed.watch(policy, stored=stored))
+        return Watch(self._interface, followed.watch(policy, stored=stored, ttl=ttl))
 
     def mirror(
         self,
@@ -255,9 +255,10 @@ class Accessor(Handle):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> Mirror:
         """Return a local copy of the value here that follows every change: `with kvs["arm"].mirror() as arm:`."""
-        return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest, stale=stale)
+        return Mirror(self._interface, self._core.full_path, max_age=max_age, largest=largest, stale=stale, ttl=ttl)
 
     def parameter(
         self,
@@ -318,17 +319,19 @@ class PublishAccessor(Accessor):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> Mirror:
         """Raise WriteOnly."""
-        return self._core.mirror(max_age=max_age, largest=largest, stale=stale)  # type: ignore[return-value]
+        refused: Any = self._core.mirror(max_age=max_age, largest=largest, stale=stale, ttl=ttl)
+        return refused  # type: ignore[no-any-return]
 
     def parameter(self, name: str, default: Any, **specification: Any) -> Parameter:
         """Raise WriteOnly."""
         return self._interface._run(self._core.parameter(name, default, **specification))  # type: ignore[return-value]
 
-    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+    def watch(self, policy: Policy | None = None, *, stored: bool = True, ttl: float | None = None) -> Watch:
         """Raise WriteOnly."""
-        return self._core.watch(policy, stored=stored)  # type: ignore[return-value]
+        return self._core.watch(policy, stored=stored, ttl=ttl)  # type: ignore[return-value]
 
 
 def _rebuilt(kinds: Any, interface: RedisInterface, path: tuple[Any, ...]) -> Accessor:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from reem_async.errors import InterfaceClosed
 from reem_async.plan.paths import Path
+from reem_async.plan.trees import MISSING
 from reem_async.pubsub import mirror as core
 
 from ._twin import documented_by
@@ -27,7 +28,8 @@ class Mirror(Following):
     `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
-    `stale="keep"` they return the last known value through an outage.
+    `stale="keep"` they return the last known value through an outage. With `ttl` they raise Silent once no update has
+    been published for that long, whatever the reason.
     Use it with `with`, or `listen()` and `close()`.
 
     Args:
@@ -39,6 +41,9 @@ class Mirror(Following):
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
         stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
             how old that is.
+        ttl: Seconds for which answers count, from the arrival of the last published update on this program's clock;
+            None for any. A shorter break of the connection is not noticed, unless `max_age` is given too. What is found
+            at the beginning or after a break does not count until the next update arrives, nor do plain writes.
     """
 
     def __init__(
@@ -49,13 +54,14 @@ class Mirror(Following):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> None:
         self._interface = interface
         session = interface._followers.session
         self._core = core.Mirror(
-            session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest, stale=stale
+            session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest, stale=stale, ttl=ttl
         )
-        self.channel, self.max_age, self.stale = self._core.channel, max_age, stale
+        self.channel, self.max_age, self.stale, self.ttl = self._core.channel, max_age, stale, self._core.ttl
 
     @property
     def age(self) -> float:
@@ -71,14 +77,14 @@ class Mirror(Following):
         with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
             self._interface._wait(self._core.close())
 
-    def value(self) -> Any:
+    def value(self, default: Any = MISSING) -> Any:
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call."""
         with quiet_at_exit():
-            return self._core.value()
+            return self._core.value(default)
 
     def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:
         """Wait until the value is as wanted; returns it. No round trip."""
-        core._check_wait(predicate, timeout)
+        timeout = core._limit(predicate, timeout)
         end = math.inf if timeout is None else time.monotonic() + timeout
         with quiet_at_exit(), self._core._wait() as wait:
             # First the states that wait are tried. Then the caller waits for the next one, at most what is left.

@@ -10,6 +10,8 @@ from typing import Any, Self
 
 from reem_async.concurrency.queues import EMPTY, Ended, Policy
 from reem_async.concurrency.scheduling import take_short_turns
+from reem_async.concurrency.streams import closed, timed_out
+from reem_async.concurrency.timeouts import waiting_limit
 from reem_async.errors import BadType, InterfaceClosed
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
@@ -69,6 +71,21 @@ class Watch(Following):
             self._interface._wait(self._core.close())
         except InterfaceClosed:  # the event loop that would do it has ended, or is too busy for that
             self._core.queue.close()
+
+    def next(self, timeout: float | None = None) -> core.Update:
+        """Return the next update: as the loop does, but with a time limit."""
+        limit = waiting_limit(timeout)
+        try:
+            if limit is None:
+                return next(self)
+            if not self._core._following:
+                self.listen()
+            update = self._core.queue.take_within(limit)
+        except (StopIteration, Ended):
+            raise closed() from None
+        if update is EMPTY:
+            raise timed_out(limit)
+        return update  # type: ignore[no-any-return]
 
     def __iter__(self) -> Self:
         return self
@@ -157,8 +174,8 @@ class SilentSubscriber(Following):
         del self._core[key]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        _, (_, arguments, stored) = self._core.__reduce__()
-        return core._rebuilt, (type(self), (self.channel, self.interface, *arguments[2:]), stored)
+        _, (_, arguments, *more) = self._core.__reduce__()
+        return core._rebuilt, (type(self), (self.channel, self.interface, *arguments[2:]), *more)
 
     def __repr__(self) -> str:
         return f"<reem.{type(self).__name__} {self.channel}>"
@@ -176,6 +193,9 @@ class CallbackSubscriber(SilentSubscriber):
     updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
     `data` may have later ones in it already, which are called for too.
 
+    A callback with a parameter `update`, or that takes `**kwargs`, gets the `Update` by that name. It says how the call
+    came about: after an outage the callback is called with what was found (`update.origin`), which may be old.
+
     Args:
         channel: The path to follow.
         interface: The server: a RedisInterface, or what it takes as host.
@@ -183,6 +203,9 @@ class CallbackSubscriber(SilentSubscriber):
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
         stored: Call for plain writes too, by any client.
+        ttl: Seconds without a published update after which there is silence. The callback is only called for published
+            updates that are not older than that when the call begins. See `Accessor.watch`.
+        on_silent: Called with `kwargs` once when silence begins, on the same thread.
     """
 
     def __init__(
@@ -194,17 +217,20 @@ class CallbackSubscriber(SilentSubscriber):
         policy: Policy | None = None,
         *,
         stored: bool = False,
+        ttl: float | None = None,
+        on_silent: Callable[..., Any] | None = None,
     ) -> None:
         super().__init__(channel, interface, policy, stored=stored)
-        self._calls = core.CallbackSubscriber(
-            channel, self.interface._followers, callback_function, kwargs, policy, stored=stored
-        )
+        options: dict[str, Any] = {"stored": stored, "ttl": ttl, "on_silent": on_silent}
+        followers = self.interface._followers
+        self._calls = core.CallbackSubscriber(channel, followers, callback_function, kwargs, policy, **options)
         # What answers `value()` is what calls are made of, so a callback never sees a copy older than its update.
         self._core = self._calls
         self._thread: threading.Thread | None = None
         self._starting = threading.RLock()
-        if inspect.iscoroutinefunction(callback_function):
-            raise BadType("callback_function is a coroutine function, which a thread cannot call; use reem_async")
+        for name, function in (("callback_function", callback_function), ("on_silent", on_silent)):
+            if inspect.iscoroutinefunction(function):
+                raise BadType(f"{name} is a coroutine function, which a thread cannot call; use reem_async")
 
     def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""

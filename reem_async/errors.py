@@ -21,6 +21,7 @@
     +-- Conflict                 another client changed what was edited, or kept writing to the key; nothing written
     |   +-- Contended            other clients kept writing to the key for the whole timeout
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
+    |   +-- Silent               no update has arrived for as long as the mirror's `ttl` allows
     +-- QueueFull                a subscriber with the policy Every fell too far behind
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
     +-- ServerMissing            extra `server` not installed, or no usable server binary
@@ -88,6 +89,7 @@ __all__ = [
     "ServerMissing",
     "ServerNotReady",
     "ServerReadOnly",
+    "Silent",
     "Stale",
     "TlsRefused",
     "TooDeep",
@@ -202,6 +204,10 @@ class QueueFull(ReemError):
 
 class Stale(ReemError):
     """A mirror does not answer: its connection is down, or its copy is older than `max_age` allows."""
+
+
+class Silent(Stale):
+    """A mirror does not answer: no published update has arrived for as long as its `ttl` allows."""
 
 
 class BadData(ReemError, ValueError):

@@ -6,6 +6,8 @@ import collections
 import contextlib
 import dataclasses
 import os
+import queue
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -86,7 +88,8 @@ class BoundedQueue:
         self._items: collections.OrderedDict[int, Any] = collections.OrderedDict()
         self._last = 0
         self._gaps: dict[int, int | None] = {}  # what was lost before which update
-        self._sleepers: collections.deque[None] = collections.deque()  # one for each thread that waits for a wakeup
+        # One for each thread that waits for a wakeup: what wakes that one alone, or None for one that all may take
+        self._sleepers: collections.deque[queue.SimpleQueue[None] | None] = collections.deque()
         self._wakeups: dict[int, Wakeups] = {}  # by process: a forked child must not take its parent's
         self._end: BaseException | None = None
         self.dropped = 0  # how many updates were skipped and will never be taken out
@@ -113,7 +116,7 @@ class BoundedQueue:
         """Keep in one what was lost before updates that were dropped, the last of which had this number."""
         gone = [number for number in self._gaps.copy() if number <= dropped]
         if len(gone) > 1:
-            self._gaps[gone[-1]] = _sum([self._gaps.pop(number, 0) for number in gone])
+            self._gaps[gone[-1]] = total([self._gaps.pop(number, 0) for number in gone])
 
     def skip(self) -> None:
         """Note that an update will never come: a newer one of the same path has taken its place."""
@@ -141,8 +144,7 @@ class BoundedQueue:
         """Wake all waiting threads; one that finds nothing waits again."""
         while self._sleepers:
             with contextlib.suppress(IndexError):  # it has found something meanwhile
-                self._sleepers.pop()
-                self._wakeup().put(None)
+                (self._sleepers.pop() or self._wakeup()).put(None)
         self.wake()
 
     def _wakeup(self) -> Wakeups:
@@ -163,7 +165,21 @@ class BoundedQueue:
         """Return an update with all that was lost before it and not told yet."""
         told = [self._gaps.pop(each, EMPTY) for each in self._gaps.copy() if each <= number]
         told = [missed for missed in told if missed is not EMPTY]  # another thread tells those
-        return dataclasses.replace(update, gap=True, missed=_sum(told)) if told else update
+        return dataclasses.replace(update, gap=True, missed=total(told)) if told else update
+
+    def take_within(self, seconds: float) -> Any:
+        """As `take_waiting`, for so many seconds at most; then return EMPTY."""
+        end = time.monotonic() + seconds
+        while (item := self.take()) is EMPTY and (left := end - time.monotonic()) > 0:
+            # Its own, since a thread that reads from the common one cannot leave when its time is over.
+            wakeup: queue.SimpleQueue[None] = queue.SimpleQueue()
+            self._sleepers.append(wakeup)
+            if not self._items and self._end is None:
+                with contextlib.suppress(queue.Empty):
+                    wakeup.get(timeout=left)
+            with contextlib.suppress(ValueError):  # it was woken
+                self._sleepers.remove(wakeup)
+        return item
 
     def take_waiting(self) -> Any:
         """As `take`, but block this thread until there is something. Any number of threads may."""
@@ -196,6 +212,6 @@ def noop() -> None:
     """Do nothing."""
 
 
-def _sum(missed: list[int | None]) -> int | None:
+def total(missed: list[int | None]) -> int | None:
     """Return how many updates were lost in all, None if that is not known of each loss."""
     return None if None in missed else sum(number for number in missed if number is not None)

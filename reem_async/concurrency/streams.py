@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Generic, Self, TypeVar
 
-from ..errors import BadType
+from ..errors import BadType, InterfaceClosed
 from .queues import EMPTY, BoundedQueue, Ended, Policy, noop
+from .timeouts import waiting_limit
 
 Item = TypeVar("Item")
 
@@ -59,6 +60,31 @@ class Stream(Following, Generic[Item]):
         """Stop following and end the loop. Idempotent."""
         await self.close()
 
+    async def next(self, timeout: float | None = None) -> Item:  # noqa: ASYNC109
+        """Return the next update: as the loop does, but with a time limit.
+
+        It begins to follow first, if need be, which the limit does not count. A call that times out loses no update.
+
+        Args:
+            timeout: Seconds to wait, 0 for what has arrived already. None for the limit of a
+                `with reem_async.timeout(...)` block around the call; outside of one there is no limit.
+
+        Raises:
+            TimeoutError: No update has arrived in time.
+            InterfaceClosed: It was closed, and all updates were taken.
+            QueueFull: The policy allows no skipped update.
+        """
+        limit = waiting_limit(timeout)
+        if not self._following:
+            await self.listen()
+        try:
+            async with asyncio.timeout(limit):
+                return await anext(self)
+        except StopAsyncIteration:
+            raise closed() from None
+        except TimeoutError:
+            raise timed_out(limit) from None
+
     def __aiter__(self) -> Self:
         return self
 
@@ -90,6 +116,16 @@ class Stream(Following, Generic[Item]):
                 self._waiter.set_result(None)
             except asyncio.InvalidStateError:  # Ctrl-C cancels between any two steps of Python
                 return
+
+
+def closed() -> InterfaceClosed:
+    """Return the error for a stream that has ended."""
+    return InterfaceClosed("this subscription is closed; make a new one")
+
+
+def timed_out(seconds: float | None) -> TimeoutError:
+    """Return the error for a time limit that is over."""
+    return TimeoutError(f"no update has arrived within {seconds:g} s")
 
 
 def arrived(stream: Stream[Item]) -> Iterator[Item]:

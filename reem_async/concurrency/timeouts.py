@@ -14,6 +14,7 @@ from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 
 from ..errors import BadValue
+from ..plan.arguments import check_number
 
 LONGEST = 1e6  # seconds that a time limit may have: eleven days, which is as good as none
 LOOKS = 160
@@ -64,7 +65,8 @@ def timeout(seconds: float) -> Iterator[None]:
     """Give every call of REEM inside the block another time limit than its interface's.
 
     A call is given up once no byte has moved for that long, in either direction, while its reply is
-    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread.
+    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread. `next()` of a watch
+    and `wait_until()` of a mirror, which have no limit of their own, wait for that long.
 
     Args:
         seconds: The limit, above 0.
@@ -77,6 +79,17 @@ def timeout(seconds: float) -> Iterator[None]:
         yield
     finally:
         _given.reset(token)
+
+
+def waiting_limit(seconds: float | None) -> float | None:
+    """Return for how long to wait: `seconds`, else the limit of the `with timeout(...)` block around, if there is one.
+
+    Raises BadType or BadValue for what is no time.
+    """
+    if seconds is None:
+        return _given.get()
+    check_number("timeout", seconds, "use seconds, 0 or more, or None for no limit")
+    return float(seconds)
 
 
 def forget() -> None:

@@ -334,7 +334,7 @@ def changes_of(live: LiveParameter, declaration: Declaration) -> tuple[Caller, C
     assert on_change is not None
     live.group.add(queue)
     live.changes.append((queue, declaration.given))
-    return Caller(live.name, lambda value, _: on_change(value), {}), queue
+    return Caller(live.name, lambda update: on_change(update.data)), queue
 
 
 class ParameterHandle(Handle):

@@ -48,6 +48,7 @@ class Notice(NamedTuple):
     early: bool = False  # whether it arrived before the server had the update
     late: float = 0.0  # seconds between the publisher's call and its sending, if an outage was between them
     lease: int = 0  # the fencing number of the lease under which it was written; 0 without one
+    arrived: float | None = None  # when it arrived, on the receiver's monotonic clock, where that is noted
 
 
 class Extras(NamedTuple):

@@ -15,7 +15,8 @@ from ..concurrency.queues import EMPTY, Ended
 from ..concurrency.streams import Stream
 from ..concurrency.tasks import is_being_cancelled, started
 from ..concurrency.timeouts import forget
-from ..errors import BadType
+from ..errors import BadType, BadValue
+from ..plan.paths import shorten
 
 if TYPE_CHECKING:
     from .events import Update
@@ -32,16 +33,38 @@ _current_call: ContextVar[asyncio.Task[Any] | None] = ContextVar("_current_call"
 """The task that awaits the callback which this code belongs to; tasks that the callback starts inherit it."""
 
 
-def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callable[..., Any]:
-    """Return what calls `function` with data and path by name, where its signature has these names, else in this order.
+def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callable[[Update], Any]:
+    """Return what calls `function` for an update: data and path by name if it has these names, else in this order.
 
     REEM 0.1 gave both by name, the manual says that they come first: so a function may name them in any order, take
-    them as `**kwargs`, or call them what it likes. Raises BadType if it cannot be called so, with `kwargs` besides.
+    them as `**kwargs`, or call them what it likes. Besides them it gets `kwargs`, and the update if it has a parameter
+    of that name or takes `**kwargs`. One that takes `*args` too hands all on to a function of which nothing is known,
+    and gets no update. Raises BadType if it cannot be called so.
     """
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # of some functions written in C
-        return function
+        return lambda update: function(update.data, update.path, **kwargs)
+    kinds = {each.kind for each in signature.parameters.values()}
+    takes_any = inspect.Parameter.VAR_KEYWORD in kinds and inspect.Parameter.VAR_POSITIONAL not in kinds
+    if "update" not in kwargs and (takes_any or "update" in signature.parameters):
+        call = _in_this_way(function, signature, {**kwargs, "update": None})
+        if call is not None:
+            return lambda update: call(update.data, update.path, **kwargs, update=update)
+    plain = _in_this_way(function, signature, kwargs)
+    if plain is None:
+        raise BadType(
+            "callback_function cannot be called as "
+            f"callback(data, updated_path{', ' * bool(kwargs)}{', '.join(kwargs)}): "
+            f"it is {getattr(function, '__name__', type(function).__name__)}{signature}"
+        )
+    return lambda update: plain(update.data, update.path, **kwargs)
+
+
+def _in_this_way(
+    function: Callable[..., Any], signature: inspect.Signature, kwargs: Mapping[str, Any]
+) -> Callable[..., Any] | None:
+    """Return what calls `function` with data, path and `kwargs` in this order; None if it cannot be called."""
     parameters = signature.parameters.values()
     first = [each.name for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)][:2]
     named = {each.name for each in parameters if each.kind in (each.POSITIONAL_OR_KEYWORD, each.KEYWORD_ONLY)}
@@ -62,21 +85,35 @@ def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callabl
         return lambda data, path, **others: function(data=data, updated_path=path, **others)
     if in_order and ("data" in first[1:] or "updated_path" in first[:1]):
         return lambda data, path, **others: function(path, data, **others)
-    if in_order:
-        return function
-    raise BadType(
-        f"callback_function cannot be called as callback(data, updated_path{', ' * bool(kwargs)}{', '.join(kwargs)}): "
-        f"it is {getattr(function, '__name__', type(function).__name__)}{signature}"
-    )
+    return function if in_order else None
+
+
+def checked_on_silent(function: Any, kwargs: Mapping[str, Any], ttl: float | None) -> Callable[[], Any]:
+    """Return what calls `function` when silence begins; raises BadType or BadValue for what cannot be called so."""
+    if function is None:
+        return lambda: None
+    if ttl is None:
+        raise BadValue("on_silent is called when silence begins; say when that is, such as ttl=0.2")
+    if not callable(function):
+        raise BadType(f"on_silent={shorten(function)} is not a function; use one that is called with kwargs")
+    try:
+        inspect.signature(function).bind(**kwargs)
+    except TypeError as error:
+        raise BadType(f"on_silent is called as on_silent({', '.join(kwargs)}), with kwargs alone: {error}") from None
+    except ValueError:  # of some functions written in C
+        pass
+    return lambda: function(**kwargs)
 
 
 class Caller:
     """Calls one callback; both fronts use it, each on a thread of its own choice."""
 
-    def __init__(self, channel: str, function: Callable[..., Any], kwargs: Mapping[str, Any]) -> None:
+    def __init__(
+        self, channel: str, function: Callable[[Update], Any], on_silent: Callable[[], Any] = lambda: None
+    ) -> None:
         self._channel = channel
         self._function = function
-        self._kwargs = kwargs
+        self._on_silent = on_silent
         self._raised: dict[object, int] = {}  # by kind and place
         self._dropped = 0
 
@@ -96,7 +133,7 @@ class Caller:
         if update.initial:
             return None
         try:
-            return self._function(update.data, update.path, **self._kwargs)
+            return self._on_silent() if update.silent else self._function(update)
         except (Exception, asyncio.CancelledError):  # of something that was cancelled, and whose result it asked for
             self.failed(update)
             return None

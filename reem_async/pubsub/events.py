@@ -28,6 +28,9 @@ class Origin(StrEnum):
     FOUND = "found"
     """It was there when following began, or after a loss."""
 
+    SILENCE = "silence"
+    """Nothing was updated: no update has arrived for as long as `ttl` allows."""
+
 
 @dataclass(frozen=True, slots=True)
 class Update:
@@ -47,10 +50,15 @@ class Update:
         sequence: Its number among this publisher's updates of the top-level key; None likewise.
         gap: Updates were lost between this one and the last: a connection broke, or one was unreadable.
         missed: How many were lost, None if that is not known.
-        origin: Whether it was published, only stored, or found at the beginning or after a loss.
+        origin: Whether it was published, only stored, or found at the beginning or after a loss; or that there is
+            silence.
         deleted: Nothing is there any more: `value` is None because of that.
         early: It was told before the server had it (`RedisInterface(local="early")` of its publisher): the server has
             it soon, or what it has then is told, with `gap`.
+        late: For how many seconds an outage delayed it at its publisher (`PublishSpace(outage="newest")`), on that
+            one's monotonic clock.
+        silent: No update: silence has begun, with `ttl`. `data` and `value` are None.
+        arrived: When its notice arrived here, on `time.monotonic()`; with `ttl`, else None.
     """
 
     path: str
@@ -65,6 +73,9 @@ class Update:
     origin: Origin = Origin.PUBLISHED
     deleted: bool = False
     early: bool = False
+    late: float = 0.0
+    silent: bool = False
+    arrived: float | None = None
 
 
 class Look(NamedTuple):

@@ -56,6 +56,7 @@ class Follower(Listener):
         stored: bool = False,
         largest: float = math.inf,
         heartbeat: float = math.inf,
+        timed: bool = False,
     ) -> None:
         super().__init__(Topic(keys.channel.encode()))
         self.keys = keys
@@ -63,6 +64,9 @@ class Follower(Listener):
         self.stored = stored
         self.local = largest == math.inf  # else it wants no large values
         self.heartbeat = heartbeat
+        self._timed = timed  # it notes when updates arrive
+        # If timed: since when the newest update of the copy counts, on the monotonic clock; -inf if the copy was found
+        self.live_since = -math.inf
         self._manager = manager
         self._transport, self._tasks = manager.transport, manager.tasks
         self._replica = Replica(keys, path, ships, cache, largest)
@@ -115,13 +119,16 @@ class Follower(Listener):
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         self._looks.heard += 1
+        if self._timed:
+            notice = notice._replace(arrived=time.monotonic())
         self._replica.on_notice(notice)
         if self._replica.outputs:
             self._perform()
 
     @contained
     def on_early(self, notice: Notice) -> None:
-        self._replica.on_early(notice, time.monotonic())
+        now = time.monotonic()
+        self._replica.on_early(notice._replace(arrived=now) if self._timed else notice, now)
         self._perform()
 
     @contained
@@ -234,6 +241,7 @@ class Follower(Listener):
             self._skip(output)
         elif isinstance(output, Snapshot):
             data, initial = output.data, output.initial
+            self.live_since = -math.inf
             self._tell_state((), data, data, Origin.FOUND, initial=initial, gap=not initial, missed=output.missed)
         elif isinstance(output, Ready):
             self.down = False
@@ -341,12 +349,20 @@ class Follower(Listener):
         notice, tree, written, missed = event
         publisher, sequence, time, inner = notice[:4]
         path = show((self.keys.name, *inner))
+        late, arrived = self._heard(notice)
         for queue in self.queues:
             data = own(tree)
             value = data if written is tree else own(written)
             gone = notice.deleted or tree is MISSING
             how = Origin.PUBLISHED, gone, notice.early
-            queue.put(Update(path, data, value, False, time, publisher, sequence, missed != 0, missed, *how))
+            stamp = time, publisher, sequence, missed != 0, missed
+            queue.put(Update(path, data, value, False, *stamp, *how, late, False, arrived))
+
+    def _heard(self, notice: Notice) -> tuple[float, float | None]:
+        """Note since when an update counts; return how late it was, and when it arrived if that is noted."""
+        if notice.arrived is not None:
+            self.live_since = notice.arrived - notice.late
+        return notice.late, notice.arrived
 
     def _tell_state(self, inner: Path, tree: Any, value: Any, origin: Origin, **how: Any) -> None:
         """Report what is there, and who published it is unknown."""
@@ -362,8 +378,11 @@ class Follower(Listener):
     def _skip(self, event: Skipped) -> None:
         notice = event.notice
         path, stamp = show((self.keys.name, *notice.path)), (notice.time, notice.publisher, notice.sequence)
+        late, arrived = self._heard(notice)
         for queue in self.queues:
-            queue.overtaken(Update(path, own(event.data), None, False, *stamp) if event.newest else None)
+            queue.overtaken(
+                Update(path, own(event.data), None, False, *stamp, late=late, arrived=arrived) if event.newest else None
+            )
 
     def _report(self, event: Failed) -> None:
         error = event.error

@@ -6,18 +6,22 @@ import asyncio
 import collections
 import contextlib
 import math
+import time
 import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Literal, NamedTuple, NoReturn
 
 from ..concurrency.streams import Following
-from ..errors import BadType, BadValue, InterfaceClosed, Stale
+from ..concurrency.timeouts import waiting_limit
+from ..errors import BadType, BadValue, InterfaceClosed, MissingKey, Silent, Stale
 from ..plan.arguments import check_number
 from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, shorten, show
+from ..plan.trees import MISSING
 from ..session import Session
 from .follower import Follower, checked_largest, own
+from .silence import checked_ttl
 from .subscribers import Link, LocalAccessor
 
 _PROBES = 3  # probes in the time of `max_age`
@@ -61,7 +65,8 @@ class Mirror(Following):
     `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
     one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
-    `stale="keep"` they return the last known value through an outage.
+    `stale="keep"` they return the last known value through an outage. With `ttl` they raise Silent once no update has
+    been published for that long, whatever the reason.
     Use it with `async with`, or `listen()` and `close()`.
 
     Args:
@@ -74,9 +79,12 @@ class Mirror(Following):
             what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
         stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
             how old that is.
+        ttl: Seconds for which answers count, from the arrival of the last published update on this program's clock;
+            None for any. A shorter break of the connection is not noticed, unless `max_age` is given too. What is found
+            at the beginning or after a break does not count until the next update arrives, nor do plain writes.
 
     Raises:
-        BadType, BadValue: An argument that cannot be used, or `max_age` with `stale="keep"`.
+        BadType, BadValue: An argument that cannot be used, or `max_age` or `ttl` with `stale="keep"`.
     """
 
     def __init__(
@@ -88,6 +96,7 @@ class Mirror(Following):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> None:
         if max_age is not None:
             check_number("max_age", max_age, f"use {_SHORTEST} seconds or more, or None", least=_SHORTEST)
@@ -95,9 +104,14 @@ class Mirror(Following):
             raise BadValue(f'stale={shorten(stale)} is unknown; use "raise" or "keep"')
         if stale == "keep" and max_age is not None:
             raise BadValue(f'max_age={max_age:g} refuses old values and stale="keep" returns them; use one of the two')
+        if ttl is not None:
+            ttl = checked_ttl(ttl, (keys.name, *path))
+            if stale == "keep":
+                raise BadValue(f'ttl={ttl:g} refuses old values and stale="keep" returns them; use one of the two')
         self.channel = show((keys.name, *path))
         self.max_age = max_age
         self.stale = stale
+        self.ttl = ttl
         self._full_path: Path = (keys.name, *path)
         make = partial(
             Follower,
@@ -108,6 +122,7 @@ class Mirror(Following):
             stored=True,
             largest=checked_largest(largest),
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
+            timed=ttl is not None,
         )
         self._link = Link(session, make, [])
         self._link.on_state = _waking(self)
@@ -139,15 +154,23 @@ class Mirror(Following):
         follower = self._link.follower
         return follower.age() if follower is not None and self._link.follows else math.inf
 
-    def value(self) -> Any:
+    def value(self, default: Any = MISSING) -> Any:
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call.
 
+        Args:
+            default: Returned where nothing is there, and in place of Stale and Silent. A mirror that does not follow
+                yet, or is closed, raises all the same.
+
         Raises:
-            Stale: The connection is down (unless `stale="keep"`), or the copy is older than `max_age`.
+            Stale: The connection is down (unless `stale="keep"` or `ttl`), or the copy is older than `max_age`.
+            Silent: No update has arrived for `ttl`; a Stale.
         """
-        self._check()
-        follower = self._link.follower
-        return None if follower is None else follower.value()
+        follower = self._check_open()
+        refusal = self._refusal(follower)
+        if refusal is not None and default is MISSING:
+            raise refusal
+        found = MISSING if refusal is not None else follower.at()
+        return default if found is MISSING and default is not MISSING else own(found)
 
     def _check_begun(self) -> Follower:
         """Return the follower; raise Stale if there is none."""
@@ -161,28 +184,52 @@ class Mirror(Following):
             )
         return follower
 
-    def _check(self) -> None:
+    def _check_open(self) -> Follower:
         if self._link.closed:
             raise Stale(f"{self.channel}: this mirror is closed; make a new one")
         if self._link.interface_closed:
             raise Stale(f"{self.channel}: the RedisInterface of this mirror is closed; make new ones")
-        if reason := self._stale(self._check_begun()):
-            raise Stale(f"{self.channel}: {reason}")
+        return self._check_begun()
+
+    def _check(self) -> None:
+        if (refusal := self._refusal(self._check_open())) is not None:
+            raise refusal
+
+    def _refusal(self, follower: Follower) -> Stale | None:
+        """Return the error of an answer; None if the copy may be relied on."""
+        if reason := self._silence(follower):
+            return Silent(f"{self.channel}: {reason}")
+        reason = self._stale(follower)
+        return Stale(f"{self.channel}: {reason}") if reason else None
+
+    def _silence(self, follower: Follower) -> str:
+        """Return for how long there is silence; nothing if `ttl` allows it, or following has ended."""
+        silence = time.monotonic() - follower.live_since
+        if self.ttl is None or silence <= self.ttl or follower.failure is not None:
+            return ""
+        down = "; the connection is down" if follower.down else ""
+        if silence == math.inf:
+            return f"no update has arrived since following began or was interrupted, and ttl={self.ttl:g}{down}"
+        return f"no update has arrived for {silence:.3f} s, and ttl={self.ttl:g}{down}"
 
     def _stale(self, follower: Follower) -> str:
-        """Return why the copy must not be relied on; nothing if it may be."""
+        """Return why the copy is too old whatever was published; nothing if it is not."""
         age = follower.age()
         # Before the age: these say more than that the copy is old.
         if follower.failure is not None:
             return f"following has ended over an error: {follower.failure!r}; make a new mirror"
-        if self.stale == "keep":
+        if self.stale == "keep" or (self.ttl is not None and self.max_age is None):
             return ""
         if follower.down:
             return f"the connection is down, and the copy {age:.3f} s old; it is being made again"
         if self.max_age is None or age <= self.max_age:
             return ""
         reason = follower.untrusted
-        return f"the copy is {age:.3f} s old, and max_age={self.max_age:g}" + (f"; {reason}" if reason else "")
+        # Not how old the value is: that the commander has died, for example, `max_age` does not show.
+        said = (
+            f"the copy is {age:.3f} s old, and max_age={self.max_age:g} (the link to the server; for updates use ttl)"
+        )
+        return said + (f"; {reason}" if reason else "")
 
     async def wait_until(self, predicate: Callable[[Any], Any], timeout: float | None = None) -> Any:  # noqa: ASYNC109
         """Wait until the value is as wanted; returns it. No round trip.
@@ -191,14 +238,15 @@ class Mirror(Following):
             predicate: Called with a copy of the value at once, and with each published state after that, also if the
                 next one follows at once. States that are only stored may be merged into the last one. Of more
                 than 1,000 states that wait for a slow predicate, the oldest are skipped.
-            timeout: Seconds after which to give up.
+            timeout: Seconds after which to give up. None for the limit of a `with reem_async.timeout(...)` block around
+                the call; outside of one there is no limit.
 
         Raises:
             TimeoutError: It did not come true in time.
             Stale: The mirror does not follow yet.
             InterfaceClosed: The mirror was closed, or the interface.
         """
-        _check_wait(predicate, timeout)
+        timeout = _limit(predicate, timeout)
         # Kept, to tell its end from a TimeoutError that the predicate raises.
         limit = asyncio.timeout(timeout)
         try:
@@ -233,7 +281,7 @@ class Mirror(Following):
             wait.seen = wait.states.popleft()
             if predicate(value := own(wait.seen)):
                 return Tried(True, value)
-        if self._stale(follower):
+        if self._refusal(follower):
             return Tried(False, again=_RETRY)
         # The first state of all, or one that was too old when it came.
         if (tree := follower.at()) is not wait.seen:
@@ -251,14 +299,14 @@ class Mirror(Following):
 
     def _give_up(self, timeout: float | None) -> NoReturn:
         follower = self._link.follower
-        reason = self._stale(follower) if follower is not None else "this mirror does not follow"
+        reason = self._silence(follower) or self._stale(follower) if follower else "this mirror does not follow"
         why = f"; {reason}" if reason else ""
         raise TimeoutError(f"{self.channel}: did not come true within {timeout:g} s{why}") from None
 
     def _take(self, tree: Any) -> None:
         follower = self._link.follower
         for wait in tuple(self._waiting):  # another thread may add one meanwhile
-            if (wait.states[-1] if wait.states else wait.seen) is not tree and follower and not self._stale(follower):
+            if (wait.states[-1] if wait.states else wait.seen) is not tree and follower and not self._refusal(follower):
                 wait.states.append(tree)
             wait.wake()
 
@@ -275,11 +323,11 @@ class Mirror(Following):
         return f"<reem_async.Mirror {self.channel}>"
 
 
-def _check_wait(predicate: Any, timeout: Any) -> None:
+def _limit(predicate: Any, timeout: float | None) -> float | None:
+    """Return for how long to wait; raise BadType or BadValue for what cannot be waited for."""
     if not callable(predicate):
         raise BadType(f"predicate={shorten(predicate)} is not a function; use one that is called with the value")
-    if timeout is not None:
-        check_number("timeout", timeout, "use seconds, 0 or more, or None for no limit")
+    return waiting_limit(timeout)
 
 
 def _waking(mirror: Mirror) -> Callable[[Any], None]:
@@ -303,7 +351,14 @@ class MirrorAccessor(LocalAccessor):
 
         Raises:
             MissingKey: Nothing is here.
-            Stale: The connection is down, or the copy is older than `max_age`.
+            Stale: As `Mirror.value`; Silent is one.
         """
         self._subscriber._check()
         return super().read()
+
+    def get(self, default: Any = None) -> Any:
+        """Return the value here, or `default` if nothing is here or there is silence. No round trip."""
+        try:
+            return self.read()
+        except (MissingKey, Silent):
+            return default

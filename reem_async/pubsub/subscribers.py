@@ -17,10 +17,11 @@ from ..plan.keys import Keys
 from ..plan.paths import Path, check_element, parse, show
 from ..plan.trees import MISSING, copied
 from ..session import Session
-from .callbacks import Caller, Calls, arranged
+from .callbacks import Caller, Calls, arranged, checked_on_silent
 from .events import Update
 from .follower import Follower, unnoticed
 from .manager import SubscriptionManager, manager_of
+from .silence import LivePlaceQueue, LiveQueue, checked_ttl
 
 __all__ = ["CallbackSubscriber", "Link", "LocalAccessor", "SilentSubscriber", "Update", "Watch"]
 
@@ -99,6 +100,8 @@ class Watch(Stream[Update]):
         policy: What to keep for a loop that is slower than the updates.
         queue: Where they go, if it is not to be a plain one.
         stored: Yield what is only stored, too.
+        ttl: Seconds without a published update after which there is silence. Only updates that are not older are
+            yielded then, and one when silence begins (`silent`).
     """
 
     def __init__(
@@ -110,9 +113,14 @@ class Watch(Stream[Update]):
         queue: BoundedQueue | None = None,
         *,
         stored: bool = True,
+        ttl: float | None = None,
     ) -> None:
+        if ttl is not None and queue is None:
+            full_path = keys.name, *path
+            queue = LiveQueue(policy, checked_ttl(ttl, full_path), full_path)
         super().__init__(policy, queue)
-        make = partial(Follower, keys, path, session.ships, session.cache, stored=stored)
+        timed = isinstance(queue, LiveQueue)
+        make = partial(Follower, keys, path, session.ships, session.cache, stored=stored, timed=timed)
         self._link = Link(session, make, [self.queue])
 
     @property
@@ -122,6 +130,8 @@ class Watch(Stream[Update]):
     async def listen(self) -> None:
         """Begin to follow. When this returns, no later update is missed. Idempotent; two or three round trips."""
         await self._link.follow()
+        if isinstance(self.queue, LiveQueue):
+            self.queue.start_clock()
 
     async def close(self) -> None:
         """Stop following and end the loop. Idempotent."""
@@ -214,8 +224,10 @@ class SilentSubscriber(Following):
         return f"<reem_async.{type(self).__name__} {self.channel}>"
 
 
-def _rebuilt(kind: type[SilentSubscriber], arguments: tuple[Any, ...], stored: bool) -> SilentSubscriber:
-    return kind(*arguments, stored=stored)
+def _rebuilt(
+    kind: type[SilentSubscriber], arguments: tuple[Any, ...], stored: bool, more: Mapping[str, Any] | None = None
+) -> SilentSubscriber:
+    return kind(*arguments, stored=stored, **(more or {}))
 
 
 class LocalAccessor(Handle):
@@ -285,6 +297,9 @@ class CallbackSubscriber(SilentSubscriber):
     than updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
     `data` may have later ones in it already, which are called for too.
 
+    A callback with a parameter `update`, or that takes `**kwargs`, gets the `Update` by that name. It says how the call
+    came about: after an outage the callback is called with what was found (`update.origin`), which may be old.
+
     Args:
         channel: The path to follow.
         interface: The server: a RedisInterface, or what it takes as host.
@@ -292,6 +307,9 @@ class CallbackSubscriber(SilentSubscriber):
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
         stored: Call for plain writes too, by any client.
+        ttl: Seconds without a published update after which there is silence. The callback is only called for published
+            updates that are not older than that when the call begins. See `Accessor.watch`.
+        on_silent: Called with `kwargs` once when silence begins, as `callback_function` and in turn with it.
     """
 
     def __init__(
@@ -303,6 +321,8 @@ class CallbackSubscriber(SilentSubscriber):
         policy: Policy | None = None,
         *,
         stored: bool = False,
+        ttl: float | None = None,
+        on_silent: Callable[..., Any] | None = None,
     ) -> None:
         super().__init__(channel, interface, chosen(policy, Last(1000)), stored=stored)
         if not callable(callback_function):
@@ -312,11 +332,16 @@ class CallbackSubscriber(SilentSubscriber):
             check_instance("kwargs", kwargs, Mapping, "use a dict of keyword arguments, or None")
         self.kwargs = dict(kwargs or {})
         self._call = arranged(callback_function, self.kwargs)
+        self._call_silent = checked_on_silent(on_silent, self.kwargs, ttl)
+        self.ttl = None if ttl is None else checked_ttl(ttl, self.full_path)
+        self.on_silent = on_silent
         self._begin()
 
     def _begin(self) -> None:
         session = self.interface.session
-        queue = PlaceQueue(self.policy)
+        queue: BoundedQueue = PlaceQueue(self.policy)
+        if self.ttl is not None:
+            queue = LivePlaceQueue(self.policy, self.ttl, self.full_path)
         self._updates = Watch(session, self._keys, self._path, self.policy, queue, stored=self.stored)
         self._watches[id(self._updates)] = self._updates
         self._link = self._updates._link  # one follower serves the calls and value()
@@ -335,10 +360,10 @@ class CallbackSubscriber(SilentSubscriber):
 
     def __reduce__(self) -> tuple[Any, ...]:
         arguments = self.channel, self.interface, self.callback_function, self.kwargs, self.policy
-        return _rebuilt, (type(self), arguments, self.stored)
+        return _rebuilt, (type(self), arguments, self.stored, {"ttl": self.ttl, "on_silent": self.on_silent})
 
     def _caller(self) -> Caller:
-        return Caller(self.channel, self._call, self.kwargs)
+        return Caller(self.channel, self._call, self._call_silent)
 
     async def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent.

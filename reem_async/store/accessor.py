@@ -401,7 +401,7 @@ class Accessor(Handle):
         """
         return Edit(self._reader, self._writer, self._path)
 
-    def watch(self, policy: Policy | None = None, *, stored: bool = True) -> Watch:
+    def watch(self, policy: Policy | None = None, *, stored: bool = True, ttl: float | None = None) -> Watch:
         """Return an async iterator over the value here, first as it is, then each time any client changes it.
 
         Example:
@@ -421,8 +421,17 @@ class Accessor(Handle):
                 default), `Last(n)` or `Every(bound)`, all from `reem_async`, such as `reem_async.Last(100)`.
             stored: Yield plain writes too. It needs the right to use CLIENT TRACKING; without, a warning is logged, and
                 only published updates arrive.
+            ttl: Seconds without a published update after which there is silence, by the clock of this program: one
+                update with `silent=True` says so, within some milliseconds, also if the publisher, the server or the
+                network is gone. The clock starts when following begins. Only published updates arrive then, and none
+                that is older than `ttl`: not what is found, not plain writes, and not what has waited in the queue, or
+                in an outage of its publisher, for longer. `data` has those changes too.
+
+        Raises:
+            BadType, BadValue: A policy or `ttl` that cannot be used; `ttl` with `Every`, or at an index from the end.
         """
-        return Watch(self._reader.session, self._reader.keys, self._path, chosen(policy, Newest()), stored=stored)
+        policy = chosen(policy, Newest())
+        return Watch(self._reader.session, self._reader.keys, self._path, policy, stored=stored, ttl=ttl)
 
     def mirror(
         self,
@@ -430,6 +439,7 @@ class Accessor(Handle):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> Mirror:
         """Return a local copy of the value here that follows every change: `async with kvs["arm"].mirror() as arm:`.
 
@@ -437,13 +447,22 @@ class Accessor(Handle):
         `await arm.wait_until(predicate, timeout)` waits for a change.
 
         Args:
-            max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale.
+            max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale. It
+                measures the link to the server, not the age of the value, and does not notice a dead publisher.
             largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one.
                 `kvs["arm"]["image"].read()` fetches it.
             stale: "keep" has answers return the last known value while the connection is down, instead of raising.
+            ttl: Seconds after the last published update in which answers count; then they raise Silent, also if the
+                publisher, the server or the network is gone, or return what is given: `cmd.value(default=STOP)`.
         """
         return Mirror(
-            self._reader.session, self._reader.keys, self._path, max_age=max_age, largest=largest, stale=stale
+            self._reader.session,
+            self._reader.keys,
+            self._path,
+            max_age=max_age,
+            largest=largest,
+            stale=stale,
+            ttl=ttl,
         )
 
     async def parameter(

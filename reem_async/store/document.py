@@ -53,16 +53,23 @@ class Assignment(NamedTuple):
     is_entry: bool = False  # whether the dict above must exist: an array does not make its top-level key
 
 
+class CallTime(NamedTuple):
+    """When a call was made that is sent later."""
+
+    wall: float  # seconds since 1970, for notices
+    monotonic: float  # to measure how late it is
+
+
 class Turn:
     """The turn of one call, and the announcements of its changes. This one has none, so calls need not wait.
 
     An async context manager: entering waits for the turn of the call, leaving starts the next one.
 
     Attributes:
-        time: When the call was made, in seconds since 1970; None for now.
+        called: When the call was made; None for now.
     """
 
-    time: float | None = None
+    called: CallTime | None = None
 
     async def __aenter__(self) -> Self:
         return self

@@ -36,7 +36,7 @@ from ..plan.paths import Path, below, show
 from ..plan.reads import exists
 from ..plan.sizes import sizes_of
 from ..session import Session
-from .document import Assignment, DocumentWriter, Turn
+from .document import Assignment, CallTime, DocumentWriter, Turn
 
 logger = logging.getLogger("reem.publish")
 
@@ -56,7 +56,7 @@ class _Kept(NamedTuple):
 
     assignment: Assignment  # with bytes of its own
     size: int  # bytes
-    time: float  # seconds since 1970 on which it was published
+    called: CallTime  # when it was published
 
 
 class _Out:
@@ -135,7 +135,8 @@ class Outage:
         return sum([len(out.kept) + out.sending for out in list(self._out.values())])
 
     async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
-        called = time.time()  # before it waits for its turn, and for a server that does not answer
+        # Before it waits for its turn, and for a server that does not answer.
+        called = CallTime(time.time(), time.monotonic())
         try:
             await writer.in_turn(self._put, writer, assignments, called)
         except _AWAY as error:
@@ -145,7 +146,9 @@ class Outage:
     async def demand(self, writer: DocumentWriter, send: Callable[..., Awaitable[Any]], what: tuple[Any, ...]) -> Any:
         return await writer.in_turn(self._demand, writer, send, what)
 
-    async def _put(self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
+    async def _put(
+        self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime
+    ) -> None:
         if self._is_out(writer.keys):
             self._take(writer, assignments, called)
             self._start_asking()
@@ -173,7 +176,7 @@ class Outage:
         return keys.document in self._out or (self._away and not self._session.transport.sharded)
 
     def _begin(
-        self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: float, error: ReemError
+        self, turn: Turn, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime, error: ReemError
     ) -> None:
         """Note that a key is out of reach, and apply the policy to the updates of this call."""
         is_first = not self._out
@@ -190,7 +193,7 @@ class Outage:
             self._take(writer, assignments, called)
         self._start_asking()
 
-    def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: float) -> None:
+    def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime) -> None:
         out = self._out.setdefault(writer.keys.document, _Out(writer))
         if self.policy == "drop":
             self._drop(writer.keys, len(assignments))
@@ -283,7 +286,7 @@ class Outage:
             out.sending = 1
             place = next(iter(out.kept))
             it = out.pop(place)  # first, so that it is never sent twice
-            turn.time = it.time
+            turn.called = it.called
             try:
                 await out.writer.send(turn, [it.assignment])
             except MissingKey:  # a deletion of a value that is gone
@@ -301,7 +304,7 @@ class Outage:
             finally:
                 out.sending = 0
                 turn.release()
-        turn.time = None
+        turn.called = None
         self._out.pop(keys.document, None)
 
     def close(self) -> None:

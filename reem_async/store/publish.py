@@ -12,10 +12,21 @@ from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys
-from ..plan.notices import LARGEST_INLINE, Slot, announce, in_slot, notify_path, published, sizes_of_parts, with_value
+from ..plan.notices import (
+    LARGEST_INLINE,
+    NO_EXTRAS,
+    Extras,
+    Slot,
+    announce,
+    in_slot,
+    notify_path,
+    published,
+    sizes_of_parts,
+    with_value,
+)
 from ..plan.paths import Path, counts_from_end
 from ..session import Session
-from .document import Attachments, DocumentWriter, Turn
+from .document import Attachments, CallTime, DocumentWriter, Turn
 from .outage import Outage
 
 _ANSWERS, _ANSWER = 5, 0.001
@@ -31,10 +42,10 @@ class PublishTurn(Turn):
     other.
     """
 
-    __slots__ = ("_announcements", "_keys", "_order", "_session", "time")
+    __slots__ = ("_announcements", "_keys", "_order", "_session", "called")
 
     def __init__(self, session: Session, keys: Keys) -> None:
-        self.time: float | None = None
+        self.called: CallTime | None = None
         self._session = session
         self._keys = keys
         # Shared by the interface: other stores, and threads, may publish to the same key.
@@ -57,9 +68,9 @@ class PublishTurn(Turn):
         self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
     ) -> UpdateAnnouncement:
         if text is None:
-            announcement = UpdateAnnouncement(self._session, self._keys, self.time, deleted)
+            announcement = UpdateAnnouncement(self._session, self._keys, self.called, deleted)
         else:
-            announcement = ValueAnnouncement(self._session, self._keys, self.time, text, attachments)
+            announcement = ValueAnnouncement(self._session, self._keys, self.called, text, attachments)
         self._announcements.append(announcement)
         return announcement
 
@@ -76,12 +87,13 @@ class PublishTurn(Turn):
 class UpdateAnnouncement(Announcement):
     """Notifies subscribers of one change, without the value."""
 
-    __slots__ = ("_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time")
+    __slots__ = ("_began", "_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time")
 
-    def __init__(self, session: Session, keys: Keys, time: float | None, deleted: bool = False) -> None:
+    def __init__(self, session: Session, keys: Keys, called: CallTime | None, deleted: bool = False) -> None:
         self._session = session
         self._keys = keys
-        self._time = time
+        self._time = None if called is None else called.wall
+        self._began = None if called is None else called.monotonic
         self._deleted = deleted
         # A number is first reserved, then in a plan (made), then used. `release` gives back a reserved number, `unsent`
         # and `not_applied` one of a plan that was not applied.
@@ -109,11 +121,21 @@ class UpdateAnnouncement(Announcement):
         self._made = stamp = self._reserved.pop() if self._reserved else self._session.stamp(self._keys)
         place = notify_path(path)
         # A change at a path that is too long is announced at a place above, without the value.
-        text = payload(stamp, path) if place is path else announce(*stamp, self._time or time.time(), place)
+        if place is path:
+            text = payload(stamp, path)
+        else:
+            moment, extras = self._when()
+            text = announce(*stamp, moment, place, extras=extras)
         return published(self._keys, *stamp, text, everywhere=self._everywhere)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
-        return announce(*stamp, self._time or time.time(), path, deleted=self._deleted)
+        moment, extras = self._when()
+        return announce(*stamp, moment, path, deleted=self._deleted, extras=extras)
+
+    def _when(self) -> tuple[float, Extras]:
+        """Return the time of the call, in seconds since 1970, and how late it is sent if an outage was in between."""
+        late = 0.0 if self._began is None else time.monotonic() - self._began
+        return self._time or time.time(), Extras(late=late) if late else NO_EXTRAS
 
 
 class ValueAnnouncement(UpdateAnnouncement):
@@ -124,8 +146,10 @@ class ValueAnnouncement(UpdateAnnouncement):
 
     __slots__ = ("_attachments", "_early", "_slot", "_text")
 
-    def __init__(self, session: Session, keys: Keys, time: float | None, text: bytes, attachments: Attachments) -> None:
-        super().__init__(session, keys, time)
+    def __init__(
+        self, session: Session, keys: Keys, called: CallTime | None, text: bytes, attachments: Attachments
+    ) -> None:
+        super().__init__(session, keys, called)
         self._text = text
         self._attachments = attachments
         self._slot: Slot | None = None
@@ -175,7 +199,8 @@ class ValueAnnouncement(UpdateAnnouncement):
             return
         self._time = self._time or time.time()  # the update itself has the same, which identifies it
         if self._slot is None:
-            payload = with_value(*stamp, self._time, path, self._text, self._attachments, largest=LEAST)
+            moment, extras = self._when()
+            payload = with_value(*stamp, moment, path, self._text, self._attachments, extras, largest=LEAST)
         else:
             payload = self._payload(stamp, path)
         if len(payload) <= LARGEST_INLINE:
@@ -189,10 +214,10 @@ class ValueAnnouncement(UpdateAnnouncement):
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
         if self._early is not None and self._early[0] == stamp:
             return self._early[1]
-        moment = self._time or time.time()
+        moment, extras = self._when()
         if self._slot is not None:
-            return in_slot(*stamp, moment, path, self._slot, self._text, self._attachments)
-        return with_value(*stamp, moment, path, self._text, self._attachments)
+            return in_slot(*stamp, moment, path, self._slot, self._text, self._attachments, extras)
+        return with_value(*stamp, moment, path, self._text, self._attachments, extras)
 
 
 class DocumentPublisher(DocumentWriter):

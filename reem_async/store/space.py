@@ -64,6 +64,7 @@ class PublishAccessor(Accessor):
         max_age: float | None = None,
         largest: int | None = None,
         stale: Literal["raise", "keep"] = "raise",
+        ttl: float | None = None,
     ) -> NoReturn:
         """Raise WriteOnly."""
         self._refuse()
@@ -72,7 +73,7 @@ class PublishAccessor(Accessor):
         """Raise WriteOnly."""
         self._refuse()
 
-    def watch(self, policy: Any = None, *, stored: bool = True) -> NoReturn:
+    def watch(self, policy: Any = None, *, stored: bool = True, ttl: float | None = None) -> NoReturn:
         """Raise WriteOnly."""
         self._refuse()
 

@@ -1,0 +1,143 @@
+"""Silence: for how long no update may arrive until what was received last counts for nothing.
+
+All clocks are this program's `time.monotonic`. A clock starts when the notice of an update arrives, so it needs neither
+the server nor the publisher, nor their clocks. Only published updates count, equal values too. What is found at the
+beginning or after a loss may be of any age, and plain writes have no publisher that could fall silent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+import time
+import weakref
+from typing import Any
+
+from ..concurrency.queues import EMPTY, BoundedQueue, PlaceQueue, Policy, total
+from ..concurrency.timeouts import LONGEST
+from ..errors import BadValue
+from ..plan.arguments import check_number
+from ..plan.paths import Path, counts_from_end, show
+from .events import Origin, Update
+
+_CURE = "use seconds above 0, such as 0.2, or None for no limit"
+
+_LOOK = 0.001
+"""Seconds from the end of the time to the report. In between, the event loop reads from its sockets what has arrived
+while it was busy: uvloop calls timers before it does that."""
+
+
+def checked_ttl(ttl: float, path: Path) -> float:
+    """Return `ttl` as a float; raises BadType or BadValue.
+
+    Args:
+        ttl: Seconds.
+        path: What is followed, top-level key first.
+    """
+    check_number("ttl", ttl, _CURE, above=0)
+    if not ttl <= LONGEST:
+        raise BadValue(f"ttl={ttl} is out of range; {_CURE} (at most a million)")
+    if counts_from_end(path):
+        raise BadValue(
+            f"ttl={ttl:g} at {show(path)}: an index from the end names another item after each change; follow the list"
+        )
+    return float(ttl)
+
+
+class LiveQueue(BoundedQueue):
+    """Delivers published updates while they are not older than `ttl`, and one update when silence begins.
+
+    An update's age is for how long it was late at its publisher, and what has passed since its notice arrived. Updates
+    that are found or only stored are not delivered. Losses that they report are reported by the next one.
+
+    Args:
+        policy: What to keep for a loop that is slower than the updates.
+        ttl: Seconds.
+        path: What is followed, top-level key first.
+    """
+
+    def __init__(self, policy: Policy, ttl: float, path: Path) -> None:
+        if policy.fails:
+            raise BadValue(
+                f"policy={policy!r} keeps every update, and ttl={ttl:g} drops those that wait too long; "
+                "use Newest() or Last(n), or no ttl"
+            )
+        super().__init__(policy)
+        self._ttl = ttl
+        self._silent = Update(show(path), None, None, origin=Origin.SILENCE, silent=True)
+        self._live_since = -math.inf  # from when on the newest live update counts; or when the clock was started
+        self._loop: asyncio.AbstractEventLoop | None = None  # where the clock runs
+        self._timer: asyncio.TimerHandle | None = None  # None while there is silence
+
+    def start_clock(self) -> None:
+        """Report silence from now on, in this event loop. Idempotent."""
+        loop = asyncio.get_running_loop()
+        if self._loop is not loop:
+            self._live_since = max(self._live_since, time.monotonic())
+            self._wait(self._ttl)
+
+    def put(self, update: Update) -> None:
+        if update.arrived is not None and self._is_fresh(update):
+            self._heard(update)
+            super().put(update)
+        elif update.gap:
+            self._owe(0, update.missed)
+
+    def overtaken(self, update: Update | None) -> None:
+        if update is not None and self._is_fresh(update):
+            self._heard(update)
+        super().overtaken(update)
+
+    def take(self) -> Any:
+        while (update := super().take()) is not EMPTY and not (update.silent or self._is_fresh(update)):
+            self.dropped += 1
+            if update.gap:
+                self._owe(-threading.get_ident(), update.missed)  # each thread its own: see `BoundedQueue`
+        return update
+
+    def _is_fresh(self, update: Update) -> bool:
+        return time.monotonic() - _counts_from(update) <= self._ttl
+
+    def _owe(self, number: int, missed: int | None) -> None:
+        """Have the next update that is taken report a loss; `number` is below those of all updates."""
+        self._gaps[number] = total([self._gaps.pop(number, 0), missed])
+
+    def _heard(self, update: Update) -> None:
+        self._live_since = _counts_from(update)
+        if self._timer is None or self._loop is not asyncio.get_running_loop():
+            self._wait(self._ttl)
+
+    def _wait(self, seconds: float, *, looked: bool = False) -> None:
+        self._loop = asyncio.get_running_loop()
+        # A reference back would keep a watch that was dropped.
+        self._timer = self._loop.call_later(seconds, _check, weakref.ref(self), looked)
+
+    def _check(self, looked: bool) -> None:
+        left = self._live_since + self._ttl - time.monotonic()
+        if self._end is not None:
+            self._timer = None
+        elif left > 0:  # a timer of its own for each update would cost more
+            self._wait(max(left, _LOOK))
+        elif not looked:
+            self._wait(_LOOK, looked=True)
+        else:
+            self._timer = None
+            super().put(self._silent)
+
+
+class LivePlaceQueue(LiveQueue, PlaceQueue):
+    """As `LiveQueue`, for a caller that needs the present value of places and not what was written."""
+
+    def overtaken(self, update: Update | None) -> None:
+        PlaceQueue.overtaken(self, update)
+
+
+def _counts_from(update: Update) -> float:
+    """Return when an update was published on this program's clock, as far as is known."""
+    return (update.arrived or 0.0) - update.late
+
+
+def _check(reference: weakref.ref[LiveQueue], looked: bool) -> None:
+    if (queue := reference()) is not None:
+        queue._check(looked)
