@@ -5,10 +5,12 @@ from __future__ import annotations
 import builtins
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Literal, Self
+from functools import partial
+from typing import Any, Literal, Self, overload
 
 from reem_async.concurrency.queues import Policy
 from reem_async.coordination.parameters import prepared
+from reem_async.coordination.services import QUEUE
 from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
@@ -20,6 +22,7 @@ from ._twin import documented_by
 from .connection import RedisInterface
 from .mirror import Mirror
 from .parameters import Parameter, declared
+from .service import Service
 from .subscribe import Watch
 
 
@@ -244,10 +247,7 @@ class Accessor(Handle):
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True, ttl: float | None = None) -> Watch:
         """Return an iterator over the value here and its changes."""
-        # What follows lives on the background loop: the connections of the caller's thread only ask and answer.
-        kind, writer = type(self._core), self._core._writer.maker()
-        followed = core.rebuilt(kind, writer, self._interface._followers.session, self._core.full_path)
-        return Watch(self._interface, followed.watch(policy, stored=stored, ttl=ttl))
+        return Watch(self._interface, self._follower().watch(policy, stored=stored, ttl=ttl))
 
     def mirror(
         self,
@@ -276,6 +276,29 @@ class Accessor(Handle):
         specification = {"low": low, "high": high, "unit": unit, "help": help, "choices": choices}
         declaration = prepared(self.full_path, name, default, on_change=on_change, **specification)
         return declared(self._interface, declaration)
+
+    def _follower(self) -> core.Accessor:
+        """Return the core's accessor on the background loop: connections of the caller's thread only ask and answer."""
+        kind, writer = type(self._core), self._core._writer.maker()
+        session = self._interface._followers.session
+        return core.rebuilt(kind, writer, session, self._core.full_path)  # type: ignore[no-any-return]
+
+    def call(self, *, timeout: float | None = None, **arguments: Any) -> Any:
+        """Ask the service at this place, and return its answer."""
+        return self._interface._wait(self._follower().call(timeout=timeout, **arguments))
+
+    @overload
+    def serve(self, function: Callable[..., Any], *, concurrency: int = 1, queue: int = QUEUE) -> Service: ...
+    @overload
+    def serve(
+        self, function: None = None, *, concurrency: int = 1, queue: int = QUEUE
+    ) -> Callable[[Callable[..., Any]], Service]: ...
+
+    def serve(self, function: Callable[..., Any] | None = None, *, concurrency: int = 1, queue: int = QUEUE) -> Any:
+        """Answer calls of the service at this place with a function: `@kvs["policy"].serve`, or with a `with` block."""
+        if function is None:
+            return partial(self.serve, concurrency=concurrency, queue=queue)
+        return Service(self._interface, self._follower()._service(function, concurrency, queue))
 
     def __enter__(self) -> Any:
         edit = self.edit()

@@ -27,13 +27,14 @@ if TYPE_CHECKING:
     from .transport.state import StateChange
 
 __all__ = [
-    "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "BytesShip", "CallbackSubscriber",
-    "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection", "InterfaceClosed",
-    "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop", "Misuse", "Newest",
-    "NoJsonSupport", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter",
-    "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
-    "ReemError", "Refused", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
-    "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
+    "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
+    "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
+    "InterfaceClosed", "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop",
+    "Misuse", "Newest", "NoJsonSupport", "NoService", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip",
+    "Origin", "Overflow", "Parameter", "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull",
+    "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull",
+    "ServerMissing", "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost", "Silent",
+    "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
     "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
 ]  # fmt: skip

@@ -23,6 +23,12 @@
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     |   +-- Silent               no update has arrived for as long as the mirror's `ttl` allows
     +-- QueueFull                a subscriber with the policy Every fell too far behind
+    +-- ServiceError             a call of a service got no answer
+    |   +-- NoService            no program serves it; nothing was begun
+    |   +-- Busy                 every server of it has as many requests waiting as it allows; nothing was begun
+    |   +-- CallTimeout          also TimeoutError: no answer within the timeout
+    |   +-- ServiceLost          its server ended, stopped serving or does not answer any more
+    |   +-- RemoteError          its function raised an exception; has its type, message and traceback as text
     +-- BadData                  what the server sent is not what REEM writes; nothing trusted
     +-- ServerMissing            extra `server` not installed, or no usable server binary
     +-- ServerFailed             an embedded server did not start: port taken, ...
@@ -62,6 +68,8 @@ __all__ = [
     "BadKey",
     "BadType",
     "BadValue",
+    "Busy",
+    "CallTimeout",
     "ClusterNode",
     "Conflict",
     "ConnectionLost",
@@ -74,6 +82,7 @@ __all__ = [
     "MissingTop",
     "Misuse",
     "NoJsonSupport",
+    "NoService",
     "NotAllowed",
     "NotConnected",
     "NotFinite",
@@ -84,11 +93,14 @@ __all__ = [
     "ReadOnly",
     "ReemError",
     "Refused",
+    "RemoteError",
     "ServerFailed",
     "ServerFull",
     "ServerMissing",
     "ServerNotReady",
     "ServerReadOnly",
+    "ServiceError",
+    "ServiceLost",
     "Silent",
     "Stale",
     "TlsRefused",
@@ -208,6 +220,50 @@ class Stale(ReemError):
 
 class Silent(Stale):
     """A mirror does not answer: no published update has arrived for as long as its `ttl` allows."""
+
+
+class ServiceError(ReemError):
+    """A call of a service got no answer."""
+
+
+class NoService(ServiceError):
+    """No program serves it; nothing was begun."""
+
+
+class Busy(ServiceError):
+    """Every server of the service has as many requests waiting as its `queue` allows; nothing was begun."""
+
+
+class CallTimeout(ServiceError, TimeoutError):
+    """No answer came within the timeout; the request may or may not have been handled."""
+
+
+class ServiceLost(ServiceError):
+    """The server that had the request ended, stopped serving, or does not answer any more.
+
+    The request may or may not have been handled. It is not sent to another server.
+    """
+
+
+class RemoteError(ServiceError):
+    """The function of the service raised an exception, or returned what cannot be stored.
+
+    Attributes:
+        type_name: The name of the exception's class.
+        message: Its text.
+        traceback: The traceback in the server's program, as text; Python shows it below this error.
+    """
+
+    def __init__(self, where: str, type_name: str, message: str, traceback: str) -> None:
+        super().__init__(f"{where}: the service raised {type_name}: {message}")
+        self.type_name = type_name
+        self.message = message
+        self.traceback = traceback
+        self._where = where
+        self.add_note(f"In the server's program:\n{traceback.rstrip()}")
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return RemoteError, (self._where, self.type_name, self.message, self.traceback)
 
 
 class BadData(ReemError, ValueError):

@@ -72,6 +72,14 @@ def stored(urls):
         del kvs["c"]
 
 
+def test_the_robot_serves_and_calls(urls):
+    """Services need two more channels and the directory of channels, and no other right."""
+    with reem.RedisInterface(urls["robot"], namespace="robot1:") as interface:
+        place = reem.KeyValueStore(interface)["policy"]["act"]
+        with place.serve(lambda image: image + 1):
+            assert int(place.call(image=np.zeros(30_000), timeout=5)[-1]) == 1
+
+
 @pytest.mark.parametrize("name", list(FRONTS))
 def test_a_watcher_reads_everything(urls, stored, name):
     with contextlib.closing(FRONTS[name](urls["watcher"], namespace="robot1:")) as front:

@@ -1,1 +1,1 @@
-"""What programs of a robot agree on: parameters."""
+"""What programs of a robot agree on: parameters, and services that are asked and answer."""

@@ -7,7 +7,7 @@ that arrive are not trusted: anything unexpected is refused as `BadData`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
@@ -305,11 +305,19 @@ def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deep
         if ship is None:
             return ANNOUNCED
         replies[label, suffix] = ship.unpack(blob)
+    return assembled(text, replies, deepest)
+
+
+def assembled(text: bytes, attachments: Mapping[tuple[str, str], Any], deepest: int) -> Any:
+    """Return the tree of a document of at most `deepest` levels, with its attachments, by label and suffix.
+
+    Raises anything over foreign bytes.
+    """
     holder = [orjson.loads(text)]
     if nested_over(text, holder[0], deepest):
         raise BadData(f"path and value are nested over {_DEEPEST} levels")
-    for slot in find(holder, "a notice: ") if marked(text) else ():
-        slot.container[slot.key] = replies[slot.placeholder.label, slot.placeholder.suffix]
+    for slot in find(holder, "a message: ") if marked(text) else ():
+        slot.container[slot.key] = attachments[slot.placeholder.label, slot.placeholder.suffix]
     return holder[0]
 
 

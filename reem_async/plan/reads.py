@@ -63,7 +63,7 @@ def interpreted(raw_read: RawRead, slot: PlaceholderSlot, ship: Registered, repl
     """Return what the ship makes of a reply: the value, something for `awaited`, or an Unreadable."""
     cause: Exception | None = None
     try:
-        return ship.ship.interpret_read([reply if ship.blob is not None else _plain(reply)])
+        return ship.ship.interpret_read([reply if ship.blob is not None else with_bytes(reply)])
     except BadData as error:
         problem = str(error)
     except Exception as error:
@@ -80,14 +80,14 @@ async def awaited(raw_read: RawRead, slot: PlaceholderSlot, value: Awaitable[Any
         return raw_read.give_up(slot, error)
 
 
-def _plain(reply: Reply) -> Reply:
-    # The transport reads large strings into a bytearray, without a copy. Ships of users expect redis-py's bytes.
+def with_bytes(reply: Reply) -> Reply:
+    """Return a reply as redis-py gives it to ships of users: the transport reads large strings into a bytearray."""
     if isinstance(reply, bytearray):
         return bytes(reply)
     if isinstance(reply, list):
-        return [_plain(item) for item in reply]
+        return [with_bytes(item) for item in reply]
     if isinstance(reply, dict):
-        return {_plain(key): _plain(item) for key, item in reply.items()}
+        return {with_bytes(key): with_bytes(item) for key, item in reply.items()}
     return reply
 
 

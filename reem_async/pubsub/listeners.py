@@ -71,6 +71,7 @@ class Listener:
         self.ready: asyncio.Future[None] | None = None  # done when it has begun to follow
         self.stored = False  # it is notified of keys that were changed, not only of what is published
         self.heartbeat = math.inf  # seconds between probes that it needs; infinite if those that all get will do
+        self.takes_messages = False  # what comes on its channel are no notices: `on_message` takes it
         self.local = False  # it takes large values from the memory of publishers of the same host
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
@@ -88,6 +89,9 @@ class Listener:
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         """Take one update."""
+
+    def on_message(self, payload: bytes) -> None:
+        """Take one message that is no notice; raises BadData for what is none of its kind either."""
 
     def on_early(self, notice: Notice) -> None:
         """Take an update that the server may not have yet, and may yet refuse."""
@@ -201,6 +205,13 @@ class Inbox:
         listeners = self._topics.get(topic, NO_LISTENERS).present()
         if not listeners:  # all were dropped without closing
             self._empty(Topic(*topic))
+            return
+        if listeners[0].takes_messages:
+            for listener in listeners:
+                try:
+                    listener.on_message(payload)
+                except Exception as error:  # as below
+                    self._unreadable(channel, error)
             return
         if topic[1] and not names_key(channel):
             self._unreadable(channel, BadData("no key can have it for a channel"))

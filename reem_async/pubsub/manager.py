@@ -74,6 +74,7 @@ class SubscriptionManager:
         self._heartbeats = Heartbeats(self)
         self.parameters: dict[str, Any] = {}  # by top-level key, the groups of coordination/parameters.py
         self.callers: set[Any] = set()  # what makes calls for updates, kept here although the program may not hold it
+        self.kept: dict[object, Any] = {}  # callers and servers of services, which live as long as this
         self.place = os.getpid(), asyncio.get_running_loop()  # the process and the event loop it belongs to
 
     async def follow(self, listener: Listener) -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import builtins
 import operator
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, overload
 
 import numpy as np
 
 from ..concurrency.queues import Newest, Policy, chosen
 from ..connection import RedisInterface
+from ..coordination.calls import call
 from ..coordination.parameters import Parameter, declared, prepared
+from ..coordination.services import QUEUE, Service
 from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey, WrongType
 from ..plan.arguments import Handle
 from ..plan.documents import number_text
@@ -511,6 +514,80 @@ class Accessor(Handle):
         specification = {"low": low, "high": high, "unit": unit, "help": help, "choices": choices}
         declaration = prepared(self.full_path, name, default, on_change=on_change, **specification)
         return await declared(self._reader.session, declaration)
+
+    async def call(self, *, timeout: float | None = None, **arguments: Any) -> Any:  # noqa: ASYNC109
+        """Ask the service at this place, and return its answer: `actions = await kvs["policy"].call(image=image)`.
+
+        One of the programs that `serve` here calls its function with these arguments, at most once. Arguments and
+        answer are what REEM stores: native values, arrays, what ships carry. Arrays in an answer are read-only.
+        Nothing is stored under this key; what is sent in passing expires. A call that is left, by cancelling or by its
+        timeout, cancels a coroutine function, and is not begun if it still waits.
+
+        A message to the server and one back, without waiting in between; the first call subscribes and looks for
+        servers, two round trips more. A value over 64 KB takes a round trip more to fetch.
+
+        Args:
+            timeout: Seconds to wait for the answer; what `reem_async.timeout` says, or 10, if not given. A request
+                that is not begun by then is never begun.
+            arguments: The arguments of the function, by name. None can be called `timeout`.
+
+        Raises:
+            BadValue, BadType, BadKey, TooDeep: An argument cannot be stored, or not a timeout; nothing was sent.
+            NoService: No program serves this; at once.
+            Busy: Too many requests wait at every server; at once.
+            CallTimeout: No answer in time. Also TimeoutError.
+            RemoteError: The function raised an exception, or returned what cannot be stored.
+            ServiceLost: The server ended or does not answer any more; within 0.3 s, or 1.2 s if it hangs.
+            ConnectionLost: The connection broke before the answer came.
+            BadData: The answer was written by a ship this interface lacks.
+        """
+        return await call(self._reader.session, self._reader.keys, self._path, arguments, timeout)
+
+    @overload
+    def serve(self, function: Callable[..., Any], *, concurrency: int = 1, queue: int = QUEUE) -> Service: ...
+    @overload
+    def serve(
+        self, function: None = None, *, concurrency: int = 1, queue: int = QUEUE
+    ) -> Callable[[Callable[..., Any]], Service]: ...
+
+    def serve(self, function: Callable[..., Any] | None = None, *, concurrency: int = 1, queue: int = QUEUE) -> Any:
+        """Answer calls of the service at this place with a function: `@kvs["policy"].serve`, or with a `with` block.
+
+        Example:
+            @kvs["policy"].serve
+            async def act(image, state):
+                return {"actions": model(image, state)}
+
+            async with kvs["policy"].serve(act, concurrency=2):
+                ...
+
+        A plain function runs on a thread of REEM's own, and may use REEM. In asyncio a coroutine function runs on the
+        event loop and is cancelled when its caller leaves; it must not block. An exception reaches the caller as
+        RemoteError. Several programs, and several functions in one, may serve the same place: they share the calls.
+
+        In plain programs it has begun when this returns. In asyncio it begins in the background, and is tried again
+        until there is a server; `async with` and `await service.listen()` return when it has begun, and raise what
+        prevents it. It ends with `close()`, with the interface, or with the program, which it does not keep from
+        ending: `await service.wait()` is the last line of a program that only serves. A forked child does not serve.
+
+        Args:
+            function: What answers. It gets the arguments of a call by name; arrays are read-only.
+            concurrency: How many calls are handled at a time.
+            queue: How many more requests may wait. Beyond, callers try other servers, or get Busy.
+
+        Raises:
+            BadType, BadValue: `function` cannot be called, or the others are not whole numbers of at least 1.
+            WrongLoop: In asyncio, no event loop is running.
+            NotConnected, NotAllowed: In plain programs, no server, or a right is missing.
+        """
+        if function is None:
+            return partial(self.serve, concurrency=concurrency, queue=queue)
+        service = self._service(function, concurrency, queue)
+        service.begin()
+        return service
+
+    def _service(self, function: Callable[..., Any], concurrency: int, queue: int) -> Service:
+        return Service(self._reader.session, self._reader.keys, self._path, function, concurrency, queue)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)
