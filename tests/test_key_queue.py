@@ -9,15 +9,14 @@ from dataclasses import dataclass
 
 import pytest
 from test_layers import ROOT, roots
-from test_overtaken import model_value, published
 
 from reem_async.errors import Conflict, NotConnected
-from reem_async.plan.copies import concerns
+from reem_async.plan.copies import concerns, is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
-from reem_async.plan.trees import MISSING, get
+from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
 from reem_async.pubsub.division import Division, Heard, divided_read
 from reem_async.pubsub.gaps import Numbers
-from reem_async.tools.recording.key_queue import Item, KeyQueue
+from reem_async.tools.recording.key_queue import Item, KeyQueue, settled
 from reem_async.tools.recording.stored import New, Unchanged, applied
 
 PUBLISHERS = "p", "q", "r"
@@ -370,3 +369,85 @@ def test_the_queue_does_no_input_or_output():
         path = ROOT / "reem_async" / f"{name}.py"
         assert roots(path) <= set(sys.stdlib_module_names) | {"reem_async"}
         assert not roots(path) & {"asyncio", "socket", "time", "threading"}
+
+
+# --- what a read tells of the updates that were only announced
+
+
+PLACES = [(), ("a",), ("a", "b"), ("a", "b", "c"), ("d",), ("l",), ("l", 0), ("l", 1), ("l", 0, "x")]
+
+
+def model_value(rng, number, path):
+    """A value that no other update writes, with insides that others may touch."""
+    inner = {"b": {"c": number, "e": number}, "n": number}
+    whole = {"a": inner, "d": number, "l": [{"x": number}, {"x": -number}, number], "n": number}
+    return {0: whole, 1: {"a": inner, "l": whole["l"]}.get(path[-1] if path else "", number)}.get(len(path), number)
+
+
+def published(rng, count):
+    """Updates as a publisher makes them, each with the tree that it leads to; the server refuses none of them."""
+    tree = model_value(rng, 0, ())
+    made = []
+    while len(made) < count:
+        path = rng.choice(PLACES)
+        number = len(made) + 1
+        if rng.random() < 0.3 and path and get(tree, path) is not MISSING:
+            tree = removed(tree, path)
+            made.append(("delete", path, MISSING, tree))
+            continue
+        try:
+            value = model_value(rng, number, path)
+            tree = replaced(tree, path, value)
+        except CannotApply:
+            continue
+        made.append(("update", path, ANNOUNCED if rng.random() < 0.5 else value, tree))
+    return made
+
+
+def test_only_what_was_touched_is_lost():
+    later = [Item("update", ("cam", "state"), "done", (0, 0, 2)), Item("update", ("cam", "box", 1), 7, (0, 0, 3))]
+    value = {"image": 1, "state": "done", "box": [1, 7]}
+    assert not is_own(("cam",), later)
+    assert is_own(("cam", "image"), later)
+    assert rest_of(value, ("cam",), later) == ({"image": 1}, {("cam", "box"): 1})
+    assert rest_of(value, ("cam",), [Item("delete", ("cam",), None, (0, 0, 2))]).value is MISSING
+    assert rest_of([1, 7], ("cam", "box"), later) == (MISSING, {("cam", "box"): 1})
+
+
+def test_a_list_that_was_written_as_a_whole_again_is_not_taken_from_what_was_read():
+    later = [Item("update", ("cam", "box", 1), 7, (0, 0, 2)), Item("update", ("cam",), ANNOUNCED, (0, 0, 3))]
+    assert rest_of([1, 7], ("cam", "box"), later) == (MISSING, {})
+
+
+def test_an_item_that_may_have_moved_is_nobody_s():
+    """Deleting the item before it moved another one to its place."""
+    deletion = Item("delete", ("cam", "box", 0), None, (0, 0, 2))
+    assert not is_own(("cam", "box", 1), [deletion])
+    assert rest_of(5, ("cam", "box", 1), [deletion]) == (MISSING, {("cam", "box"): 0})
+
+
+def test_a_gap_may_have_touched_anything():
+    large = Item("update", ("k", "a"), ANNOUNCED, (2000, 1, 1), 1)
+    gap = Item("gap", ("k",), 3, (4000, 0, 0), 2)
+    items, _ = settled([large, gap], 5, 0, line=2)
+    assert [item.role for item in items] == ["skip", "gap"]
+    items, _ = settled([large, gap], 5, 0, line=1)
+    assert [(item.role, item.value) for item in items] == [("update", 5), ("gap", 3)]
+
+
+def test_a_state_comes_behind_all_that_it_holds_and_brings_the_values_of_those_announced():
+    state = Item("state", ("k",), ANNOUNCED, (1000, 0, 0), 0)
+    large = Item("update", ("k", "a"), ANNOUNCED, (2000, 1, 1), 1)
+    small = Item("update", ("k", "x"), 1, (4000, 2, 2), 2)
+    keyframe = Item("keyframe", ("k",), None, (6000, 0, 1), 2)
+    newer = Item("update", ("k", "x"), 2, (8000, 3, 3), 3)
+    items, _ = settled([state, large, small, keyframe, newer], {"a": 5, "x": 1}, 0, line=2)
+    assert [item.role for item in items] == ["update", "update", "keyframe", "state", "update"]
+    assert [item.stamp[0] for item in items] == [2000, 4000, 6000, 7000, 8000]
+    assert items[0].value == 5
+
+
+def test_what_nobody_published_is_no_deletion():
+    """The server refused an announced update, or somebody only stored: nothing is there, and nobody deleted it."""
+    items, _ = settled([Item("update", ("k", "a"), ANNOUNCED, (2000, 1, 1), 1)], MISSING, 0, line=1)
+    assert [(item.role, item.value) for item in items] == [("skip", None), ("found", MISSING)]

@@ -374,15 +374,6 @@ def test_a_look_that_is_redirected_is_an_answer_of_the_node():
     assert end.value.value == [moved]
 
 
-def test_what_others_have_changed_meanwhile_is_tried_again():
-    steps = translated([("JSON.NUMINCRBY", "k", '$["a"]', b"1")], Known(), error_of)
-    next(steps)
-    steps.send([b"OK", b' {"a":0}'])
-    with pytest.raises(StopIteration) as end:
-        steps.send([b"OK", b"QUEUED", None])
-    assert end.value.value is None
-
-
 def test_a_large_text_is_written_though_somebody_was_first(server, raw, monkeypatch):
     """It is not sent ahead: there is no key of its own for it to go to."""
     attempt, firsts = HeldText.attempt, []
