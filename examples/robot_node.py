@@ -1,8 +1,8 @@
 """A robot node: sensing, control and heartbeat, several loops at rates of their own in one program.
 
-In the asyncio front they are tasks of one group: if one fails, the others are cancelled and the
-program ends with that error; Ctrl-C and SIGTERM end them in order, motors last. In the blocking
-front they are threads. An operator loop stands for the program of somebody else, who moves the set point.
+In the asyncio front they are tasks of one group: if one fails, the others are cancelled and the program ends with that
+error; Ctrl-C and SIGTERM end them in order, motors last. In the blocking front they are threads. An operator loop is
+a program of its own that moves the set point. The gain of the wheel is a parameter: `reem param set wheel.gain 0.8`.
 
     python -m examples.robot_node [--front asyncio] [--seconds 5] [--url redis://...]
 """
@@ -23,6 +23,8 @@ import reem
 import reem_async
 from examples.common import aticks, parser, run, server, ticks
 
+GAIN = {"low": 0.0, "high": 1.0, "help": "share of the difference to the set point that one step makes up for"}
+
 
 class Robot:
     """A simulated wheel that turns at the speed it is told."""
@@ -35,9 +37,9 @@ class Robot:
         self.done["readings"] += 1
         return {"speed": self.speed + 0.01 * math.sin(50 * time.time()), "time_stamp": time.time()}
 
-    def steer(self, set_point: dict[str, float]) -> None:
+    def steer(self, set_point: dict[str, float], gain: float) -> None:
         self.done["set points followed"] += 1
-        self.speed += 0.5 * (set_point["speed"] - self.speed)
+        self.speed += gain * (set_point["speed"] - self.speed)
 
     def beat(self) -> dict[str, float]:
         self.done["heartbeats"] += 1
@@ -56,9 +58,10 @@ async def sensor_loop(robot: Robot, pspace: reem_async.PublishSpace) -> None:
 
 
 async def control_loop(robot: Robot, kvs: reem_async.KeyValueStore) -> None:
+    gain = await kvs["wheel"].parameter("gain", 0.5, **GAIN)
     try:
         async for update in kvs["set_point"].watch():
-            robot.steer(update.data)
+            robot.steer(update.data, float(gain))
     finally:
         robot.speed = 0.0  # whatever the reason, the wheel does not go on turning
 
@@ -105,6 +108,7 @@ def blocking(options: Namespace) -> None:
     with server(options.url) as host, reem.RedisInterface(host) as interface:
         kvs, pspace = reem.KeyValueStore(interface), reem.PublishSpace(interface)
         set_points = kvs["set_point"].watch()
+        gain = kvs["wheel"].parameter("gain", 0.5, **GAIN)
 
         def sense() -> None:
             for _ in ticks(100):
@@ -115,7 +119,7 @@ def blocking(options: Namespace) -> None:
         def control() -> None:
             try:
                 for update in set_points:  # ends when it is closed
-                    robot.steer(update.data)
+                    robot.steer(update.data, float(gain))
             finally:
                 robot.speed = 0.0
 

@@ -37,6 +37,7 @@ def kvs(cli):
 
 
 SNAPSHOT = [["snapshot", command] for command in ("save", "list", "restore")]
+PARAM = [["param", command] for command in ("list", "get", "set", "save", "load", "forget")]
 
 # --- the whole -------------------------------------------------
 
@@ -48,7 +49,7 @@ def test_help_has_every_command_under_its_heading():
         assert entry.panel in run.stdout
         assert f" {entry.name} " in run.stdout
         thing = getattr(importlib.import_module(entry.full_module), entry.attribute)
-        if entry.module not in ("up", "snapshot", "record", "play", "log", "browse"):
+        if entry.module not in ("up", "snapshot", "param", "record", "play", "log", "browse"):
             said = commands.help_text(thing.__doc__)
             assert said.split("\n\n")[0].startswith(entry.help.removesuffix(".")[:30])
     assert "--install-completion" in run.stdout
@@ -68,7 +69,7 @@ def test_help_needs_none_of_the_commands():
 
 @pytest.mark.parametrize(
     "words",
-    [*[[entry.name] for entry in COMMANDS if entry.attribute != "app"], *SNAPSHOT],
+    [*[[entry.name] for entry in COMMANDS if entry.attribute != "app"], *SNAPSHOT, *PARAM],
     ids=" ".join,
 )
 def test_help_of_each_command_has_examples(words):

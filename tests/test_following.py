@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import logging
 
 import numpy as np
 import pytest
@@ -156,6 +157,23 @@ def test_a_callback_gets_data_path_and_its_keyword_arguments(following, as_callb
         ({"number": 6, "string": "REEM"}, f"{key('c')}.number", 5, 1),
     ]
     assert all(type(path) is str for _, path, _, _ in calls)
+
+
+def test_an_exception_in_a_callback_is_logged_and_ends_nothing(following, as_callback, pspace, key, caplog):
+    seen = []
+
+    def fail(data, updated_path):
+        seen.append(data)
+        if data == 1:
+            raise ZeroDivisionError("on purpose")
+
+    with caplog.at_level(logging.ERROR):
+        following.calls(key(), as_callback(fail))
+        pspace[key()] = 1
+        following.until(lambda: seen == [1])
+        pspace[key()] = 2
+        following.until(lambda: seen == [1, 2])
+    assert any(record.exc_info and record.exc_info[0] is ZeroDivisionError for record in caplog.records)
 
 
 def test_a_loop_begins_with_what_is_there_and_then_tells_every_update(following, kvs, pspace, key):

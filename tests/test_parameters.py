@@ -26,7 +26,7 @@ from hypothesis import strategies as st
 
 import reem
 import reem_async
-from reem_async.coordination.parameters import SPECIFICATIONS, prepared, specifications
+from reem_async.coordination.parameters import SPECIFICATIONS, prepared, stored_parameters
 from reem_async.coordination.specification import as_json, equal, from_stored, specified
 from reem_async.errors import BadData, BadInput, ConnectionLost, NotAllowed, NotConnected, PathRefused, WriteOnly
 
@@ -394,11 +394,11 @@ async def test_what_tools_read_of_specifications_is_checked_entry_by_entry(
     store["control"].parameter("kp", 2.0, low=0.0)
     store[SPECIFICATIONS].update({"x": {}, "a[0].b": {}, "control.ki": {"type": "float", "default": "x"}, "": 5})
     async with reem_async.RedisInterface(server_url, **namespace) as other:
-        found, refused = await specifications(other)
-        assert {path: each.low for path, each in found.items()} == {("control", "kp"): 0.0}
+        found, refused = await stored_parameters(other.session)
+        assert [(each.name, each.value, each.invalid) for each in found.values()] == [("control.kp", 2.0, "")]
         assert len(refused) == 4
         store[SPECIFICATIONS] = [1, 2]
-        assert await specifications(other) == ({}, [f"{SPECIFICATIONS}: [1, 2] is not a dict; remove it"])
+        assert await stored_parameters(other.session) == ({}, [f"{SPECIFICATIONS}: [1, 2] is not a dict; remove it"])
     with pytest.raises(PathRefused):
         store["control"].parameter("kd", 2.0)
 

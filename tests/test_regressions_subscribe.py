@@ -1,13 +1,14 @@
 """Defects that a review found, one test for each: publishing and following."""
 
 import asyncio
+import contextlib
 import logging
 import os
 import threading
 
 import numpy as np
 import pytest
-from conftest import PATIENCE, aeventually, homes, python, subscribed
+from conftest import PATIENCE, aeventually, assert_same, homes, python, subscribed
 
 import reem
 import reem_async
@@ -89,6 +90,21 @@ async def test_after_a_fork_parent_and_child_are_two_publishers(server_url, akvs
     assert [update.data["n"] for update in heard] == list(range(11))
     assert heard[0].publisher == heard[-1].publisher != heard[3].publisher
     assert not any(update.gap for update in heard)
+
+
+async def test_a_cancelled_large_publish_and_a_later_small_one_keep_their_order(
+    ainterface, apspace, akvs, binterface, key
+):
+    large, other = np.zeros(2_000_000), np.zeros(20_000)
+    await apspace[key()].write(other)
+    async with Mirror(key(), binterface) as mirror:
+        for number in range(8):
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(apspace[key()].write(large), 0.002 * number)
+            await apspace[key()].write(number)
+            await akvs[key("behind")].write(other)  # goes behind all that is still on its way
+            assert_same(await akvs[key()].read(), number)
+            await aeventually(lambda number=number: repr(mirror.value()) == repr(number))
 
 
 @pytest.mark.parametrize("kind", ["watch", "mirror", "callback"])

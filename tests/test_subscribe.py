@@ -10,6 +10,7 @@ from conftest import PATIENCE, aeventually, assert_same, eventually, subscribed
 import reem
 from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace, RedisInterface
 from reem_async import SilentSubscriber as Mirror
+from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import InterfaceClosed, MissingKey
 from reem_async.pubsub.manager import manager_of
 
@@ -29,6 +30,24 @@ async def test_a_mirror_that_starts_while_others_publish_ends_up_right(ainterfac
             await publishes
             stored = await akvs[key()].read()
             await aeventually(lambda mirror=mirror, stored=stored: mirror.value()["n"] == stored["n"])
+
+
+async def test_a_mirror_ends_up_equal_to_the_server_after_competing_publishers(ainterface, key, binterface, akvs):
+    """A publish is one transaction of the write and its notice."""
+    spaces = [PublishSpace(ainterface), PublishSpace(binterface)]
+    await spaces[0][key()].write({"n": 0})
+    async with Mirror(key(), ainterface) as mirror:
+
+        async def publish(me):
+            for n in range(50):
+                await spaces[me % 2][key()].write({"n": n, "me": me, "image": np.full(me + 1, n)})
+                await spaces[me % 2][key()]["n"].write(1000 * me + n)
+                await spaces[me % 2][key()]["image"].write(np.full(3, n) if n % 2 else n)
+
+        await asyncio.gather(*(publish(me) for me in range(4)))
+        stored = await akvs[key()].read()
+        await aeventually(lambda: repr(mirror.value()) == repr(stored))
+        assert_same(mirror.value(), stored)
 
 
 def held_back(interface, monkeypatch):
@@ -140,6 +159,28 @@ async def test_a_large_update_is_not_told_with_what_a_lost_one_made_of_it(
         await space[key()]["x"].write(3)
         update = await asyncio.wait_for(anext(updates), PATIENCE)
         assert (update.path, update.value, update.data["n"]) == (f"{key()}.x", 3, 2)
+
+
+async def test_what_was_there_before_is_no_loss(ainterface, binterface, key):
+    """The note of a key's last update names one of the past: nobody has missed it."""
+    await PublishSpace(binterface)[key()].write({"x": 1})
+    async with KeyValueStore(ainterface)[key()].watch(Last(100)) as updates:
+        assert (await anext(updates)).initial
+        listener = updates._link.follower
+        for _ in range(2):  # what the heartbeat does
+            (note,) = await ainterface.session.transport.roundtrip([("GET", listener.note)])
+            listener.on_note(note)
+        assert updates.queue.take() is EMPTY
+
+
+async def test_a_store_write_is_not_published(ainterface, akvs, apspace, key):
+    heard = []
+    async with CallbackSubscriber(key(), ainterface, lambda data, updated_path: heard.append(updated_path), {}):
+        await akvs[key()].write({"a": 1})
+        await apspace[key()]["b"].write(2)
+        await aeventually(lambda: f"{key()}.b" in heard)
+        await asyncio.sleep(0.1)
+        assert [path for path in heard if path != f"{key()}.b"] == []
 
 
 async def test_a_callback_may_use_reem(ainterface, akvs, apspace, key):

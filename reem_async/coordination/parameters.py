@@ -17,7 +17,6 @@ import numpy as np
 
 from ..concurrency.queues import BoundedQueue, Newest
 from ..concurrency.streams import Stream
-from ..connection import RedisInterface
 from ..errors import (
     BadData,
     BadInput,
@@ -34,7 +33,7 @@ from ..errors import (
 )
 from ..plan.arguments import Handle
 from ..plan.keys import Keys
-from ..plan.paths import Path, check_name, has_index, parse, shorten, show
+from ..plan.paths import Path, below, check_name, has_index, parse, shorten, show
 from ..plan.trees import MISSING, get
 from ..plan.writes import make_parents
 from ..pubsub.callbacks import Caller, Calls
@@ -57,7 +56,7 @@ _LARGEST = 4096  # bytes of an array that is fetched: a vector that another prog
 _ECHO = 0.5  # seconds to wait until a value that was written is in the copy; it is later only if the connection broke
 _PAUSE = 1.0  # seconds between attempts to store defaults that are gone
 _TRIES = 50  # of storing a default while other programs write to the same key
-_MOST_REPORTED = 20  # different invalid values of one parameter that are logged
+_MOST_REPORTED = 20  # different warnings about one parameter
 
 
 class Declaration(NamedTuple):
@@ -144,7 +143,7 @@ class LiveParameter:
                 self._set(self.specification.checked(self.name, raw))
             except BadInput as error:
                 self.invalid = str(error)
-                self._report()
+                self.report(f"the stored value is ignored, and {shorten(as_json(self.value))} stays: {error}")
         for condition, future in self._waiting:
             if condition() and not future.done():
                 future.set_result(None)
@@ -157,10 +156,11 @@ class LiveParameter:
             for queue, given in self.changes:
                 queue.put_value(self.name, given(value))
 
-    def _report(self) -> None:
-        if self.invalid not in self._reported and len(self._reported) < _MOST_REPORTED:
-            self._reported.add(self.invalid)
-            logger.warning("the stored value is ignored, and %s stays: %s", shorten(as_json(self.value)), self.invalid)
+    def report(self, text: str) -> None:
+        """Log a warning once."""
+        if text not in self._reported and len(self._reported) < _MOST_REPORTED:
+            self._reported.add(text)
+            logger.warning("%s", text)
 
     @contextlib.contextmanager
     def awaited(self, condition: Callable[[], bool]) -> Iterator[asyncio.Future[None]]:
@@ -316,7 +316,7 @@ class ParameterGroup:
                     await self._store_default(live)
                     await self._describe(live)
                 except (ReemError, RedisError, OSError) as error:
-                    logger.warning("%s: its default cannot be stored: %s", live.name, error)
+                    live.report(f"{live.name}: its default cannot be stored: {error}")
             await asyncio.sleep(_PAUSE)
 
 
@@ -439,28 +439,60 @@ async def declared(session: Session, declaration: Declaration) -> Parameter:
     return Parameter(live, declaration)
 
 
-async def specifications(interface: RedisInterface) -> tuple[dict[Path, Specification], list[str]]:
-    """Return what programs have declared, by path, and why entries were left out. One round trip.
+class StoredParameter(NamedTuple):
+    """A parameter as tools see it: what was declared, and what is stored."""
 
-    Any program may have written these entries.
+    path: Path
+    specification: Specification
+    value: Any  # what is stored, None if nothing is or it is not allowed; a vector is a tuple
+    invalid: str = ""  # why what is stored is not allowed
+
+    @property
+    def name(self) -> str:
+        """The path as text."""
+        return show(self.path)
+
+    @property
+    def used(self) -> Any:
+        """What a program uses that starts now."""
+        return self.specification.default if self.value is None else self.value
+
+
+async def stored_parameters(session: Session, under: Path = ()) -> tuple[dict[Path, StoredParameter], list[str]]:
+    """Return what programs have declared at and below a path, by path and in its order, and why entries were left out.
+
+    Any program may have written the entries. One round trip, and another one for all values together.
     """
     try:
-        stored = await DocumentReader(interface.session, SPECIFICATIONS).read(())
+        entries = await DocumentReader(session, SPECIFICATIONS).read(())
     except MissingKey:
-        stored = {}
-    if not isinstance(stored, dict):
-        return {}, [f"{SPECIFICATIONS}: {shorten(stored)} is not a dict; remove it"]
+        entries = {}
+    if not isinstance(entries, dict):
+        return {}, [f"{SPECIFICATIONS}: {shorten(entries)} is not a dict; remove it"]
     found: dict[Path, Specification] = {}
     refused = []
-    for name, data in stored.items():
+    for name, data in entries.items():
         try:
             path = parse(name)
             if len(path) < 2 or has_index(path):
                 raise BadKey(f"{SPECIFICATIONS}: {shorten(name)} is not the path of a parameter; remove it")
+            session.keys(path[0])
             found[path] = from_stored(show(path), data)
         except (BadInput, BadData) as error:
             refused.append(str(error))
-    return found, refused
+    wanted = sorted(path for path in found if below(path, under))
+    each = await asyncio.gather(*[_with_value(session, path, found[path]) for path in wanted])
+    return {it.path: it for it in each}, refused
+
+
+async def _with_value(session: Session, path: Path, specification: Specification) -> StoredParameter:
+    try:
+        stored = await DocumentReader(session, path[0]).read(path[1:])
+        return StoredParameter(path, specification, specification.checked(show(path), stored))
+    except MissingKey:
+        return StoredParameter(path, specification, None)
+    except (BadInput, BadData, NotAllowed) as error:
+        return StoredParameter(path, specification, None, str(error))
 
 
 async def publish(session: Session, path: Path, value: Any) -> None:

@@ -16,6 +16,8 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
+from ...coordination.parameters import StoredParameter
+from ...coordination.specification import as_json
 from ...errors import (
     BadData,
     BadInput,
@@ -166,6 +168,7 @@ _MOST_MARKS = 5000
 _MOST_POINTS = 1200
 _MOST_FOUND = 60
 _LONGEST_TEXT = 200_000
+_MOST_PARAMETERS = 200
 
 
 class Api:
@@ -178,7 +181,7 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        asked = self.tree, self.series, self.step, self.activity, self.search
+        asked = self.tree, self.series, self.step, self.activity, self.search, self.parameters
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         return [*routes, Route("/write", answered(self.write), methods=["POST"])]
@@ -260,6 +263,11 @@ class Api:
         found = [node.as_json() | {"shown": visible(show(node.path))} for node in nodes if node is not None]
         return reply({"found": found, "most": _MOST_FOUND})
 
+    async def parameters(self, request: Request) -> Response:
+        """Return the parameters at and below a path: what programs have declared, and what they use now."""
+        found = await self._source.parameters(path_in(request))
+        return reply({"parameters": [_control(it) for it in found[:_MOST_PARAMETERS]]})
+
     async def write(self, request: Request) -> Response:
         """Publish a value, if that is allowed, and asked by a page from here."""
         if not self.allow_write:
@@ -278,6 +286,29 @@ class Api:
             raise RefusedRequest(400, "a top-level key is needed")
         await self._source.write(path, content["value"])
         return reply({"written": address(path)})
+
+
+def _control(it: StoredParameter) -> dict[str, Any]:
+    """Return what a page needs to draw the control of a parameter. Values are texts: JavaScript has no 64-bit ints."""
+    specification = it.specification
+    return {
+        "address": address(it.path),
+        "shown": visible(it.name),
+        "type": specification.type,
+        "low": as_json(specification.low),
+        "high": as_json(specification.high),
+        "choices": [_value_text(each) for each in specification.choices] or None,
+        "range": visible(specification.range_text()),
+        "unit": visible(specification.unit),
+        "help": visible(specification.help),
+        "text": _value_text(it.used),
+        "default_text": visible(_value_text(specification.default)),
+        "invalid": visible(it.invalid),
+    }
+
+
+def _value_text(value: Any) -> str:
+    return value if isinstance(value, str) else orjson.dumps(as_json(value)).decode()
 
 
 def _branch(text: str) -> tuple[int, int, str]:

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...connection import RedisInterface
-from ...errors import BadType, ConnectionLost, MissingKey, NotConnected, ServerNotReady
+from ...coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
+from ...errors import BadType, ConnectionLost, MissingKey, NotAllowed, NotConnected, ServerNotReady
 from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, walk
@@ -213,12 +214,28 @@ class LiveSource:
             raise NotKept(f"{show(path)} has {node.size} bytes, too many for a page; read it with Python")
         return await DocumentReader(self.interface.session, str(path[0])).read(path[1:])
 
+    async def parameters(self, path: Path) -> list[StoredParameter]:
+        """Return what programs have declared at and below a path. Two round trips, none without any parameters."""
+        if SPECIFICATIONS not in self._follower.names:
+            return []
+        try:
+            found, _ = await stored_parameters(self.interface.session, path)
+        except NotAllowed:  # to read `_parameters`: the page shows all the rest
+            return []
+        return list(found.values())
+
     async def write(self, path: Path, value: Any) -> None:
-        """Publish a value in the place of a plain one; subscribers learn of it. Three round trips.
+        """Publish a value in the place of a plain one; subscribers learn of it. Up to five round trips.
 
         Raises:
             BadType: An array is there, or nothing at all below the top level.
+            BadType, BadValue: A program has declared a parameter there, and does not allow the value.
         """
+        # Not `parameters`: a key that was just made is among the names a second later.
+        found, _ = await stored_parameters(self.interface.session, path)
+        if (it := found.get(path)) is not None:
+            await publish(self.interface.session, path, it.specification.checked(it.name, value))
+            return
         (node,) = await peek(self.interface.session, [path])
         if node is None:
             raise MissingKey(f"nothing is stored at {show(path)}; the page changes only what is there")

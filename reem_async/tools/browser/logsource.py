@@ -12,6 +12,7 @@ import anyio
 import anyio.to_thread
 import numpy as np
 
+from ...coordination.parameters import StoredParameter
 from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, show
 from ...plan.trees import MISSING, get
@@ -170,6 +171,9 @@ class LogSource:
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         state = await self._do(lambda: self._state(self._when(at)))
         return await self._do(lambda: matching(text.lower(), sorted(state), state.items(), most))
+
+    async def parameters(self, path: Path) -> list[StoredParameter]:
+        return []  # they cannot be set; `_parameters` is shown as any key
 
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ...coordination.parameters import StoredParameter
 from ...errors import BadKey, ReemError
 from ...plan.paths import Path, check_top_key, parse, parse_suffix, suffix
 from ...plan.placeholders import Unfetched
@@ -220,6 +221,9 @@ class Source(Protocol):
     async def value(self, path: Path, at: float | None) -> Sample: ...
     async def search(self, text: str, at: float | None, most: int) -> list[Path]: ...
     async def write(self, path: Path, value: Any) -> None: ...
+
+    # What programs have declared at and below a path.
+    async def parameters(self, path: Path) -> list[StoredParameter]: ...
 
     # Which paths were published or seen to change; which have another value at one instant than at another.
     async def changes(self, since: float, until: float, most: int) -> list[Path]: ...

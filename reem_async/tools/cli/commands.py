@@ -50,6 +50,7 @@ COMMANDS = (
     Entry("set", "values", "set_", CHANGE, "Store a value.", takes_minus=True),
     Entry("del", "values", "delete", CHANGE, "Delete a value."),
     Entry("pub", "values", "pub", CHANGE, "Publish a value, once or at a rate.", takes_minus=True),
+    Entry("param", "param", "app", CHANGE, "List, set, save and load parameters, within their bounds."),
     Entry("echo", "echo", "echo", LIVE, "Print changes as they are published or stored."),
     Entry("top", "top", "top", LIVE, "Show what is published: a live table of keys."),
     Entry("hz", "top", "hz", LIVE, "Measure how often paths are published or stored."),
@@ -91,12 +92,12 @@ def command_of(entry: Entry) -> Any:
         return group.commands[entry.name]
     # Else -1.5 would be taken for an option; real options still come first.
     settings = {"ignore_unknown_options": True} if entry.takes_minus else {}
-    kind = _MinusCommand if entry.takes_minus else TyperCommand
+    kind = MinusCommand if entry.takes_minus else TyperCommand
     holder.command(entry.name, cls=kind, help=help_text(thing.__doc__ or ""), context_settings=settings)(thing)
     return typer.main.get_command(holder)
 
 
-class _MinusCommand(TyperCommand):
+class MinusCommand(TyperCommand):
     """Takes values such as -1.5. No value begins with two minus signs, unless it stands behind `--`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -224,7 +224,7 @@ function route() {
 }
 
 function onKey(event) {
-  const typing = event.target.matches?.("input[type=text], input[type=search], textarea, select");
+  const typing = event.target.matches?.("input[type=text], input[type=search], textarea, select, .control input");
   if (event.ctrlKey || event.metaKey || event.altKey || typing || document.querySelector("dialog[open]")) return;
   const pressed = event.target.closest?.("button, summary, a");
   if (event.key === "/") { finder.box.focus(); finder.box.select(); }

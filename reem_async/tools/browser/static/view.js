@@ -2,6 +2,7 @@
 import { ArrayView } from "./arrays.js";
 import { Course } from "./course.js";
 import { isNumber, MOST, Panes } from "./panes.js";
+import { Parameters } from "./parameters.js";
 import { Tree } from "./tree.js";
 import { addressUrl, ageText, bodyOf, bytesText, copy, el, fetched, getJson, getPicture, nameOf, postWrite, query, setNumbers, setText, steps, swap, toast, visible } from "./util.js";
 
@@ -53,6 +54,7 @@ export class View {
       this.note.hidden = !kept;
       if (kept) setText(this.note, `It is ${nameOf(node.kind)} now: ${node.text}. It is shown again once Edit is closed.`);
       else await this.body.update(node, signal);
+      await this.parameters.update(signal);
       this.offer();
     } catch (error) {
       if (error.name === "AbortError" || address !== this.address) return;
@@ -82,9 +84,10 @@ export class View {
     this.what = el("span", { class: "what" });
     this.note = el("p", { class: "note", role: "status", hidden: true });
     this.main = el("div");
+    this.parameters = new Parameters(this.app, this.address);
     this.element.replaceChildren(
       el("div", { class: "head" }, el("a", { class: "back", href: "/", "data-go": "" }, "‹ all keys"), el("h1", {}, ...crumbs), this.what, this.pinButton()),
-      this.note, this.main, ...(node ? this.extras(node) : []));
+      this.note, this.parameters.element, this.main, ...(node ? this.extras(node) : []));
   }
 
   pinButton() {
