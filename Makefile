@@ -85,8 +85,9 @@ hunt: $(VENV)/ready  ## random calls on REEM and on a dict, ten minutes; HUNT="-
 watching: $(VENV)/ready  ## 100,000 random changes by four processes beside watchers of all kinds; WATCHING="--seed 7 --kill --cluster"
 	$(BIN)/python -m tests.watchmodel $(WATCHING)
 
-slots: $(VENV)/ready  ## a million uses of slots of shared memory by processes that are killed; SLOTS="--seed 7 --uses 50000"
+slots: $(VENV)/ready  ## a million uses of slots of shared memory, and a million early updates, by processes that are killed; SLOTS="--seed 7"
 	$(BIN)/python tests/slots.py $(SLOTS)
+	$(BIN)/python tests/earlysoak.py $(SLOTS)
 
 week: $(VENV)/ready  ## a robot's week in an hour: programs, recorder, page and server fail at random; WEEK="--seed 7 --events 100"
 	$(BIN)/python tests/robotweek.py $(WEEK)

@@ -34,8 +34,10 @@ JOINED, FOLLOWS, UPDATE = b"J", b"F", b"U"
 PUBLISHER, SUBSCRIBER = "p", "s"
 
 _LARGEST = 1 << 17  # bytes of a datagram: twice the largest value that is not in a slot; Linux sends up to 200,000
+_ANSWER = 1 << 11  # bytes of a datagram for a publisher: the name of a channel and an address
 _HEAD = struct.Struct("!cH")  # the kind, and the bytes of the channel
 _CREDENTIALS = struct.Struct("3i")  # struct ucred of <sys/socket.h>: process, user, group
+_ANCILLARY = socket.CMSG_SPACE(_CREDENTIALS.size) + socket.CMSG_SPACE(4)
 _ADDRESS = re.compile(r"[0-9a-f]{16}[ps][0-9a-f]{16}")
 _PARENT = "/tmp"  # noqa: S108 - the owner of what is below is checked
 _ANSWERED = 2.5  # seconds for which the answer of a subscriber holds: publishers ask each second
@@ -75,6 +77,8 @@ class Mailbox:
         self.close = weakref.finalize(self, _close, self._socket, owner, path, os.getpid())
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
         self._socket.bind(path)
+        # Kept, since memory of that size comes from the system each time. Only an event loop reads it.
+        self._buffer = bytearray(_LARGEST) if role == SUBSCRIBER else None
         _all.add(self)
 
     def send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> bool:
@@ -89,10 +93,10 @@ class Mailbox:
 
     def receive(self) -> Datagram | None:
         """Return the next valid datagram of the same user; None if there is none."""
-        room = socket.CMSG_SPACE(_CREDENTIALS.size) + socket.CMSG_SPACE(4)
+        buffer = bytearray(_ANSWER) if self._buffer is None else self._buffer  # threads share a publisher's
         while True:
             try:
-                data, ancillary, flags, _ = self._socket.recvmsg(_LARGEST, room, socket.MSG_CMSG_CLOEXEC)
+                size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
             except OSError:
                 return None
             user = None
@@ -102,11 +106,11 @@ class Mailbox:
                 elif kind == socket.SCM_RIGHTS:  # REEM sends no descriptors
                     for number in array.array("i", content[: len(content) // 4 * 4]):
                         os.close(number)
-            if user == os.getuid() and len(data) >= _HEAD.size and not flags & socket.MSG_TRUNC:
-                kind, length = _HEAD.unpack_from(data)
+            if user == os.getuid() and size >= _HEAD.size and not flags & socket.MSG_TRUNC:
+                kind, length = _HEAD.unpack_from(buffer)
                 end = _HEAD.size + length
-                if end <= len(data):
-                    return Datagram(kind, data[_HEAD.size : end], data[end:])
+                if end <= size:
+                    return Datagram(kind, bytes(buffer[_HEAD.size : end]), bytes(memoryview(buffer)[end:size]))
 
 
 _all = Inherited[Mailbox](lambda mailbox: mailbox.close())

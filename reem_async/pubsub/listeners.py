@@ -180,6 +180,10 @@ class Inbox:
         self._moved = moved  # called with topics that their server does not have any more, and why
         self._empty = empty  # called with a topic that has no listener any more
         self.early = EarlyInbox(self._take_early)
+        self._last_early: tuple[bytes, Notice | None] = (
+            b"",
+            None,
+        )  # the bytes are decoded once if the server's are equal
         self._warned: set[bytes] = set()
         # Notified of every key that the server says was changed, whichever listener read it
         self.watchers = ListenerGroup()
@@ -219,7 +223,9 @@ class Inbox:
         try:
             # A loop, since a generator would take as long as the rest.
             view = self._view if [1 for listener in listeners if listener.local] else None
-            notice = decode(payload, self._ships, view)
+            early, notice = self._last_early
+            if view is None or payload != early or notice is None:
+                notice = decode(payload, self._ships, view)
         except BadData as error:
             self._unreadable(channel, error)
             for listener in listeners:
@@ -239,9 +245,11 @@ class Inbox:
         if not listeners:
             return
         try:
-            notice = decode(payload, self._ships, self._view)._replace(early=True)
+            notice = decode(payload, self._ships, self._view)
+            self._last_early = payload, notice if notice.slot is None else None  # no slot is kept from its publisher
+            early = notice._replace(early=True)
             for listener in listeners:
-                listener.on_early(notice)
+                listener.on_early(early)
         except Exception as error:  # as above; what the server has then is delivered in any case
             self._unreadable(channel, error)
 
