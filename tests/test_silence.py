@@ -28,7 +28,7 @@ def publish_late(raw, key, value, late, number):
     """Publish with a notice of this test's own making, as a publisher does after an outage."""
     keys, text = keys_of(key), orjson.dumps(value)
     head = [1, "late", number, time.time(), [], "set", len(text), [], {"late": late}]
-    raw.execute_command(keys.publish, keys.channel, orjson.dumps(head) + b"\n" + text)
+    raw.publish(keys.channel, orjson.dumps(head) + b"\n" + text)
 
 
 def idle(front, seconds):
