@@ -147,6 +147,7 @@ def _end_loops() -> None:
     global _exiting
     _exiting = True
     for each in list(_interfaces):
+        finish(each._direct.session.finish(is_exit=True))
         each._background.stop()
         each._closing.detach()  # it would keep a ship, and with it all that the ship's module has
     keep_open_at_exit()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from reem_async.concurrency.queues import Policy
@@ -116,20 +116,31 @@ class PublishSpace(KeyValueStore):
 
     _accessor = PublishAccessor
 
-    def __init__(self, interface: Any = None, outage: str = "raise", **options: Any) -> None:
+    def __init__(
+        self,
+        interface: Any = None,
+        outage: str = "raise",
+        wait: bool = True,
+        on_error: Callable[[Exception], object] | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__(interface, **options)
         self.outage = outage
         # In place of the one that KeyValueStore has made, which knows no outages; neither has sent anything.
-        self._core: space.PublishSpace = space.PublishSpace(self.interface._core, outage)
+        self._core: space.PublishSpace = space.PublishSpace(self.interface._core, outage, wait, on_error)
+
+    def flush(self, timeout: float | None = None) -> None:
+        """Wait until the updates of all calls so far are stored or dropped."""
+        self.interface._run(self._core.flush(timeout))
 
     @property
     def dropped(self) -> int:
-        """How many updates this has not published because of outages, or not for certain."""
+        """How many updates this has not published, or not for certain: because of outages, or of `wait=False`."""
         return self._core.dropped
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept until the server is back, or on their way then and not answered yet."""
+        """How many updates are queued, or kept until the server is back, or on their way and not answered yet."""
         return self._core.waiting
 
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> Any:
@@ -137,4 +148,4 @@ class PublishSpace(KeyValueStore):
         return self._core.watch(*patterns, policy=policy, largest=largest)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.interface, self.outage)
+        return type(self), (self.interface, *self._core._chosen)

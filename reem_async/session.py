@@ -102,7 +102,35 @@ class _Numbers:
             return False
 
 
-class Session:
+class PublisherIdentity:
+    """A publisher as subscribers know it: its id, and the number of its last update of each top-level key."""
+
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self._numbers = _Numbers()
+
+    def stamp(self, keys: Keys) -> tuple[str, int]:
+        """Return the publisher's id, and the number of its next update of a top-level key."""
+        return self._numbers.next(keys.channel)
+
+    def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
+        """Make the number of a stamp free again.
+
+        The caller holds the turn of the key, see `Transport.ordered`. If a call out of a `__del__` has published in
+        between, the number is never used.
+        """
+        self._numbers.take_back(keys.channel, *stamp)
+
+    def is_fresh(self, keys: Keys) -> bool:
+        """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know.
+
+        Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet, or not
+        any more.
+        """
+        return self.transport.sharded and self._numbers.is_fresh(keys.channel)
+
+
+class Session(PublisherIdentity):
     """A server as one interface sees it; the arguments are those of the interface."""
 
     def __init__(
@@ -122,16 +150,17 @@ class Session:
         self._room = LONGEST_TOP_KEY - len(namespace.encode())
         self.ships = Ships(default_ships() if ships is None else ships, CommandRecorder)
         self.cache = ShapeCache()
-        self.options, self.transport = _transport_to(host, timeout, options, new_transport)
+        self.options, transport = _transport_to(host, timeout, options, new_transport)
+        super().__init__(transport)
         self.transport.states.startup = StartupWait(min(float(wait), LONGEST))
         self.local = local
         self.interface: Any = None  # the interface this belongs to: pickled in its place
-        self._numbers = _Numbers()
         # The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
         self.subscriptions: Any = None
         # The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.
         self.tasks: Any = Tasks()
-        self.closing: weakref.WeakSet[Any] = weakref.WeakSet()  # objects with a method `close`, to close with this
+        # The `Outage`s of its publishers: `finish` is called before this is closed, `close` then.
+        self.closing: weakref.WeakSet[Any] = weakref.WeakSet()
         self.closed = False  # whether it is closed, or about to be
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -161,26 +190,6 @@ class Session:
         """Run a plan and those that follow from its replies, `at` one server or where their keys are."""
         return drive(at or self.transport, plan)
 
-    def stamp(self, keys: Keys) -> tuple[str, int]:
-        """Return the publisher's id, and the number of its next update of a top-level key."""
-        return self._numbers.next(keys.channel)
-
-    def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
-        """Make the number of a stamp free again.
-
-        The caller holds the turn of the key, see `Transport.ordered`. If a call out of a `__del__` has published in
-        between, the number is never used.
-        """
-        self._numbers.take_back(keys.channel, *stamp)
-
-    def is_fresh(self, keys: Keys) -> bool:
-        """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know.
-
-        Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet, or not
-        any more.
-        """
-        return self.transport.sharded and self._numbers.is_fresh(keys.channel)
-
     async def initialize(self) -> None:
         await self.ships.ready()
         await self.transport.states.startup.retried(self.transport, self._check_server)
@@ -202,6 +211,12 @@ class Session:
             steps.push_async_callback(self.tasks.end)
             if subscriptions is not None:
                 steps.push_async_callback(subscriptions.close)
+            steps.push_async_callback(self.finish)
+
+    async def finish(self, *, is_exit: bool = False) -> None:
+        """Send what publishers have queued, for a limited time; at exit, later updates are sent by their calls."""
+        for each in list(self.closing):
+            await each.finish(is_exit=is_exit)
 
     async def close(self) -> None:
         self.closed = True
@@ -214,6 +229,7 @@ class Session:
             steps.push_async_callback(self.transport.close)
             if self.subscriptions is not None:
                 steps.push_async_callback(self.subscriptions.close)
+            steps.push_async_callback(self.finish)
 
 
 def _transport_to(

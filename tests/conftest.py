@@ -139,6 +139,7 @@ ONE_SERVER = {
     "test_a_plain_client_for_asyncio": "the same",
     "test_the_state_server_of_a_robot": "the same",
     "test_a_server_on_the_port_is_named": "the same",
+    "test_an_event_loop_that_ends_sends_what_was_published": "each node's connection ends by itself then",
     "test_a_store_and_its_transport_keep_a_bounded_number_of_keys": "looks into the transport of one server",
     "test_a_large_array_waits_for_small_calls_that_are_under_way": "the same",
     "test_what_is_stored_is_of_one_instant_though_another_task_comes_first": "the same",
@@ -166,6 +167,7 @@ WITH_MODULE = {
     "test_a_plain_client_of_the_same_server": "calls the module; test_plain.py has what it says without",
     "test_a_plain_client_for_asyncio": "the same",
     "test_the_state_server_of_a_robot": "the same",
+    "test_an_event_loop_that_ends_sends_what_was_published": "a write takes a generator, which an ending loop warns of",
 }
 """Tests, and files of tests, of what only a server with the JSON module does, and why."""
 

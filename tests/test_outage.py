@@ -399,22 +399,22 @@ def test_what_is_kept_leads_to_what_the_calls_lead_to(seed):
     rng = random.Random(seed)
     for _ in range(sized(50, 500)):
         start = {"l": [0, [1, {"y": 2}], 3], "d": {"l": [4, 5]}, "n": 1}
-        kept, expected, count, replaced_count = outage._Out(None), start, rng.randrange(30), 0
+        kept, expected, count, replaced_count = outage.UnsentUpdates(None), start, rng.randrange(30), 0
         for _ in range(count):
             path, value = _random_call(rng, expected)
             expected = removed(expected, path) if value is MISSING else replaced(expected, path, value)
             text = None if value is MISSING else orjson.dumps(value)
-            replaced_count += kept.put(outage._Kept(Assignment(path, text), 1, 0.0))
+            replaced_count += kept.put(outage.Kept((Assignment(path, text),), 1, 0.0))
         found = start
-        for it, _, _ in kept.kept.values():
+        for it in [each.assignments[0] for each in kept.kept.values()]:
             value = it.text and orjson.loads(it.text)
             with contextlib.suppress(CannotApply):  # the server refuses it: only l[-1] and l[2] may be one place
                 found = removed(found, it.path) if value is None else replaced(found, it.path, value)
         assert found == expected
         assert len(kept.kept) == kept.size == count - replaced_count
     for number in range(100):
-        kept.put(outage._Kept(Assignment(("l", 0), b"%d" % number), 1, 0.0))
-    assert sum(path == ("l", 0) for path, _ in kept.kept) == 1
+        kept.put(outage.Kept((Assignment(("l", 0), b"%d" % number),), 1, 0.0))
+    assert sum(each.assignments[0].path == ("l", 0) for each in kept.kept.values()) == 1
 
 
 def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):

@@ -50,6 +50,9 @@ class Announcement:
     def not_applied(self) -> None:
         """Note that the change was sent and not applied: its number is free."""
 
+    def again(self) -> None:
+        """Note that the change was not applied, and is sent again with its number."""
+
 
 SILENT = Announcement()
 

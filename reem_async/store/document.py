@@ -38,7 +38,7 @@ from ..plan.writes import (
     takes,
     together,
 )
-from ..session import Session
+from ..session import PublisherIdentity, Session
 from .encoding import HUGE, Encoder, unique_tail
 
 Attachments = tuple[EncodedAttachment, ...]
@@ -67,9 +67,11 @@ class Turn:
 
     Attributes:
         called: When the call was made; None for now.
+        announced: The announcements of the next changes, made before this turn.
     """
 
     called: CallTime | None = None
+    announced: Sequence[Announcement] = ()
 
     async def __aenter__(self) -> Self:
         return self
@@ -126,7 +128,8 @@ class DocumentWriter:
         self.encoder = Encoder(session, self.keys)
         self._outages = outages
 
-    def turn(self) -> Turn:
+    def turn(self, identity: PublisherIdentity | None = None) -> Turn:
+        """Return the turn of a call; its updates have the numbers of `identity`, if given."""
         return _SILENT_TURN
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:

@@ -13,14 +13,15 @@ kept updates are sent before any later one, and every kept update is sent.
 from __future__ import annotations
 
 import asyncio
+import collections
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, NamedTuple
 
 from ..concurrency.locks import Inherited
+from ..concurrency.timeouts import LONGEST, check_timeout
 from ..errors import (
-    BadValue,
     ConnectionLost,
     InterfaceClosed,
     MissingKey,
@@ -30,7 +31,7 @@ from ..errors import (
     ServerNotReady,
     TlsRefused,
 )
-from ..plan.changes import EncodedAttachment
+from ..plan.changes import Announcement, EncodedAttachment
 from ..plan.keys import Keys
 from ..plan.paths import Path, below, show
 from ..plan.reads import exists
@@ -40,67 +41,122 @@ from .document import Assignment, CallTime, DocumentWriter, Turn
 
 logger = logging.getLogger("reem.publish")
 
-_POLICIES = ("raise", "drop", "newest")
-
 _PAUSES = (0.02, 0.05, 0.1, 0.2, 0.25)  # seconds between two attempts to reach the server; the last one repeats
+_LOOKS = (0.0005, 0.001, 0.002, 0.005)  # seconds between two looks of `flush` at what is unsent; the last one repeats
 _MOST = 256 << 20  # bytes of kept values, of all keys together
 _OVERHEAD = 500  # bytes that a kept value needs besides its content, about
 _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
 """Errors of an outage; except TlsRefused, a NotConnected that does not end by waiting."""
+_CUT = (ConnectionLost, InterfaceClosed)  # errors that do not tell whether an update was stored
 
-_Place = tuple[Path, int]  # a path, and how many items had been removed from its outermost list before
 
+class Kept(NamedTuple):
+    """The assignments of one call, sent later in one transaction."""
 
-class _Kept(NamedTuple):
-    """An assignment that is sent later."""
-
-    assignment: Assignment  # with bytes of its own
+    assignments: tuple[Assignment, ...]  # with bytes of their own
     size: int  # bytes
     called: CallTime  # when it was published
+    announcements: tuple[Announcement, ...] = ()  # if they have their numbers already
+    removals: int = 0  # how many items had been removed before from the outermost list on the path
+
+    def replaces(self, older: Kept, in_list: bool) -> bool:
+        """Return whether nothing of an older update is left after this one; `in_list` if its path leads through one."""
+        return (not in_list or older.removals == self.removals) and all(
+            any(below(old.path, new.path) for new in self.assignments) for old in older.assignments
+        )
 
 
-class _Out:
-    """A top-level key that is out of reach, and its kept updates in the order of the calls.
+class UnsentUpdates:
+    """The unsent updates of a top-level key, in the order of the calls. One thread sends, others may put and drop.
 
     A newer value of a place replaces older ones of the same place and inside it. An index of a list names another item
     after a removal. So a removal is never replaced by another one, and updates of items before it are not replaced by
     those after it. Only a value of the whole list, or of a place above, replaces both.
+
+    Attributes:
+        away: The server did not answer the last update or question.
+        sending: How many updates are being sent and are not among those kept.
+        last: The number of the last call.
+        done: The number of the last call that is stored or dropped.
     """
 
-    def __init__(self, writer: DocumentWriter) -> None:
+    def __init__(self, writer: DocumentWriter, *, away: bool = True) -> None:
         self.writer = writer
-        self.kept: dict[_Place, _Kept] = {}
-        self.size = 0
-        self.sending = 0  # how many are being sent and not among those kept
+        self.kept: collections.OrderedDict[int, Kept] = collections.OrderedDict()
+        self.away = away
+        self.sending = self.last = self.done = 0
+        self._put_bytes = self._taken_bytes = 0  # each is changed by one thread
         self._removals: dict[Path, int] = {}  # of items, by the outermost list
 
-    def put(self, it: _Kept) -> int:
-        """Keep an assignment in place of those that it replaces; return their number."""
-        path = it.assignment.path
-        # The outermost list on the path.
+    @property
+    def size(self) -> int:
+        """How many bytes are kept, about."""
+        return self._put_bytes - self._taken_bytes
+
+    def put(self, it: Kept, *, merge: bool = True) -> int:
+        """Keep the assignments of a call; return how many older ones they replaced, none without `merge`."""
+        first = it.assignments[0]
+        path = first.path
+        # The outermost list on the path. Several assignments are entries of one dict, so they have it in common.
         outermost = next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
-        place = path, self._removals.get(outermost, 0) if outermost is not None else 0
-        replaced = [each for each in self.kept if below(each[0], path) and (outermost is None or each[1] == place[1])]
-        for each in replaced:
-            self.pop(each)
-        self.kept[place] = it
-        self.size += it.size
-        if outermost is not None and it.assignment.text is None and isinstance(path[-1], int):
-            self._removals[outermost] = place[1] + 1
-        return len(replaced)
+        if outermost is not None:
+            it = it._replace(removals=self._removals.get(outermost, 0))
+            if first.text is None and isinstance(path[-1], int):
+                self._removals[outermost] = it.removals + 1
+        self.last += 1
+        number, self._put_bytes = self.last, self._put_bytes + it.size
+        self.kept[number] = it  # one step, so an interrupted call has put all or nothing
+        if not merge:
+            return 0
+        in_list = outermost is not None
+        older = [each for each, old in list(self.kept.items()) if each != number and it.replaces(old, in_list)]
+        return sum([self._drop(each) for each in older])
 
-    def pop(self, place: _Place) -> _Kept:
-        it = self.kept.pop(place)
-        self.size -= it.size
-        return it
+    def drop_first(self) -> int:
+        """Drop the oldest call; return how many updates it had."""
+        return self._drop(next(iter(list(self.kept)), 0))
 
-    def put_back(self, place: _Place, it: _Kept) -> None:
-        self.kept = {place: it, **self.kept}
-        self.size += it.size
+    def drop_all(self) -> int:
+        """Drop all calls; return how many updates they had."""
+        numbers = list(self.kept)
+        count = sum([self._drop(number) for number in numbers])
+        self.done = max(self.done, *numbers, 0)
+        return count
+
+    def _drop(self, number: int) -> int:
+        it = self.kept.pop(number, None)  # None: it is being sent
+        if it is None:
+            return 0
+        self._put_bytes -= it.size
+        return len(it.assignments)
+
+    def take(self) -> tuple[int, Kept] | None:
+        """Take the oldest call to send it, and count it as being sent; None if there is none."""
+        self.sending = 1
+        try:
+            number, it = self.kept.popitem(last=False)
+        except KeyError:
+            self.sending = 0
+            return None
+        self.sending = len(it.assignments)
+        self._taken_bytes += it.size
+        return number, it
+
+    def put_back(self, number: int, it: Kept) -> None:
+        self._taken_bytes -= it.size
+        self.kept[number] = it
+        self.kept.move_to_end(number, last=False)
+
+    @property
+    def count(self) -> int:
+        """How many updates are unsent."""
+        return sum([len(it.assignments) for it in list(self.kept.values())]) + self.sending
 
 
 class Outage:
     """The outages of one PublishSpace, with the policy "drop" or "newest"."""
+
+    _task_name = "reem outage"
 
     def __init__(self, session: Session, policy: str) -> None:
         self.policy = policy
@@ -111,20 +167,19 @@ class Outage:
 
     def forget(self) -> None:
         """Reset the state, also in a forked child: the parent sends the kept updates."""
-        self._out: dict[str, _Out] = {}  # by document
+        self._out: dict[str, UnsentUpdates] = {}  # by document
         self._dropped: dict[str, int] = {}  # likewise; counted in a key's turn, so threads lose no count
         self._is_closed = False
         self._dropped_before = 0  # how many were dropped when the last outage began
-        # A task asks whether the server is back, in this event loop; True in the blocking front.
-        self._asking: asyncio.AbstractEventLoop | bool = False
+        # The task that asks whether the server is back; True for a thread of the blocking front.
+        self._asking: asyncio.Task[Any] | bool = False
         self._away = False  # the server did not answer the last call or question
+        self._reason: Exception = NotConnected("not yet connected")  # why it did not
 
-    @classmethod
-    def chosen(cls, session: Session, policy: str) -> Outage | None:
-        """Return the outages with a policy; None for "raise". Raises BadValue."""
-        if policy not in _POLICIES:
-            raise BadValue(f"outage={policy!r:.40}: say 'raise', 'drop' or 'newest'")
-        return None if policy == "raise" else cls(session, policy)
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """The choices of the PublishSpace."""
+        return {"policy": self.policy}
 
     @property
     def dropped(self) -> int:
@@ -132,7 +187,7 @@ class Outage:
 
     @property
     def waiting(self) -> int:
-        return sum([len(out.kept) + out.sending for out in list(self._out.values())])
+        return sum([out.count for out in list(self._out.values())])
 
     async def put(self, writer: DocumentWriter, assignments: Sequence[Assignment]) -> None:
         # Before it waits for its turn, and for a server that does not answer.
@@ -181,11 +236,10 @@ class Outage:
         """Note that a key is out of reach, and apply the policy to the updates of this call."""
         is_first = not self._out
         self._away = True
-        self._out.setdefault(writer.keys.document, _Out(writer))
+        self._out.setdefault(writer.keys.document, UnsentUpdates(writer))
         if is_first:  # noted before it is logged: a log handler may publish too
             self._dropped_before = self.dropped
-            what = "dropped" if self.policy == "drop" else "kept, the newest of each place,"
-            logger.warning("updates are %s until the server is back: %s", what, error)
+            self._note_begin(error)
         if isinstance(error, ConnectionLost):  # it was applied or not: sent again, it could be applied twice
             self._count(writer.keys, len(assignments))
         else:
@@ -193,18 +247,23 @@ class Outage:
             self._take(writer, assignments, called)
         self._start_asking()
 
+    def _note_begin(self, error: Exception) -> None:
+        what = "kept, the newest of each place," if self.policy == "newest" else "dropped"
+        logger.warning("updates are %s until the server is back: %s", what, error)
+
     def _take(self, writer: DocumentWriter, assignments: Sequence[Assignment], called: CallTime) -> None:
-        out = self._out.setdefault(writer.keys.document, _Out(writer))
+        out = self._out.setdefault(writer.keys.document, UnsentUpdates(writer))
         if self.policy == "drop":
             self._drop(writer.keys, len(assignments))
             return
-        for it in assignments:
-            # With bytes of its own: the caller may change the arrays.
-            own = it._replace(attachments=tuple([_copied(each) for each in it.attachments]))
-            self._drop(writer.keys, out.put(_Kept(own, _size(own), called)))
-        while out.kept and sum([each.size for each in list(self._out.values())]) > _MOST:
-            out.pop(next(iter(out.kept)))
-            self._drop(writer.keys, 1)
+        own = own_copies(assignments)
+        self._drop(writer.keys, out.put(Kept(own, size_of(own), called)))
+        while out.kept and self._is_full:
+            self._drop(writer.keys, out.drop_first())
+
+    @property
+    def _is_full(self) -> bool:
+        return sum([each.size for each in list(self._out.values())]) > _MOST
 
     def _drop(self, keys: Keys, count: int) -> None:
         """Count updates that are not published, and use up their numbers, so that subscribers see a gap."""
@@ -216,26 +275,33 @@ class Outage:
         if count:
             self._dropped[keys.document] = self._dropped.get(keys.document, 0) + count
 
+    @property
+    def _is_asking(self) -> bool:
+        task = self._asking
+        return task if isinstance(task, bool) else not (task.done() or task.get_loop().is_closed())
+
     def _start_asking(self) -> None:
         """Start a task that asks whether the server is back, if there is none."""
-        if not self._out:
+        if not self._out or self._is_asking:
             return
-        if self._asking is True or (self._asking and not self._asking.is_closed()):
-            return
+        is_thread = asyncio._get_running_loop() is None
+        if is_thread:
+            self._asking = True  # before it begins
         try:
-            self._asking = asyncio.get_running_loop()
-        except RuntimeError:  # in the blocking front
-            self._asking = True
-        try:
-            self._session.tasks.start(self._until_back(), "reem outage")
+            task = self._session.tasks.start(self._until_back(), self._task_name)
         except BaseException:
             self._asking = False
             raise
+        if not is_thread:
+            self._asking = task
 
     async def _until_back(self) -> None:
         tries, asking = 0, self._asking
         try:
-            while self._out and not await self._all_sent():
+            while self._out or self._has_more():
+                if await self._all_sent():
+                    tries = 0
+                    continue
                 await self._session.transport.pause(_PAUSES[min(tries, len(_PAUSES) - 1)])
                 tries += 1
         except InterfaceClosed:  # `close` counts what was kept
@@ -245,8 +311,14 @@ class Outage:
                 self._asking = False
         if self._out:  # added by a call just now
             self._start_asking()
-        if self._out or self._is_closed:
-            return
+        if not self._out and not self._is_closed:
+            self._note_end()
+
+    def _has_more(self) -> bool:
+        """Return whether to go on though nothing is kept."""
+        return False
+
+    def _note_end(self) -> None:
         logger.warning("the server answers again; %d updates were dropped", self.dropped - self._dropped_before)
 
     async def _all_sent(self) -> bool:
@@ -259,66 +331,117 @@ class Outage:
                     break
         return every
 
-    async def _answers(self, out: _Out) -> bool:
+    async def _answers(self, out: UnsentUpdates) -> bool:
         """Ask the server of a key whether it is back; not in the key's turn, for which callers would wait."""
         try:
             await self._session.run(exists(out.writer.keys))
         except InterfaceClosed:
             raise
         except (ReemError, RedisError) as error:  # any other error, such as a missing right, is an answer
-            self._away = isinstance(error, _AWAY)
+            self._away, self._reason = isinstance(error, _AWAY), error
         else:
             self._away = False
         return not self._away
 
-    async def _sent(self, out: _Out) -> bool:
+    async def _sent(self, out: UnsentUpdates) -> bool:
         try:
             await out.writer.in_turn(self._flush, out)
-        except _AWAY:
-            self._away = True
+        except _AWAY as error:
+            self._away, self._reason, out.away = True, error, True
             return False
         return True
 
-    async def _flush(self, turn: Turn, out: _Out) -> None:
+    async def _flush(self, turn: Turn, out: UnsentUpdates) -> None:
         """Send the kept updates of a key, in its turn. If that is interrupted, the rest stays."""
-        keys = out.writer.keys
-        while out.kept:
-            out.sending = 1
-            place = next(iter(out.kept))
-            it = out.pop(place)  # first, so that it is never sent twice
-            turn.called = it.called
-            try:
-                await out.writer.send(turn, [it.assignment])
-            except MissingKey:  # a deletion of a value that is gone
-                continue
-            except (NotConnected, ServerNotReady):
-                turn.not_applied(1)
-                out.put_back(place, it)
+        while await self._send_next(turn, out):
+            pass
+        self._out.pop(out.writer.keys.document, None)
+
+    async def _send_next(self, turn: Turn, out: UnsentUpdates) -> bool:
+        """Send the oldest kept call of a key, in its turn; return whether there was one."""
+        taken = out.take()  # first, so that it is never sent twice
+        if taken is None:
+            return False
+        number, it = taken
+        turn.called, turn.announced = it.called, list(it.announcements)
+        is_over = True
+        try:
+            await out.writer.send(turn, it.assignments)
+        except (NotConnected, ServerNotReady):
+            is_over = False
+            turn.not_applied(len(it.assignments))
+            for each in it.announcements:
+                each.again()
+            out.put_back(number, it)
+            raise
+        except BaseException as error:
+            is_refused = isinstance(error, RedisError | ReemError) and not isinstance(error, _CUT)
+            self._not_stored(out.writer.keys, it, error, is_refused)
+            if not is_refused:
                 raise
-            except BaseException as error:
-                self._count(keys, 1)
-                if not isinstance(error, RedisError | ReemError) or isinstance(error, ConnectionLost | InterfaceClosed):
-                    raise
-                where = show((keys.name, *it.assignment.path))
-                logger.warning("%s: kept in an outage, and refused now: %s", where, error)
-            finally:
-                out.sending = 0
-                turn.release()
-        turn.called = None
-        self._out.pop(keys.document, None)
+        finally:
+            turn.called, turn.announced = None, []
+            if is_over:
+                out.done = number
+            out.sending = 0
+            turn.release()
+        return True
+
+    def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
+        """Count updates that were refused, or are not known to be stored."""
+        if isinstance(error, MissingKey):  # a deletion of a value that is gone
+            return
+        self._count(keys, len(it.assignments))
+        if is_refused:
+            logger.warning("%s: kept in an outage, and refused now: %s", place_of(keys, it), error)
+
+    async def flush(self, timeout: float | None) -> None:  # noqa: ASYNC109
+        """Wait until the updates of all calls so far are stored or dropped. Raises TimeoutError."""
+        if timeout is not None:
+            check_timeout(timeout)
+        if not await self._is_sent_within(LONGEST if timeout is None else timeout):
+            raise TimeoutError(f"{self.waiting} updates were not sent within {timeout:g} s; they are still kept")
+
+    async def _is_sent_within(self, seconds: float) -> bool:
+        await self._wake()
+        deadline, looks = time.monotonic() + seconds, 0
+        for document, out, last in [(document, out, out.last) for document, out in list(self._out.items())]:
+            while out.done < last and self._out.get(document) is out:
+                if time.monotonic() >= deadline:
+                    return False
+                await self._session.transport.pause(_LOOKS[min(looks, len(_LOOKS) - 1)])
+                looks += 1
+        return True
+
+    async def _wake(self) -> None:
+        """Have what is kept sent soon."""
+        self._start_asking()
+
+    async def finish(self, *, is_exit: bool) -> None:
+        """Prepare for the end of the interface, or of the program."""
 
     def close(self) -> None:
         """Drop the kept updates."""
         self._is_closed = True
         left, self._out = self._out, {}
-        for out in left.values():
-            self._count(out.writer.keys, len(out.kept))
-        count = sum([len(out.kept) for out in left.values()])
-        if count:
-            logger.warning("closed in an outage: %d kept updates were not sent", count)
+        counts = [(out.writer.keys, out.drop_all()) for out in left.values()]
+        for keys, count in counts:
+            self._count(keys, count)
+        if total := sum([count for _, count in counts]):
+            logger.warning("closed: %d kept updates were not sent", total)
 
 
 _every = Inherited(Outage.forget)
+
+
+def own_copies(assignments: Sequence[Assignment]) -> tuple[Assignment, ...]:
+    """Return assignments with bytes of their own: the caller may change the arrays."""
+    return tuple(
+        [
+            it._replace(attachments=tuple([_copied(each) for each in it.attachments])) if it.attachments else it
+            for it in assignments
+        ]
+    )
 
 
 def _copied(it: EncodedAttachment) -> EncodedAttachment:
@@ -336,5 +459,16 @@ def _copied(it: EncodedAttachment) -> EncodedAttachment:
     return it._replace(commands=tuple([tuple(map(own, each)) for each in it.commands]), blob=own(it.blob))
 
 
-def _size(it: Assignment) -> int:
-    return _OVERHEAD + len(it.text or b"") + sum([sum(sizes_of(each.commands)) for each in it.attachments])
+def size_of(assignments: Sequence[Assignment]) -> int:
+    """Return how many bytes kept assignments need, about."""
+    return sum(
+        [
+            _OVERHEAD + len(it.text or b"") + sum([sum(sizes_of(each.commands)) for each in it.attachments])
+            for it in assignments
+        ]
+    )
+
+
+def place_of(keys: Keys, it: Kept) -> str:
+    """Return the place of the first of kept assignments, for people."""
+    return show((keys.name, *it.assignments[0].path))

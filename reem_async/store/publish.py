@@ -25,9 +25,9 @@ from ..plan.notices import (
     with_value,
 )
 from ..plan.paths import Path, counts_from_end
-from ..session import Session
+from ..session import PublisherIdentity, Session
 from .document import Attachments, CallTime, DocumentWriter, Turn
-from .outage import Outage
+from .send_queue import outages
 
 _ANSWERS, _ANSWER = 5, 0.001
 """How often an early publisher looks for the answers of new subscribers on this host, and seconds between two looks."""
@@ -42,10 +42,12 @@ class PublishTurn(Turn):
     other.
     """
 
-    __slots__ = ("_announcements", "_keys", "_order", "_session", "called")
+    __slots__ = ("_announcements", "_identity", "_keys", "_order", "_session", "announced", "called")
 
-    def __init__(self, session: Session, keys: Keys) -> None:
+    def __init__(self, session: Session, keys: Keys, identity: PublisherIdentity | None = None) -> None:
         self.called: CallTime | None = None
+        self.announced: list[UpdateAnnouncement] = []
+        self._identity = identity or session
         self._session = session
         self._keys = keys
         # Shared by the interface: other stores, and threads, may publish to the same key.
@@ -67,10 +69,12 @@ class PublishTurn(Turn):
     def reserve(
         self, text: bytes | None = None, attachments: Attachments = (), *, deleted: bool = False
     ) -> UpdateAnnouncement:
+        if self.announced:
+            return self.announced.pop(0)
         if text is None:
-            announcement = UpdateAnnouncement(self._session, self._keys, self.called, deleted)
+            announcement = UpdateAnnouncement(self._session, self._keys, self._identity, self.called, deleted)
         else:
-            announcement = ValueAnnouncement(self._session, self._keys, self.called, text, attachments)
+            announcement = ValueAnnouncement(self._session, self._keys, self._identity, self.called, text, attachments)
         self._announcements.append(announcement)
         return announcement
 
@@ -89,7 +93,9 @@ class UpdateAnnouncement(Announcement):
 
     __slots__ = ("_began", "_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time")
 
-    def __init__(self, session: Session, keys: Keys, called: CallTime | None, deleted: bool = False) -> None:
+    def __init__(
+        self, session: Session, keys: Keys, identity: PublisherIdentity, called: CallTime | None, deleted: bool = False
+    ) -> None:
         self._session = session
         self._keys = keys
         self._time = None if called is None else called.wall
@@ -97,10 +103,10 @@ class UpdateAnnouncement(Announcement):
         self._deleted = deleted
         # A number is first reserved, then in a plan (made), then used. `release` gives back a reserved number, `unsent`
         # and `not_applied` one of a plan that was not applied.
-        self._reserved: list[_Stamp] = [session.stamp(keys)]
+        self._reserved: list[_Stamp] = [identity.stamp(keys)]
         self._made: _Stamp = self._reserved[0]
         # In a cluster, clients that find keys by pattern get the first notices of a key on any node.
-        self._everywhere = session.is_fresh(keys)
+        self._everywhere = identity.is_fresh(keys)
 
     def commands(self, path: Path) -> list[Command]:
         return self._numbered(path, self._payload)
@@ -108,8 +114,11 @@ class UpdateAnnouncement(Announcement):
     def unsent(self) -> None:
         self._reserved.append(self._made)
 
-    def not_applied(self) -> None:
+    def again(self) -> None:
         self._reserved = [self._made]
+
+    def not_applied(self) -> None:
+        self.again()
         self.release()
 
     def release(self) -> None:
@@ -147,9 +156,15 @@ class ValueAnnouncement(UpdateAnnouncement):
     __slots__ = ("_attachments", "_early", "_slot", "_text")
 
     def __init__(
-        self, session: Session, keys: Keys, called: CallTime | None, text: bytes, attachments: Attachments
+        self,
+        session: Session,
+        keys: Keys,
+        identity: PublisherIdentity,
+        called: CallTime | None,
+        text: bytes,
+        attachments: Attachments,
     ) -> None:
-        super().__init__(session, keys, called)
+        super().__init__(session, keys, identity, called)
         self._text = text
         self._attachments = attachments
         self._slot: Slot | None = None
@@ -225,12 +240,12 @@ class DocumentPublisher(DocumentWriter):
 
     keeps_order = True
 
-    def turn(self) -> PublishTurn:
-        return PublishTurn(self.session, self.keys)
+    def turn(self, identity: PublisherIdentity | None = None) -> PublishTurn:
+        return PublishTurn(self.session, self.keys, identity)
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
-        return partial(publisher, policy="raise" if self._outages is None else self._outages.policy)
+        return partial(publisher, **({"policy": "raise"} if self._outages is None else self._outages.chosen))
 
 
-def publisher(session: Session, name: object, policy: str) -> DocumentPublisher:
-    return DocumentPublisher(session, name, Outage.chosen(session, policy))
+def publisher(session: Session, name: object, policy: str, **chosen: Any) -> DocumentPublisher:
+    return DocumentPublisher(session, name, outages(session, policy, **chosen))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, NoReturn
 
 from ..errors import WriteOnly
 from ..plan.paths import Path, show
 from .accessor import Accessor, Writer
-from .outage import Outage
 from .publish import DocumentPublisher
 from .reader import DocumentReader
+from .send_queue import outages
 from .store import KeyValueStore
 
 
@@ -100,7 +101,7 @@ class PublishSpace(KeyValueStore):
 
     - "drop": Updates are dropped, and counted in `dropped`.
     - "newest": The newest update of each place is kept, with the bytes and the time of its call, and sent when the
-      server is back, in the order of the calls, each by itself. A replaced update is counted in `dropped`. Removals of
+      server is back, in the order of the calls. A replaced update is counted in `dropped`. Removals of
       list items are all kept, since an index names another item after each of them. Over 256 MB of values, in all, the
       oldest of a key are dropped, and counted.
 
@@ -110,28 +111,65 @@ class PublishSpace(KeyValueStore):
     the kept updates. A kept update that the server refuses is logged and counted, and closing the interface drops the
     rest. The beginning and the end of an outage are logged ("reem.publish").
 
+    With `wait=False`, `write`, `update` and `delete` encode and queue their updates and return. A background task sends
+    them in the order of the calls. What that means:
+
+    - A read through the same interface may not see the update yet. `flush` waits until it is stored; `append`, `extend`
+      and arithmetic wait for the server, behind what is queued for their key.
+    - Bad input raises in the call. Errors of the server go to `on_error`, or the next call raises the first of them
+      and queues nothing. Each such update is counted in `dropped`.
+    - Up to 32 calls of a key wait. A further one replaces those of the same place and inside it, and they are counted
+      in `dropped`. Over 1000 calls or 256 MB, in all, the oldest of a key are dropped, and counted.
+    - In an outage the queue follows `outage`: "raise" drops what is queued, counts it, and reports the error once;
+      "drop" does so without the error; "newest" keeps it.
+    - Closing the interface, and the end of the program, send what is queued for up to a second; the rest is counted and
+      logged. A killed program loses its queue, and a forked child begins with an empty one.
+
     Args:
         interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.
         outage: What to do in an outage: "raise", "drop" or "newest".
+        wait: Whether a call waits until the server has stored the update.
+        on_error: With `wait=False`, called with each error, in the background task; it must not block.
         options: With a host, what else RedisInterface takes.
     """
 
     _accessor = PublishAccessor
 
-    def __init__(self, interface: Any = None, outage: str = "raise", **options: Any) -> None:
+    def __init__(
+        self,
+        interface: Any = None,
+        outage: str = "raise",
+        wait: bool = True,
+        on_error: Callable[[Exception], object] | None = None,
+        **options: Any,
+    ) -> None:
         super().__init__(interface, **options)
         self.outage = outage
-        self._outages = Outage.chosen(self.interface.session, outage)
+        self._chosen = outage, wait, on_error
+        self._outages = outages(self.interface.session, *self._chosen)
         self._writer = partial(DocumentPublisher, outages=self._outages)
+
+    async def flush(self, timeout: float | None = None) -> None:  # noqa: ASYNC109
+        """Wait until the updates of all calls so far are stored or dropped.
+
+        Args:
+            timeout: Seconds to wait at most; as long as it takes if not given.
+
+        Raises:
+            TimeoutError: Some are not; they are still queued, or kept for the end of the outage.
+            redis.exceptions.RedisError: With `wait=False` and without `on_error`: the first error of earlier updates.
+        """
+        if self._outages is not None:
+            await self._outages.flush(timeout)
 
     @property
     def dropped(self) -> int:
-        """How many updates this has not published because of outages, or not for certain."""
+        """How many updates this has not published, or not for certain: because of outages, or of `wait=False`."""
         return 0 if self._outages is None else self._outages.dropped
 
     @property
     def waiting(self) -> int:
-        """How many updates are kept until the server is back, or on their way then and not answered yet."""
+        """How many updates are queued, or kept until the server is back, or on their way and not answered yet."""
         return 0 if self._outages is None else self._outages.waiting
 
     def watch(self, *patterns: str, policy: Any = None, largest: int | None = None) -> NoReturn:
@@ -139,4 +177,4 @@ class PublishSpace(KeyValueStore):
         raise WriteOnly(_cannot_read(patterns or ("*",)))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.interface, self.outage)
+        return type(self), (self.interface, *self._chosen)

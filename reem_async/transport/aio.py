@@ -110,7 +110,7 @@ class AsyncTransport(OneServer):
         """Return the shared wire, connecting if need be. Concurrent callers share one attempt, and its failure."""
         self.check()
         opening = self._opening.get(bulk)
-        if opening is None:
+        if opening is None or opening.cancelled():  # cancelled before it began: an event loop ends
             opening = self._opening[bulk] = self._tasks.start(self._open_lane(bulk), "reem connect")
             opening.add_done_callback(lambda done: done.cancelled() or done.exception())  # all may have gone away
         # A cancelled caller does not take the connection from the others.
