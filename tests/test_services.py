@@ -13,7 +13,17 @@ import time
 import numpy as np
 import orjson
 import pytest
-from conftest import PATIENCE, aeventually, assert_same, eventually, keys_of, python, server_without_right, sized
+from conftest import (
+    PATIENCE,
+    aeventually,
+    assert_same,
+    commands_run,
+    eventually,
+    keys_of,
+    python,
+    server_without_right,
+    sized,
+)
 from own_servers import free_port
 from servicekit import LARGE, act, program
 
@@ -71,13 +81,43 @@ def test_arguments_and_answers_are_what_reem_stores(front, raw, key, kind):
         return value
 
     service = served(front, place, act)
-    answer = front.wait(place.call(value=VALUES[kind], timeout=PATIENCE))
     expected = VALUES[kind]
-    assert_same(got[0], expected)
-    assert_same(answer, expected)
+    for number in range(3):  # the first goes through the server, large ones from then on through shared memory
+        answer = front.wait(place.call(value=expected, timeout=PATIENCE))
+        assert_same(got[number], expected)
+        assert_same(answer, expected)
     assert keys_of(raw, key()) == set()
     assert service("called here") == "called here"
     front.wait(service.close())
+
+
+@pytest.mark.parametrize("fails", ["nothing", "requests", "answers"])
+async def test_large_values_go_through_shared_memory_on_one_host(akvs, binterface, raw, key, monkeypatch, fails):
+    """And through the server where the memory cannot be read, or too many answers are in it; each is the right one."""
+    other = reem_async.KeyValueStore(binterface)
+    if fails != "nothing":
+        reader = akvs if fails == "requests" else other
+        monkeypatch.setattr(reader.interface.session.local, "view", lambda slot, size: None)
+
+    async def act(array, nap):
+        await asyncio.sleep(nap)
+        return array + 1
+
+    async with akvs[key()].serve(act, concurrency=10):
+        place = other[key()]
+        await place.call(array=np.zeros(LARGE), nap=0)
+        for nap in (0, 0.01, 0.1):
+            arrays = [np.full(LARGE + n, float(n)) for n in range(20)]
+            answers = await asyncio.gather(*(place.call(array=each, nap=nap, timeout=PATIENCE) for each in arrays))
+            assert all((answer == each + 1).all() for answer, each in zip(answers, arrays, strict=True))
+            answers = [await place.call(array=each, nap=0, timeout=PATIENCE) for each in arrays]
+            assert all((answer == each + 1).all() for answer, each in zip(answers, arrays, strict=True))
+        before = commands_run(raw).get("set", 0)
+        del answers
+        await place.call(array=np.zeros(LARGE), nap=0)
+        sent = commands_run(raw).get("set", 0) - before
+        assert sent == {"nothing": 0, "requests": 1, "answers": 1}[fails]
+    await aeventually(lambda: keys_of(raw, key()) == set())
 
 
 def test_what_a_function_raises_reaches_the_caller(front, key):

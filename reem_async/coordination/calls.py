@@ -91,6 +91,7 @@ class Instance:
         self.id = name
         self.channel = channel
         self.calls = 0  # calls from here that wait for its answer
+        self.host = ""  # what names its host, for shared memory; empty if not known, or if it cannot read ours
         self.misses = 0  # pings since its last message
         self._waiting, self._until = 0.0, 0.0  # requests that it said are waiting there, and when that is too old
 
@@ -199,9 +200,28 @@ class Caller(Listener):
             return
         call = self._pending.get(message.call)
         # An answer may come after its caller has left. One by another server than the one asked is no answer.
-        if call is not None and call.instance is not None and call.instance.id == message.sender:
-            call.instance.answered(message.number, now)
+        if call is None or call.instance is None or call.instance.id != message.sender:
+            return
+        call.instance.answered(message.number, now)
+        if message.content is not None:
+            message = self._seen(call.instance, message)
+        if message.content is None or not message.content.is_missing:
             call.end(message)
+
+    def _seen(self, instance: Instance, message: Message) -> Message:
+        """Return an answer with its bytes in shared memory, and report to the server whether they were there."""
+        assert message.content is not None
+        instance.host = message.words[0]
+        content = message.content.seen(self._session.local.view)
+        if content.view is not None or content.is_missing:
+            kind = messages.UNREAD if content.is_missing else messages.RECEIVED
+            payload = messages.bare(Message(kind, message.call, self.id))
+            self._manager.tasks.start(self._report(instance, payload), "reem report answer")
+        return message._replace(content=content)
+
+    async def _report(self, instance: Instance, payload: bytes) -> None:
+        with contextlib.suppress(ReemError, RedisError, OSError):
+            await publish(self._session, self._keys, instance.channel, payload)
 
     # One call.
 
@@ -248,7 +268,9 @@ class Caller(Listener):
                 is_complete = True
                 continue
             message = await self._ask(call, instance, value)
-            if message is None or message.kind == messages.CLOSED:
+            if message is not None and message.kind == messages.UNREAD:
+                instance.host = ""  # once more to the same, which did not begin it
+            elif message is None or message.kind == messages.CLOSED:
                 is_complete = False  # another one may have taken its place
                 gone.add(instance.id)
                 directory.instances.pop(instance.id, None)
@@ -276,7 +298,7 @@ class Caller(Listener):
             message = await self._wait(call, answer)
         finally:
             instance.calls -= 1
-        was_begun = message.kind not in (messages.BUSY, messages.CLOSED)
+        was_begun = message.kind not in (messages.BUSY, messages.CLOSED, messages.UNREAD)
         call.state = State.ANSWERED if was_begun else State.UNSENT
         return message
 
@@ -304,9 +326,15 @@ class Caller(Listener):
 
     async def _send(self, call: PendingCall, instance: Instance, value: Encoded) -> int:
         left = max(call.deadline - asyncio.get_running_loop().time(), 0.0)
-        message = Message(messages.CALL, call.id, self.id, left, [""])
-        if messages.fits_inline(value):
+        local = self._session.local
+        message = Message(messages.CALL, call.id, self.id, left, [local.host])
+        if messages.is_small(value):
             return await publish(self._session, self._keys, instance.channel, messages.inline(message, value))
+        if instance.host and instance.host == local.host:
+            slot = messages.put(local, self._keys, call.directory.names.channel(""), value)
+            if slot is not None:
+                payload = messages.in_slot(message, value, slot)
+                return await publish(self._session, self._keys, instance.channel, payload)
         prefix = call.directory.names.request(call.id)
         payload, commands = messages.stored(message, value, prefix, left)
         if call.has_stored:  # for a server that has refused it
@@ -323,7 +351,7 @@ class Caller(Listener):
             plan = messages.fetch(content, call.directory.names.answer(call.id), ships, call.where)
             pieces = await self._session.run(plan) if plan.commands else [content.data]
         else:
-            pieces = messages.carried(content)
+            pieces = messages.pieces_of(content)
         call.has_stored = False  # the server has fetched the arguments
         return await messages.opened(content, pieces, ships, call.where)
 

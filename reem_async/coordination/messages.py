@@ -16,10 +16,11 @@ import orjson
 
 from ..concurrency.timeouts import LONGEST
 from ..errors import BadData, RemoteError
+from ..local.path import LocalPath
 from ..plan import Command, Plan, Reply, blamed
 from ..plan.changes import EncodedAttachment
 from ..plan.keys import Keys
-from ..plan.notices import Slot, assembled, named, sizes_of_parts, starts
+from ..plan.notices import Slot, View, assembled, named, sizes_of_parts, starts
 from ..plan.paths import Path, escaped, suffix
 from ..plan.reads import with_bytes
 from ..ships.registry import Ships
@@ -48,7 +49,7 @@ PONG: Final = "pong"
 
 _KINDS = {CALL, CANCEL, PING, RECEIVED, UNREAD, ANSWER, FAILED, BUSY, CLOSED, DROPPED, PONG}
 _WITH_VALUE = {CALL, ANSWER}
-_WORDS = {CALL: 1, FAILED: 3}  # how many texts a message has
+_WORDS = {CALL: 1, ANSWER: 1, FAILED: 3}  # how many texts a message has
 _HERE, _STORED = "here", "stored"
 
 Encoded = tuple[bytes, Sequence[EncodedAttachment]]  # a value: the text of the document, and the attachments
@@ -61,10 +62,22 @@ class Content(NamedTuple):
     text_size: int
     parts: list[tuple[str, str, int]]  # of each attachment the ship's label, the end of its key, and its bytes
     data: bytes = b""  # what follows the header
+    view: memoryview | None = None  # its bytes in shared memory, once they are found there
 
     @property
     def is_stored(self) -> bool:
         return self.place == _STORED
+
+    def seen(self, view_of: View) -> Content:
+        """Return this with its bytes, if it is in shared memory and they are there."""
+        if not isinstance(self.place, Slot):
+            return self
+        return self._replace(view=view_of(self.place, starts(self.sizes)[-1]))
+
+    @property
+    def is_missing(self) -> bool:
+        """Whether it is in shared memory that cannot be read."""
+        return isinstance(self.place, Slot) and self.view is None
 
     @property
     def sizes(self) -> list[int]:
@@ -78,7 +91,7 @@ class Message(NamedTuple):
     call: str  # the id of the call; empty in pings and pongs
     sender: str  # the id of the caller or of the server
     number: float = 0.0  # of a caller: seconds that are left; of a server: requests that wait or are handled there
-    words: Sequence[str] = ()  # CALL: the caller's host, for shared memory; FAILED: type, message and traceback
+    words: Sequence[str] = ()  # CALL, ANSWER: the sender's host, for shared memory; FAILED: type, message, traceback
     content: Content | None = None
 
 
@@ -123,13 +136,24 @@ def is_id(text: Any) -> bool:
     return type(text) is str and len(text) == ID and not set(text) - set("0123456789abcdef")
 
 
-def total(value: Encoded) -> int:
-    """Return the bytes of a value."""
-    return sum(sizes_of_parts(*value))
+def is_small(value: Encoded) -> bool:
+    """Return whether a message can carry a value."""
+    return sum(sizes_of_parts(*value)) <= LARGEST_INLINE and is_bytes(value)
 
 
-def fits_inline(value: Encoded) -> bool:
-    return total(value) <= LARGEST_INLINE and all(each.blob is not None for each in value[1])
+def is_bytes(value: Encoded) -> bool:
+    """Return whether all of a value is bytes, and not what the commands of a user's ship store."""
+    return all(each.blob is not None for each in value[1])
+
+
+def put(local: LocalPath, keys: Keys, channel: str, value: Encoded) -> Slot | None:
+    """Copy a value into shared memory; None if there is no room, or if a ship of a user stores a part of it.
+
+    It holds while none of the five next values of the same channel is put there.
+    """
+    text, attachments = value
+    pieces = [text, *(piece for each in attachments for piece in each.blob or ())]
+    return local.put(keys._replace(channel=channel), pieces, sizes_of_parts(*value)) if is_bytes(value) else None
 
 
 def inline(message: Message, value: Encoded) -> bytes:
@@ -264,8 +288,12 @@ def _is_part(part: Any) -> bool:
     )
 
 
-def carried(content: Content) -> list[Any]:
-    """Return the parts of a value that its message carries: the text, then each attachment."""
+def pieces_of(content: Content) -> list[Any]:
+    """Return the parts of a value in its message or in shared memory: the text, then each attachment."""
+    if content.view is not None:
+        view, begins = content.view, starts(content.sizes)[:-1]
+        text, *rest = [view[start : start + size] for start, size in zip(begins, content.sizes, strict=True)]
+        return [bytes(text), *rest]
     position, pieces = 0, []
     for size in content.sizes:
         pieces.append(content.data[position : position + size])
@@ -273,11 +301,13 @@ def carried(content: Content) -> list[Any]:
     return pieces
 
 
-def cut(content: Content, view: memoryview) -> list[Any]:
-    """Return the parts of a value in shared memory."""
-    begins = starts(content.sizes)[:-1]
-    text, *rest = [view[start : start + size] for start, size in zip(begins, content.sizes, strict=True)]
-    return [bytes(text), *rest]
+def again(content: Content, prefix: str) -> Encoded:
+    """Return a value in shared memory, to be stored under keys that begin with `prefix`."""
+    text, *blobs = pieces_of(content)
+    return text, [
+        EncodedAttachment(tail, label, (("SET", prefix + tail, bytes(blob)),), (bytes(blob),))
+        for (label, tail, _), blob in zip(content.parts, blobs, strict=True)
+    ]
 
 
 def fetch(content: Content, prefix: str, ships: Ships, where: str) -> Plan:

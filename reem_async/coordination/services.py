@@ -18,7 +18,7 @@ import time
 import traceback
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from ..concurrency.scheduling import take_short_turns
 from ..concurrency.tasks import is_being_cancelled
@@ -36,6 +36,7 @@ from ..errors import (
 from ..plan import Command
 from ..plan.arguments import whole
 from ..plan.keys import Keys
+from ..plan.notices import Slot
 from ..plan.paths import Path, shorten, show
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import SubscriptionManager, manager_of
@@ -52,6 +53,8 @@ _LEFT = 1000  # calls that are remembered as left before their request came: it 
 _RETRY = 0.1  # seconds between tries to send an answer while the connection is down
 _PAUSE = 0.5  # seconds between tries to begin
 _PERIOD, _STALE = 0.25, 0.75  # seconds between looks at whether messages arrive in time, and after which they do not
+_SHARED = 2
+"""Answers in shared memory that a caller has not taken yet: of the six slots, the caller may look into three."""
 _RECENT = 200  # calls whose time is remembered
 
 
@@ -156,6 +159,14 @@ class _Request:
             self.cancel()
 
 
+class _Shared(NamedTuple):
+    """An answer in shared memory, until its caller has taken it."""
+
+    request: _Request
+    payload: bytes
+    memory: object  # keeps the memory from being given back
+
+
 class Served(Listener):
     """One function that serves in one event loop: its channel, the requests that wait, and those being handled."""
 
@@ -178,6 +189,7 @@ class Served(Listener):
         self._waiting: collections.deque[_Request] = collections.deque()
         self._running = 0
         self._left: collections.OrderedDict[str, str] = collections.OrderedDict()  # calls and their callers
+        self._shared: dict[str, _Shared] = {}  # answers in shared memory that callers have not taken, by call
         self.closed = asyncio.Event()
         self.calls = self.errors = 0  # how many were answered, and with an exception
         self.times: collections.deque[float] = collections.deque(maxlen=_RECENT)  # seconds that calls took
@@ -239,6 +251,12 @@ class Served(Listener):
                     self._drop_left()
             case messages.PING:
                 self._send_soon(message, self._bare(messages.PONG, message))
+            case messages.RECEIVED | messages.UNREAD:
+                sent = self._shared.get(message.call)
+                if sent is not None and sent.request.message.sender == message.sender:
+                    del self._shared[message.call]
+                    if message.kind == messages.UNREAD:
+                        self._manager.tasks.start(self._send_again(sent), "reem answer")
 
     def _take(self, message: Message) -> None:
         if self.closed.is_set():
@@ -249,6 +267,12 @@ class Served(Listener):
             if len(self._waiting) >= self._bound and self._running >= self._concurrency:
                 self._send_soon(message, self._bare(messages.BUSY, message))
                 return
+            assert message.content is not None  # the message was checked
+            content = message.content.seen(self._session.local.view)  # now: the caller may soon use the memory again
+            if content.is_missing:
+                self._send_soon(message, self._bare(messages.UNREAD, message))
+                return
+            message = message._replace(content=content)
             request = self._requests[message.call] = _Request(message, asyncio.get_running_loop().time())
             self._waiting.append(request)
             self._begin_next()
@@ -343,7 +367,7 @@ class Served(Listener):
             plan = messages.fetch(content, self._names.request(message.call), ships, self.where)
             pieces = await self._session.run(plan) if plan.commands else [content.data]
         else:
-            pieces = messages.carried(content)
+            pieces = messages.pieces_of(content)
         arguments = await messages.opened(content, pieces, ships, self.where)
         if type(arguments) is not dict:
             raise BadData(f"{self.where}: the arguments are {shorten(arguments)}, and not a dict")
@@ -369,12 +393,46 @@ class Served(Listener):
         return messages.failure(message.call, self.id, self._busy - 1, error, trace)
 
     async def _send_value(self, request: _Request, value: Encoded, prefix: str) -> None:
-        loop = asyncio.get_running_loop()
-        left = max(request.deadline - loop.time(), 0.0)
-        answer = Message(messages.ANSWER, request.message.call, self.id, self._busy - 1)
-        if messages.fits_inline(value):
+        answer = Message(messages.ANSWER, request.message.call, self.id, self._busy - 1, [self._session.local.host])
+        if messages.is_small(value):
             await self._send(request, messages.inline(answer, value))
             return
+        if (slot := self._slot(request, value)) is not None:
+            payload = messages.in_slot(answer, value, slot)
+            self._shared[answer.call] = _Shared(request, payload, self._session.local.kept(self._answers(request)))
+            await self._send(request, payload)
+            return
+        await self._send_stored(request, answer, value, prefix)
+
+    def _slot(self, request: _Request, value: Encoded) -> Slot | None:
+        """Put an answer into shared memory; None if the caller is elsewhere, or has others to take out first."""
+        message, local = request.message, self._session.local
+        if not local.host or message.words[0] != local.host:
+            return None
+        now = asyncio.get_running_loop().time()
+        for call in [call for call, sent in self._shared.items() if sent.request.deadline < now]:
+            del self._shared[call]
+        if sum(sent.request.message.sender == message.sender for sent in self._shared.values()) >= _SHARED:
+            return None
+        return messages.put(local, self._names.keys, self._answers(request), value)
+
+    def _answers(self, request: _Request) -> str:
+        return self._channel_to(request.message)
+
+    async def _send_again(self, sent: _Shared) -> None:
+        """Send an answer through the server that its caller could not read in shared memory."""
+        answer = messages.decode(sent.payload)
+        assert answer.content is not None
+        content = answer.content.seen(self._session.local.view)
+        prefix = self._names.answer(answer.call)
+        if content.is_missing:  # the memory is this program's own
+            error = BadData(f"{self.where}: the answer is not in shared memory any more")
+            await self._send(sent.request, self._failure(sent.request.message, error))
+            return
+        await self._send_stored(sent.request, answer, messages.again(content, prefix), prefix)
+
+    async def _send_stored(self, request: _Request, answer: Message, value: Encoded, prefix: str) -> None:
+        left = max(request.deadline - asyncio.get_running_loop().time(), 0.0)
         payload, commands = messages.stored(answer, value, prefix, left)
         try:
             received = await self._send(request, payload, commands)

@@ -118,6 +118,10 @@ class LocalPath:
             return None
         return Slot(self.host, self._pid, segment.descriptor, segment.inode, *written)
 
+    def kept(self, channel: str) -> object:
+        """Return what keeps the memory of a channel from being given back, as long as it is kept."""
+        return self._segments.get(channel)
+
     def _segment(self, channel: str, room: int) -> Segment | None:
         """Return the segment of a key with so many bytes in each slot, made if need be; None if that is too much.
 

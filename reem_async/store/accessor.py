@@ -524,7 +524,8 @@ class Accessor(Handle):
         timeout, cancels a coroutine function, and is not begun if it still waits.
 
         A message to the server and one back, without waiting in between; the first call subscribes and looks for
-        servers, two round trips more. A value over 64 KB takes a round trip more to fetch.
+        servers, two round trips more. A value over 64 KB goes through shared memory on one host; else fetching it takes
+        one round trip more.
 
         Args:
             timeout: Seconds to wait for the answer; what `reem_async.timeout` says, or 10, if not given. A request
