@@ -19,7 +19,7 @@ FOLDER = Path(__file__).parent / "reference" / "generated"
 API = {
     "connection": (
         "Connection",
-        ("reem:RedisInterface", "reem:StateChange", "reem:timeout"),
+        ("reem:RedisInterface", "reem:StateChange", "reem:NodeInfo", "reem:NodeEvent", "reem:timeout"),
     ),
     "store": ("Store", ("reem:KeyValueStore", "reem.accessor:Accessor")),
     "publish": (

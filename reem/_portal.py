@@ -13,11 +13,13 @@ from __future__ import annotations
 import _thread
 import asyncio
 import contextlib
+import os
 import socket
 import threading
 from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
+from reem_async.concurrency.locks import Inherited
 from reem_async.errors import InterfaceClosed, WrongLoop
 
 try:
@@ -246,7 +248,13 @@ class Threads:
     """The background threads of one interface. They are daemons: a program that ends does not wait for them."""
 
     def __init__(self) -> None:
+        self._begin()
+        _every.add(self)
+
+    def _begin(self) -> None:
+        """Begin without threads; in a forked child too, which does not have those of its parent."""
         self._running: set[threading.Thread] = set()
+        self._ended = threading.Event()
 
     def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> None:
         """Run a coroutine of the core, which does all its waiting in system calls."""
@@ -265,8 +273,21 @@ class Threads:
         finally:
             self._running.discard(threading.current_thread())
 
+    @property
+    def place(self) -> object:
+        """The process that threads run in."""
+        return os.getpid()
+
+    async def pause(self, seconds: float) -> None:
+        """Wait in one of the threads, until the interface is closed at the latest."""
+        self._ended.wait(seconds)
+
     async def end(self) -> None:
         """Wait until all have ended, but for the one that asks for it; the interface is closed before."""
+        self._ended.set()
         for thread in list(self._running):
             if thread is not threading.current_thread():
                 thread.join(_LONGEST_END)
+
+
+_every = Inherited(Threads._begin)

@@ -20,10 +20,10 @@ from reem_async.store.catalog import Outline
 
 from ._twin import documented_by
 from .connection import RedisInterface
+from .following import Watch
 from .mirror import Mirror
 from .parameters import Parameter, declared
 from .service import Service
-from .subscribe import Watch
 
 
 @documented_by(core.Reader)

@@ -16,6 +16,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
 import reem_async
 from reem_async.concurrency.queues import Ended
 from reem_async.connection import rebuilt
+from reem_async.coordination.presence import NodeInfo
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
@@ -25,6 +26,7 @@ from reem_async.transport.state import State, StateChange, StateChanges
 
 from ._portal import LastPortal, Portal, Threads, finish
 from ._twin import documented_by
+from .following import NodeWatch
 
 __all__ = [  # noqa: F822 - all but RedisInterface stood here in REEM 0.1.x, and old programs import it from here
     "ROOT_PATH", "ROOT_VALUE_SEQUENCE", "SEPARATOR_CHARACTER", "CallbackSubscriber", "KeyValueStore",
@@ -101,9 +103,9 @@ class _Background:
 
     def _new_interface(self) -> reem_async.RedisInterface:
         host, ships, settings = self._direct._given
-        interface = reem_async.RedisInterface(host, ships, **settings)
-        # Both have one state: a user knows of one interface.
-        interface.session.transport.states = self._direct.session.transport.states
+        # The other one has the name.
+        interface = reem_async.RedisInterface(host, ships, **{**settings, "name": None})
+        interface.session.share_with(self._direct.session)
         return interface
 
     def close(self) -> None:
@@ -206,10 +208,11 @@ class RedisInterface:
         local: Literal["auto", "off", "early"] = "auto",
         local_memory: int = MEMORY,
         wait: float = 0.0,
+        name: str | None = None,
         **options: Any,
     ) -> None:
         settings = {"namespace": namespace, "timeout": timeout, **options}
-        settings |= {"local": local, "local_memory": local_memory, "wait": wait}
+        settings |= {"local": local, "local_memory": local_memory, "wait": wait, "name": name}
         self._direct = _OnThread(host, ships, **settings)
         self._direct.session.tasks = Threads()
         self._background = _Background(self._direct)
@@ -249,6 +252,14 @@ class RedisInterface:
     def unreadable(self) -> int:
         """How many messages and values could not be read by subscribers."""
         return self._direct.unreadable
+
+    def nodes(self) -> list[NodeInfo]:
+        """Return the programs that are connected under a name, in the order of their names."""
+        return self._run(self._core.nodes())
+
+    def watch_nodes(self) -> NodeWatch:
+        """Return an iterator over the programs that join and leave, those that are there first."""
+        return NodeWatch(self)
 
     @property
     def _core(self) -> reem_async.RedisInterface:

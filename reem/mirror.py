@@ -15,7 +15,7 @@ from reem_async.pubsub import mirror as core
 
 from ._twin import documented_by
 from .connection import quiet_at_exit
-from .subscribe import Following
+from .following import Following
 
 if TYPE_CHECKING:
     from .connection import RedisInterface

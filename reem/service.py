@@ -11,7 +11,7 @@ from reem_async.errors import BadType, InterfaceClosed
 
 from ._twin import documented_by
 from .connection import RedisInterface
-from .subscribe import Following
+from .following import Following
 
 
 @documented_by(core.Service)

@@ -6,102 +6,17 @@ import contextlib
 import inspect
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self
+from typing import Any
 
-from reem_async.concurrency.queues import EMPTY, Ended, Policy
+from reem_async.concurrency.queues import Policy
 from reem_async.concurrency.scheduling import take_short_turns
-from reem_async.concurrency.streams import closed, timed_out
-from reem_async.concurrency.timeouts import waiting_limit
 from reem_async.errors import BadType, InterfaceClosed
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
 from ._twin import documented_by
 from .connection import RedisInterface
-
-
-class Following:
-    """What begins to follow in `listen` and ends in `close`; `with` calls both."""
-
-    def listen(self) -> None:
-        """Begin to follow."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Stop following."""
-        raise NotImplementedError
-
-    def __enter__(self) -> Self:
-        self.listen()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-@documented_by(core.Watch)
-class Watch(Following):
-    """Follows one path and yields its updates, one by one: an iterator.
-
-    Follows from the first `for` or `with` on. The first update is the value that is already there,
-    if any (`initial`). Leaving a loop with `break` keeps following until the watch is closed or
-    dropped.
-
-    Args:
-        interface: The server.
-        watch: The core's, which lives on the background loop.
-    """
-
-    def __init__(self, interface: RedisInterface, watch: core.Watch | PatternWatchCore) -> None:
-        self._interface = interface
-        self._core = watch
-
-    @property
-    def dropped(self) -> int:
-        """How many updates were skipped since they were not taken in time."""
-        return self._core.dropped
-
-    def listen(self) -> None:
-        """Begin to follow."""
-        self._interface._wait(self._core.listen())
-
-    def close(self) -> None:
-        """Stop following and end the loop."""
-        try:
-            self._interface._wait(self._core.close())
-        except InterfaceClosed:  # the event loop that would do it has ended, or is too busy for that
-            self._core.queue.close()
-
-    def next(self, timeout: float | None = None) -> core.Update:
-        """Return the next update: as the loop does, but with a time limit."""
-        limit = waiting_limit(timeout)
-        try:
-            if limit is None:
-                return next(self)
-            if not self._core._following:
-                self.listen()
-            update = self._core.queue.take_within(limit)
-        except (StopIteration, Ended):
-            raise closed() from None
-        if update is EMPTY:
-            raise timed_out(limit)
-        return update  # type: ignore[no-any-return]
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> core.Update:
-        # On the caller's thread: the loop puts updates into the queue and knows nothing of its readers.
-        queue = self._core.queue
-        try:
-            if (update := queue.take()) is EMPTY:
-                # A loop need not be told to begin; `listen` has no update missed that is published after it.
-                if not self._core._following:
-                    self.listen()
-                update = queue.take_waiting()
-            return update  # type: ignore[no-any-return]
-        except Ended:
-            raise StopIteration from None
+from .following import Following, Watch
 
 
 @documented_by(PatternWatchCore)

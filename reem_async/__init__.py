@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .concurrency.timeouts import timeout
     from .connection import RedisInterface
     from .coordination.parameters import Parameter
+    from .coordination.presence import NodeEvent, NodeInfo
     from .errors import *
     from .plan.placeholders import Unreadable
     from .pubsub.events import Origin, Update
@@ -30,11 +31,11 @@ __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
     "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
     "InterfaceClosed", "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop",
-    "Misuse", "Newest", "NoJsonSupport", "NoService", "NotAllowed", "NotConnected", "NotFinite", "NumpyShip",
-    "Origin", "Overflow", "Parameter", "PartialWrite", "PathRefused", "PublishSpace", "Publisher", "QueueFull",
-    "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull",
-    "ServerMissing", "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost", "Silent",
-    "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
+    "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed", "NotConnected",
+    "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter", "PartialWrite", "PathRefused", "PublishSpace",
+    "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "RemoteError",
+    "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost",
+    "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
     "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
 ]  # fmt: skip
@@ -44,6 +45,7 @@ _HOMES = {
     ".concurrency.timeouts": ["timeout"],
     ".connection": ["RedisInterface"],
     ".coordination.parameters": ["Parameter"],
+    ".coordination.presence": ["NodeEvent", "NodeInfo"],
     ".plan.placeholders": ["Unreadable"],
     ".pubsub.events": ["Origin", "Update"],
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],

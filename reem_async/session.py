@@ -12,8 +12,9 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from operator import attrgetter
-from typing import Any
+from typing import Any, Literal
 
+from .concurrency.locks import WeakList
 from .concurrency.tasks import Tasks
 from .concurrency.timeouts import LONGEST
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
@@ -78,6 +79,16 @@ class _Numbers:
                 self._looking.release()
         return publisher, number + 1
 
+    def recent(self, seconds: float) -> list[str]:
+        """Return the channels of the keys that were published in the last seconds, the newest first."""
+        since = time.monotonic() - seconds
+        if self._pid != os.getpid():  # what is there was published by the parent
+            return []
+        for _ in range(3):
+            with contextlib.suppress(RuntimeError):  # another thread publishes meanwhile
+                return [channel for channel, last in reversed(self._last.items()) if last[2] >= since]
+        return []
+
     def is_fresh(self, channel: str) -> bool:
         last = self._last.get(channel)
         return last is not None and time.monotonic() < last[3]
@@ -129,6 +140,38 @@ class PublisherIdentity:
         """
         return self.transport.sharded and self._numbers.is_fresh(keys.channel)
 
+    def recent(self, seconds: float) -> list[str]:
+        """Return the channels of the keys that it has published in the last seconds, the newest first."""
+        return self._numbers.recent(seconds)
+
+
+class Activities:
+    """What a program does, for `RedisInterface.nodes`. Any thread may call."""
+
+    def __init__(self, namespace: str) -> None:
+        self._namespace = namespace
+        # Each name as often as it was added; each step is one of C.
+        self._names: dict[str, list[str]] = {"serves": [], "owns": []}
+        self.publishers: WeakList[PublisherIdentity] = WeakList()
+
+    def add(self, kind: Literal["serves", "owns"], name: str) -> None:
+        """Note that the program serves or owns `name` from now on."""
+        self._names[kind].append(name)
+
+    def remove(self, kind: Literal["serves", "owns"], name: str) -> None:
+        """Take back one `add`."""
+        with contextlib.suppress(ValueError):
+            self._names[kind].remove(name)
+
+    def told(self, seconds: float, most: int) -> dict[str, list[str]]:
+        """Return what the program serves and owns, and the top-level keys that it published in the last seconds."""
+        channels = [channel for publisher in self.publishers for channel in publisher.recent(seconds)]
+        names = {
+            "publishes": [channel[1 : channel.index("}")].removeprefix(self._namespace) for channel in channels],
+            **self._names,
+        }
+        return {kind: sorted({*found[:most]}) for kind, found in names.items()}
+
 
 class Session(PublisherIdentity):
     """A server as one interface sees it; the arguments are those of the interface."""
@@ -155,6 +198,8 @@ class Session(PublisherIdentity):
         self.transport.states.startup = StartupWait(min(float(wait), LONGEST))
         self.local = local
         self.interface: Any = None  # the interface this belongs to: pickled in its place
+        self.activities = Activities(namespace)
+        self.activities.publishers.add(self)
         # The subscription manager, made by the first subscriber; see `pubsub.manager.manager_of`.
         self.subscriptions: Any = None
         # The background tasks of publishers, or the blocking front's `Threads`; ended by `close`.
@@ -165,6 +210,12 @@ class Session(PublisherIdentity):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return attrgetter("session"), (self.interface,)
+
+    def share_with(self, other: Session) -> None:
+        """Have both be one interface for its user: one state, and one list of what the program does."""
+        self.transport.states = other.transport.states
+        other.activities.publishers.add(self)
+        self.activities = other.activities
 
     def keys(self, name: object) -> Keys:
         """Return the server-side names of the top-level key `name`; raises BadKey."""

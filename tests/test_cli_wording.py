@@ -23,6 +23,8 @@ TYPED = re.compile(r"--\w|[?&]\w+=|://|PYTHONWARNINGS")
 """What can be typed: an option, one in a URL, a URL, a variable."""
 
 OF_PROGRAMS = {
+    "pubsub/callbacks.py": ["such as ttl=0.2"],  # no command has a callback
+    "pubsub/mirror.py": ["use one of the two"],  # no command has a mirror
     "ships/registry.py": ["read it in a program that has this ship"],
     "plan/documents.py": ["value.to_dict(as_series=False)"],  # of a data frame, which no command can hold
     "transport/options.py": [

@@ -120,6 +120,7 @@ ORDER = [
     {"local"},
     {"transport"},
     {"session"},
+    {"coordination.presence"},
     {"connection"},
     {"pubsub"},
     {"store", "coordination"},
@@ -188,8 +189,9 @@ def test_no_scripts_of_the_page_import_each_other():
 
 def folder(module):
     parts = module.split(".")[1:]
-    # The first belongs to the plans, the second to the command line; the rest of the package uses all that is below it.
-    if parts in (["legacy", "olddata"], ["legacy", "command"]):
+    # The first belongs to the plans, the second to the command line, the third to the interface; the rest of their
+    # packages uses all that is below it.
+    if parts in (["legacy", "olddata"], ["legacy", "command"], ["coordination", "presence"]):
         return ".".join(parts)
     return ".".join(parts[:2] if parts[:1] == ["tools"] else parts[:1])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Coroutine
 from contextvars import copy_context
 from typing import Any
@@ -38,6 +39,15 @@ class Tasks:
         self._running.add(task)
         task.add_done_callback(self._running.discard)
         return task
+
+    @property
+    def place(self) -> object:
+        """The process and event loop that tasks run in."""
+        return os.getpid(), id(asyncio.get_running_loop())
+
+    async def pause(self, seconds: float) -> None:
+        """Wait in one of the tasks, until their owner is closed at the latest."""
+        await asyncio.sleep(seconds)
 
     async def end(self) -> None:
         """Cancel all tasks and wait until they have ended, but for the one that asks for it. Idempotent.

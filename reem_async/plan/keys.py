@@ -40,6 +40,7 @@ def keys_of(name: str, namespace: str = "", database: int = 0, sharded: bool = F
     return Keys(name, namespace + name, tag, f"{tag}:ships", channel, f"{tag}:last", publish)
 
 
+PRESENCE = ":node"  # follows the tag in the names of the keys of coordination/presence.py
 DOCUMENT = "ReJSON-RL"  # the reply of TYPE for a JSON document
 _PAGE = "1000"
 

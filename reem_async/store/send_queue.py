@@ -81,6 +81,7 @@ class SendQueue(Outage):
     def forget(self) -> None:
         super().forget()
         self._identity = PublisherIdentity(self._session.transport)
+        self._session.activities.publishers.add(self._identity)
         self._replaced: dict[str, int] = {}  # by document: updates that calls dropped; the sender counts in `_dropped`
         self._errors: collections.deque[tuple[str, Exception]] = collections.deque(maxlen=_MOST_ERRORS)
         self._reporting = 0  # the thread that calls `on_error`

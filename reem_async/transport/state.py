@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..concurrency.locks import Inherited, WeakList
-from ..concurrency.queues import BoundedQueue, Last
+from ..concurrency.queues import BoundedQueue, Last, noop
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed
 from .startup import StartupWait
@@ -77,6 +77,7 @@ class States:
     def __init__(self) -> None:
         self.startup = StartupWait(0.0)  # `RedisInterface(wait=)`
         self.first_opened: float | None = None  # when the first connection was made, on this machine's monotonic clock
+        self.on_opened: Callable[[], None] = noop  # called after each new connection
         self.unreadable = 0  # how many messages on followed channels could not be read
         self.last = StateChange("idle", "", time.time())
         self._lock = threading.RLock()
@@ -116,6 +117,7 @@ class States:
             if restarted or self.last.state not in ("connected", "closed"):
                 self._change("connected", f"the server at {address} was restarted" if restarted else "", restarted)
         self.tell()
+        self.on_opened()
 
     def lost(self, reason: Exception) -> bool:
         """Note that a connection broke, unless it was closed on purpose; return whether there is none now."""

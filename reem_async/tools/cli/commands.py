@@ -47,6 +47,7 @@ COMMANDS = (
     Entry("ls", "listing", "ls", LOOK, "List keys with type and size."),
     Entry("tree", "listing", "tree", LOOK, "Show what is below keys; arrays are not fetched."),
     Entry("get", "values", "get", LOOK, "Print a value, or write it to a file."),
+    Entry("nodes", "nodes", "nodes", LOOK, "List the programs that are connected under a name."),
     Entry("set", "values", "set_", CHANGE, "Store a value.", takes_minus=True),
     Entry("del", "values", "delete", CHANGE, "Delete a value."),
     Entry("pub", "values", "pub", CHANGE, "Publish a value, once or at a rate.", takes_minus=True),

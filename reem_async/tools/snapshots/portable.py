@@ -18,7 +18,7 @@ from ... import __version__
 from ...connection import RedisInterface
 from ...errors import BadData, BadKey, Conflict, MissingKey, NotAllowed, PartialWrite, RedisError, ReemError, WrongKind
 from ...plan import Command, Plan
-from ...plan.keys import DOCUMENT, Keys
+from ...plan.keys import DOCUMENT, PRESENCE, Keys
 from ...plan.notices import announce, published
 from ...plan.paths import Pattern, check_top_key, shorten
 from ...plan.sizes import STAGED
@@ -285,8 +285,8 @@ def _report(progress: ProgressFunction | None, doing: str, done: int, total: int
 
 # Of each top-level key: the registry, and the note of its last update.
 _OF_KEY = {b":ships", b":last"}
-# Large arrays that are on their way to a key are not foreign; they are renamed in a moment.
-_COMING = STAGED.encode()
+# What is not foreign, and gone in a moment: large arrays that are on their way to a key, and nodes.
+_PASSING = STAGED.encode(), PRESENCE.encode()
 _SEARCHES = 3
 """How often the servers are searched before a count that does not agree is reported."""
 # The keys beside a document carry its name in braces: {foo}:ships, {foo}.bar.image.
@@ -323,7 +323,7 @@ class Survey:
         """Return the keys that are not REEM's, each with its type. One round trip for each tag in question."""
         found, documents = list(self._foreign), set(self.names)
         for name, suffixes in sorted(self._tagged.items()):
-            suffixes = {suffix for suffix in suffixes if not suffix.startswith(_COMING)}
+            suffixes = {suffix for suffix in suffixes if not suffix.startswith(_PASSING)}
             # Registry and note alone need no look where the document was found.
             if suffixes and (name not in documents or suffixes - _OF_KEY):
                 found += await session.run(strangers(session.keys(name), sorted(suffixes)))
