@@ -116,6 +116,13 @@ def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, k
     eventually(lambda: not list(raw.scan_iter(match=f"*{key.prefix}:_nodes*")))
 
 
+def test_a_service_is_listed_with_its_program(named, key):
+    one = named("blocking", "planner")
+    with one.kvs["policy"]["act"].serve(lambda: 1):
+        eventually(lambda: [node.serves for node in one.interface.nodes()] == [("policy.act",)])
+    eventually(lambda: [node.serves for node in one.interface.nodes()] == [()])
+
+
 @pytest.mark.parametrize("front", FRONTS)
 @pytest.mark.parametrize("fault", ["killed", "stopped", "cut"])
 def test_who_leaves_without_a_word_is_gone_within_a_second(server, front, fault):

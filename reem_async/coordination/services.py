@@ -203,6 +203,7 @@ class Served(Listener):
         except NotAllowed as error:
             raise explained(error) from None
         kept[self.id] = self
+        self._session.activities.add("serves", self.where)
 
     async def close(self) -> None:
         """Stop serving. Requests that wait go to other servers, and those being handled are given up."""
@@ -210,6 +211,7 @@ class Served(Listener):
             return
         self.closed.set()
         self._manager.kept.pop(self.id, None)
+        self._session.activities.remove("serves", self.where)
         try:
             await self._manager.unfollow_here(self)
             waiting = {*self._waiting}
