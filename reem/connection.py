@@ -15,6 +15,7 @@ from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
 
 import reem_async
 from reem_async.concurrency.queues import Ended
+from reem_async.concurrency.streams import next_on_thread
 from reem_async.connection import rebuilt
 from reem_async.coordination.presence import NodeInfo
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
@@ -176,6 +177,10 @@ class StateIterator:
 
     def __init__(self, changes: StateChanges) -> None:
         self._core = changes
+
+    def next(self, timeout: float | None = None) -> StateChange:
+        """Return the next change: as the loop does, but with a time limit in seconds; see `next` of a watch."""
+        return next_on_thread(self._core.queue, timeout)  # type: ignore[no-any-return]
 
     def __iter__(self) -> Self:
         return self

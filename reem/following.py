@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import Any, Self
 
 from reem_async.concurrency.queues import EMPTY, Ended
-from reem_async.concurrency.streams import closed, timed_out
-from reem_async.concurrency.timeouts import waiting_limit
+from reem_async.concurrency.streams import next_on_thread
 from reem_async.coordination.presence import NodeWatch as NodeWatchCore
 from reem_async.errors import InterfaceClosed
 from reem_async.pubsub import subscribers as core
@@ -68,18 +67,9 @@ class Watch(Following):
 
     def next(self, timeout: float | None = None) -> Any:
         """Return the next update: as the loop does, but with a time limit."""
-        limit = waiting_limit(timeout)
-        try:
-            if limit is None:
-                return next(self)
-            if not self._core._following:
-                self.listen()
-            update = self._core.queue.take_within(limit)
-        except (StopIteration, Ended):
-            raise closed() from None
-        if update is EMPTY:
-            raise timed_out(limit)
-        return update
+        if not self._core._following:
+            self.listen()
+        return next_on_thread(self._core.queue, timeout)
 
     def __iter__(self) -> Self:
         return self

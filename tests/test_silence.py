@@ -2,7 +2,10 @@
 
 import asyncio
 import contextlib
+import gc
 import math
+import operator
+import pickle
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -223,6 +226,10 @@ def test_next_waits_for_so_long(front, key, kvs, pspace):
     front.wait(watch.close())
     with pytest.raises(InterfaceClosed, match="this subscription is closed"):
         front.wait(watch.next(1))
+    changes = front.interface.states()
+    assert front.wait(changes.next(0)).state == "connected"
+    with pytest.raises(TimeoutError):
+        front.wait(changes.next(0))
     mirror = front.at((key(),)).mirror()
     front.wait(mirror.listen())
     with pytest.raises(TimeoutError, match=r"within 0\.1 s"):
@@ -361,6 +368,14 @@ def test_a_callback_learns_that_what_it_gets_was_found_or_sent_late(front, serve
         reader.until(lambda: len(it.calls) == 4 and len(live.calls) == 2)
         assert [(update.origin, update.data, update.late) for update, _ in live.calls][1:] == [("published", 4, 0)]
         assert live.calls[1][0].gap
+
+
+def test_a_subscriber_with_a_ttl_can_be_pickled(front, key):
+    package = reem_async if hasattr(front, "runner") else reem
+    subscriber = package.CallbackSubscriber(key(), front.interface, operator.eq, ttl=0.5, on_silent=gc.collect)
+    copied = pickle.loads(pickle.dumps(subscriber))
+    core = getattr(copied, "_calls", None) or copied
+    assert (core.ttl, core.on_silent, core.callback_function) == (0.5, gc.collect, operator.eq)
 
 
 CALLBACKS = {

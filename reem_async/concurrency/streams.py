@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Generic, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 from ..errors import BadType, InterfaceClosed
 from .queues import EMPTY, BoundedQueue, Ended, Policy, noop
@@ -81,9 +81,9 @@ class Stream(Following, Generic[Item]):
             async with asyncio.timeout(limit):
                 return await anext(self)
         except StopAsyncIteration:
-            raise closed() from None
+            raise _closed() from None
         except TimeoutError:
-            raise timed_out(limit) from None
+            raise _timed_out(limit) from None
 
     def __aiter__(self) -> Self:
         return self
@@ -118,13 +118,23 @@ class Stream(Following, Generic[Item]):
                 return
 
 
-def closed() -> InterfaceClosed:
-    """Return the error for a stream that has ended."""
+def next_on_thread(queue: BoundedQueue, timeout: float | None) -> Any:
+    """Return the next update of a queue, for which this thread waits; see `Stream.next`."""
+    limit = waiting_limit(timeout)
+    try:
+        item = queue.take_waiting() if limit is None else queue.take_within(limit)
+    except Ended:
+        raise _closed() from None
+    if item is EMPTY:
+        raise _timed_out(limit)
+    return item
+
+
+def _closed() -> InterfaceClosed:
     return InterfaceClosed("this subscription is closed; make a new one")
 
 
-def timed_out(seconds: float | None) -> TimeoutError:
-    """Return the error for a time limit that is over."""
+def _timed_out(seconds: float | None) -> TimeoutError:
     return TimeoutError(f"no update has arrived within {seconds:g} s")
 
 

@@ -308,7 +308,8 @@ class CallbackSubscriber(SilentSubscriber):
         policy: What to keep when calls are slower than updates.
         stored: Call for plain writes too, by any client.
         ttl: Seconds without a published update after which there is silence. The callback is only called for published
-            updates that are not older than that when the call begins. See `Accessor.watch`.
+            updates that are not older than that when the call begins; `value()` is the last known one all the same. See
+            `Accessor.watch`.
         on_silent: Called with `kwargs` once when silence begins, as `callback_function` and in turn with it.
     """
 

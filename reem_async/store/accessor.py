@@ -412,8 +412,9 @@ class Accessor(Handle):
                 print(update.path, update.value, update.data)
 
         An update holds `path` (what changed, such as "arm.joint"), `value` (what was written there), `data` (all that
-        is here now), `time`, `origin` ("published", "stored" or "found"), `deleted`, `initial` (the value that was here
-        already), and `gap` and `missed` (updates before it were lost).
+        is here now), `time`, `origin` ("published", "stored" or "found"), `late` (by how many seconds an outage delayed
+        it at its publisher), `deleted`, `initial` (the value that was here already), and `gap` and `missed` (updates
+        before it were lost).
 
         Published updates arrive one by one. Plain writes (by a KeyValueStore, another language, redis-cli, an expiry,
         ...) arrive as the state they led to: several in a short time may be one update, and the last state always
