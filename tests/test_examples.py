@@ -108,7 +108,9 @@ def test_the_demo_fails_if_a_program_does(url, tmp_path):
     assert not (tmp_path / "x.png").exists()
 
 
-@pytest.mark.parametrize("module", ["image_system", "image_system.camera", "custom_ship", "robot_node"])
+@pytest.mark.parametrize(
+    "module", ["image_system", "image_system.camera", "custom_ship", "robot_node", "policy_server"]
+)
 @FRONTS
 def test_an_example_without_its_server_says_so(module, front):
     error = run(module, "--front", front, "--url", "redis://127.0.0.1:1", code=1)
@@ -151,6 +153,13 @@ def test_a_scan_can_be_read_with_either_ship(url, monkeypatch):
         with reem.RedisInterface(url, ships=[CompressedScanShip(), ScanShip()]) as interface:
             scan = reem.KeyValueStore(interface)["room"]["scan"].read()
         assert (scan.points == take_scan().points).all()
+
+
+@FRONTS
+def test_the_robot_asks_the_policy_server(front, url):
+    printed = run("policy_server", "--front", front, "--seconds", 1, "--url", url)
+    assert int(re.search(r"executed (\d+) chunks", printed)[1]) >= 3
+    assert "holding still" not in printed
 
 
 STOPPED = r"stopped after (\d+) heartbeats, (\d+) readings, (\d+) set points followed"

@@ -30,7 +30,7 @@ from ..errors import (
 )
 from ..plan import Command, Plan, Reply, blamed
 from ..plan.keys import Keys
-from ..plan.paths import Path, show
+from ..plan.paths import Path, escaped, show
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import SubscriptionManager, manager_of
 from ..session import Session
@@ -52,11 +52,45 @@ def new_id() -> str:
 async def call(session: Session, keys: Keys, path: Path, arguments: dict[str, Any], seconds: float | None) -> Any:
     """Do as `Accessor.call`."""
     limit = time_limit(DEFAULT_TIMEOUT) if seconds is None else check_timeout(seconds)
+    return await caller_of(session, keys).call(path, arguments, limit)
+
+
+def caller_of(session: Session, keys: Keys) -> Caller:
+    """Return what calls the services under a top-level key in the running event loop; made when first asked for."""
     manager = manager_of(session)
     caller = manager.kept.get((Caller, keys.channel))
-    if caller is None:
+    if not isinstance(caller, Caller):
         caller = manager.kept[Caller, keys.channel] = Caller(session, keys, manager)
-    return await caller.call(path, arguments, limit)
+    return caller
+
+
+async def statistics(session: Session) -> list[dict[str, Any]]:
+    """Return a dict for each server of each service in the namespace, sorted; waits up to a second for what they say.
+
+    It has "service" (the path as text), "host", "pid", "calls" since it began, "rate" (calls per second), "median" of
+    the last 200 in seconds, "errors", and "waiting"; None in the place of what a server did not say.
+
+    Raises:
+        NotAllowed: The user lacks a right; says which.
+    """
+    command: Command = ("PUBSUB", "CHANNELS", f"{{{escaped(session.namespace)}*:serve@{'?' * ID}")
+    if session.transport.sharded:
+        command = ("PUBSUB", "SHARDCHANNELS", command[2])
+    found: dict[str, Names] = {}
+    for node in await session.transport.nodes():
+        (reply,) = await node.roundtrip([command])
+        if isinstance(reply, Exception):
+            raise explained(blamed(reply, command))
+        for channel in [name.decode(errors="replace") for name in reply]:
+            if (names := Names.of(channel, session.keys, session.namespace)) is not None:
+                found[channel] = names
+    asked = [caller_of(session, names.keys).ask(channel) for channel, names in found.items()]
+    stated = await asyncio.gather(*asked)
+    rows = [
+        {"service": show((names.keys.name, *names.path)), **said}
+        for names, said in zip(found.values(), stated, strict=True)
+    ]
+    return sorted(rows, key=lambda row: (row["service"], str(row["host"]), row["pid"] or 0))
 
 
 async def publish(session: Session, keys: Keys, channel: str, payload: bytes, store: Iterable[Command] = ()) -> int:
@@ -173,6 +207,7 @@ class Caller(Listener):
         self._following = asyncio.Lock()
         self._follows = False  # the channel of answers is subscribed
         self._pinging: asyncio.Task[None] | None = None
+        self._asked: dict[str, asyncio.Future[Message]] = {}  # questions to servers how they are doing
 
     # What the subscription manager calls.
 
@@ -197,6 +232,10 @@ class Caller(Listener):
             for directory in self._directories.values():
                 if (instance := directory.instances.get(message.sender)) is not None:
                     instance.answered(message.number, now)
+            return
+        if message.kind == messages.STATED:
+            if (asked := self._asked.get(message.call)) is not None and not asked.done():
+                asked.set_result(message)
             return
         call = self._pending.get(message.call)
         # An answer may come after its caller has left. One by another server than the one asked is no answer.
@@ -384,6 +423,28 @@ class Caller(Listener):
                 await self._look(directory)
         finally:
             directory.looking = None
+
+    async def ask(self, channel: str) -> dict[str, Any]:
+        """Return what a server says of itself; None for each if it says nothing within a second."""
+        if not self._follows:
+            await self._follow()
+        number = new_id()
+        answer = self._asked[number] = asyncio.get_running_loop().create_future()
+        said = dict.fromkeys(("host", "pid", "calls", "rate", "median", "errors", "waiting"))
+        try:
+            await publish(self._session, self._keys, channel, messages.bare(Message(messages.ASKED, number, self.id)))
+            async with asyncio.timeout(_LOOKS):
+                message = await answer
+            host, process, calls, errors, median, age = message.words
+            rate = int(calls) / max(float(age), 1.0)
+            return said | {
+                "host": host, "pid": int(process), "calls": int(calls), "rate": rate,
+                "median": float(median) if median else None, "errors": int(errors), "waiting": int(message.number),
+            }  # fmt: skip
+        except (TimeoutError, ValueError):  # it hangs, or is no server of REEM
+            return said
+        finally:
+            del self._asked[number]
 
     # Whether they are still there.
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import orjson
 
 from ..concurrency.timeouts import LONGEST
-from ..errors import BadData, RemoteError
+from ..errors import BadData, BadKey, RemoteError
 from ..local.path import LocalPath
 from ..plan import Command, Plan, Reply, blamed
 from ..plan.changes import EncodedAttachment
 from ..plan.keys import Keys
 from ..plan.notices import Slot, View, assembled, named, sizes_of_parts, starts
-from ..plan.paths import Path, escaped, suffix
+from ..plan.paths import Path, escaped, parse_suffix, suffix
 from ..plan.reads import with_bytes
 from ..ships.registry import Ships
 
@@ -39,6 +39,7 @@ CALL: Final = "call"  # of a caller: handle this within so many seconds
 CANCEL: Final = "cancel"  # the caller has left
 PING: Final = "ping"
 RECEIVED: Final = "received"  # the answer was taken out of shared memory
+ASKED: Final = "asked"  # of a caller: how is the server doing
 UNREAD: Final = "unread"  # of either side: what was sent in shared memory cannot be read there, send it by the server
 ANSWER: Final = "answer"  # of a server: the value
 FAILED: Final = "failed"  # the function raised
@@ -46,10 +47,11 @@ BUSY: Final = "busy"  # too many requests wait; this one was not begun
 CLOSED: Final = "closed"  # it stops serving; this request was not begun
 DROPPED: Final = "dropped"  # it stops serving; this request was begun
 PONG: Final = "pong"
+STATED: Final = "stated"  # host, process, calls, errors, median seconds of a call, seconds since it began
 
-_KINDS = {CALL, CANCEL, PING, RECEIVED, UNREAD, ANSWER, FAILED, BUSY, CLOSED, DROPPED, PONG}
+_KINDS = {CALL, CANCEL, PING, RECEIVED, ASKED, UNREAD, ANSWER, FAILED, BUSY, CLOSED, DROPPED, PONG, STATED}
 _WITH_VALUE = {CALL, ANSWER}
-_WORDS = {CALL: 1, ANSWER: 1, FAILED: 3}  # how many texts a message has
+_WORDS = {CALL: 1, ANSWER: 1, FAILED: 3, STATED: 6}  # how many texts a message has
 _HERE, _STORED = "here", "stored"
 
 Encoded = tuple[bytes, Sequence[EncodedAttachment]]  # a value: the text of the document, and the attachments
@@ -114,6 +116,21 @@ class Names(NamedTuple):
     def _tag(self) -> str:
         database = self.keys.channel.rpartition("}:notices")[2]  # channels are shared by all databases of a server
         return f"{self.keys.tag}{suffix(self.path)}{database}"
+
+    @staticmethod
+    def of(channel: str, session_keys: Callable[[str], Keys], namespace: str) -> Names | None:
+        """Return the names of the service whose channel of requests this is; None if it is none, or elsewhere."""
+        body, _, server = channel.rpartition(":serve@")
+        name, _, rest = body.removeprefix("{" + namespace).partition("}")
+        if not is_id(server) or not body.startswith("{" + namespace):
+            return None
+        try:
+            keys = session_keys(name)
+            database = keys.channel.rpartition("}:notices")[2]
+            found = Names(keys, parse_suffix(rest.removesuffix(database)))
+        except BadKey:
+            return None
+        return found if found.channel(server) == channel else None
 
     def request(self, call: str) -> str:
         """Return the beginning of the keys that hold a large request."""

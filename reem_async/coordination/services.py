@@ -12,7 +12,10 @@ import contextlib
 import functools
 import inspect
 import logging
+import os
 import queue
+import socket
+import statistics
 import threading
 import time
 import traceback
@@ -191,6 +194,7 @@ class Served(Listener):
         self._left: collections.OrderedDict[str, str] = collections.OrderedDict()  # calls and their callers
         self._shared: dict[str, _Shared] = {}  # answers in shared memory that callers have not taken, by call
         self.closed = asyncio.Event()
+        self._began = time.monotonic()
         self.calls = self.errors = 0  # how many were answered, and with an exception
         self.times: collections.deque[float] = collections.deque(maxlen=_RECENT)  # seconds that calls took
 
@@ -253,6 +257,8 @@ class Served(Listener):
                     self._drop_left()
             case messages.PING:
                 self._send_soon(message, self._bare(messages.PONG, message))
+            case messages.ASKED:
+                self._send_soon(message, self._stated(message))
             case messages.RECEIVED | messages.UNREAD:
                 sent = self._shared.get(message.call)
                 if sent is not None and sent.request.message.sender == message.sender:
@@ -288,6 +294,12 @@ class Served(Listener):
 
     def _bare(self, kind: str, message: Message) -> bytes:
         return messages.bare(Message(kind, message.call, self.id, self._busy))
+
+    def _stated(self, message: Message) -> bytes:
+        median = f"{statistics.median(self.times):.6f}" if self.times else ""
+        age = f"{time.monotonic() - self._began:.1f}"
+        words = [socket.gethostname(), str(os.getpid()), str(self.calls), str(self.errors), median, age]
+        return messages.bare(Message(messages.STATED, message.call, self.id, self._busy, words))
 
     @property
     def _busy(self) -> int:

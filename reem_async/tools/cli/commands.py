@@ -52,6 +52,8 @@ COMMANDS = (
     Entry("del", "values", "delete", CHANGE, "Delete a value."),
     Entry("pub", "values", "pub", CHANGE, "Publish a value, once or at a rate.", takes_minus=True),
     Entry("param", "param", "app", CHANGE, "List, set, save and load parameters, within their bounds."),
+    Entry("services", "services", "services", LOOK, "List the services, with what each of their servers says."),
+    Entry("call", "services", "call", CHANGE, "Call a service, and print its answer."),
     Entry("echo", "echo", "echo", LIVE, "Print changes as they are published or stored."),
     Entry("top", "top", "top", LIVE, "Show what is published: a live table of keys."),
     Entry("hz", "top", "hz", LIVE, "Measure how often paths are published or stored."),
