@@ -322,3 +322,17 @@ def test_what_is_not_sent_is_told_with_a_gap_though_it_was_read_in_between(world
         pass
     assert world.events[0].notice.publisher == refused.notice.publisher
     assert world.gaps_after(0)
+
+
+def test_of_many_that_are_not_confirmed_the_first_hundred_are_reported_early_and_all_once(world):
+    for stamp in range(150):
+        world.pending.setdefault("p", collections.deque()).append(early(world, "p", ("a",), stamp))
+    assert len(world.events) == 100
+    while world.pending:
+        world.end("p")
+    while world.step():
+        pass
+    told = [event.notice.sequence for event in world.events if isinstance(event, Updated)]
+    assert told == list(range(told[0], told[0] + 150))
+    assert not world.gaps_after(-1)
+    assert world.replica.at() == world.model.tree

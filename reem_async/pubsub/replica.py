@@ -76,6 +76,9 @@ __all__ = [
 
 
 _NONE = object()
+_UNCONFIRMED = (
+    100  # early updates of one publisher that a copy has at most: what follows is reported when it is confirmed
+)
 _PATIENT = 3  # notes, one a second, after which what was told early should have been confirmed: at least two seconds
 
 
@@ -420,7 +423,7 @@ class EarlyUpdates:
         """Return whether an update may be reported: it is known again, and depends on no other publisher's."""
         if self.look_waits or (self._told and not self._in_copy):
             return False
-        return not self._touches(notice)
+        return len(self._told.get(notice.publisher, ())) < _UNCONFIRMED and not self._touches(notice)
 
     def last(self, publisher: str) -> int | None:
         """Return the number of the last one of a publisher."""
@@ -432,7 +435,8 @@ class EarlyUpdates:
         if not self._told:
             self._base, self._in_copy = before, True
         self._notes.setdefault(notice.publisher, 0)
-        self._told.setdefault(notice.publisher, collections.deque()).append((notice, moment))
+        without_value = notice._replace(value=ANNOUNCED)  # a large one is not to be kept until it is confirmed
+        self._told.setdefault(notice.publisher, collections.deque()).append((without_value, moment))
         self.since = min(self.since, moment)
 
     def settle(self, notice: Notice, missing: int) -> Outcome:
