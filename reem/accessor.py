@@ -300,6 +300,10 @@ class Accessor(Handle):
             return partial(self.serve, concurrency=concurrency, queue=queue)
         return Service(self._interface, self._follower()._service(function, concurrency, queue))
 
+    def own(self, *, ttl: float = 0.2, name: str | None = None, take: bool = False) -> OwnedAccessor:
+        """Return this top-level key for its one owner: `with kvs["cmd"].own(name="joystick") as cmd:`."""
+        return OwnedAccessor(self._interface, self._core.own(ttl=ttl, name=name, take=take))
+
     def __enter__(self) -> Any:
         edit = self.edit()
         value = edit.__enter__()
@@ -318,6 +322,49 @@ class Accessor(Handle):
         # The facade and the core's part of it, which says whether it publishes.
         kinds = type(self), type(self._core), self._core._writer.maker()
         return _rebuilt, (kinds, self._interface, self._core.full_path)
+
+
+@documented_by(core.OwnedAccessor)
+class OwnedAccessor(Accessor):
+    """A top-level key that this program owns: what `Accessor.own` returns."""
+
+    __slots__ = ()
+    _core: core.OwnedAccessor
+
+    def __getitem__(self, key: str | int) -> Accessor:  # type: ignore[override]  # only the whole key is owned
+        return Accessor(self._interface, self._core[key])
+
+    @property
+    def lost(self) -> bool:
+        """Whether the next write raises LeaseLost, as far as is known without asking the server."""
+        return self._core.lost
+
+    @property
+    def fence(self) -> int:
+        """The fencing number of this acquisition, which its updates carry: higher than that of any owner before."""
+        return self._core.fence
+
+    def acquire(self) -> None:
+        """Become the owner, as entering the block does; three round trips."""
+        self._interface._run(self._core.acquire())
+
+    def renew(self) -> None:
+        """Renew the lease without a write."""
+        self._interface._run(self._core.renew())
+
+    def release(self) -> None:
+        """Stop to be the owner: others need not wait until the lease expires."""
+        self._interface._run(self._core.release())
+
+    def __enter__(self) -> Self:
+        self.acquire()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self._core.__reduce__()
 
 
 class PublishAccessor(Accessor):

@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
     "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
-    "InterfaceClosed", "KeyValueStore", "Last", "LoginRefused", "MissingDocument", "MissingKey", "MissingTop",
-    "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed", "NotConnected",
-    "NotFinite", "NumpyShip", "Origin", "Overflow", "Parameter", "PartialWrite", "PathRefused", "PublishSpace",
-    "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError", "Refused", "RemoteError",
-    "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly", "ServiceError", "ServiceLost",
-    "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange", "TlsRefused", "TooDeep", "Unreadable",
-    "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
+    "InterfaceClosed", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument", "MissingKey",
+    "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
+    "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
+    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
+    "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
+    "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange",
+    "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
     "timeout",
 ]  # fmt: skip
 

@@ -20,6 +20,8 @@
     +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
     +-- Conflict                 another client changed what was edited, or kept writing to the key; nothing written
     |   +-- Contended            other clients kept writing to the key for the whole timeout
+    +-- Owned                    another program owns the top-level key
+    +-- LeaseLost                this program does not own the top-level key any more; nothing written
     +-- Stale                    a mirror's copy is older than it may be, or its connection is down
     |   +-- Silent               no update has arrived for as long as the mirror's `ttl` allows
     +-- QueueFull                a subscriber with the policy Every fell too far behind
@@ -76,6 +78,7 @@ __all__ = [
     "Contended",
     "InsecureConnection",
     "InterfaceClosed",
+    "LeaseLost",
     "LoginRefused",
     "MissingDocument",
     "MissingKey",
@@ -87,6 +90,7 @@ __all__ = [
     "NotConnected",
     "NotFinite",
     "Overflow",
+    "Owned",
     "PartialWrite",
     "PathRefused",
     "QueueFull",
@@ -208,6 +212,25 @@ class Conflict(ReemError):
 
 class Contended(Conflict):
     """Other clients kept writing to the same top-level key: an immediate retry will probably fail again."""
+
+
+class Owned(ReemError):
+    """Another program owns the top-level key, so this one cannot own it.
+
+    Attributes:
+        name: What the owner calls itself; empty if the lease was not written by REEM.
+        host: The owner's host.
+        process: Its process id there.
+        since: Seconds since it acquired the key, by the server's clock; None if this is not known.
+    """
+
+    def __init__(self, message: str, name: str = "", host: str = "", process: int = 0, since: float | None = None):
+        super().__init__(message)
+        self.name, self.host, self.process, self.since = name, host, process, since
+
+
+class LeaseLost(ReemError):
+    """This program does not own the top-level key any more; nothing was written. Acquire it again to go on."""
 
 
 class QueueFull(ReemError):

@@ -1,1 +1,1 @@
-"""What programs of a robot agree on: parameters, services that are asked and answer, and which programs there are."""
+"""What programs of a robot agree on: parameters, services, ownership, and which programs there are."""

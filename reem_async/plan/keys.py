@@ -27,6 +27,16 @@ class Keys(NamedTuple):
     publish: str = "PUBLISH"
 
     @property
+    def lease(self) -> str:
+        """The lease of the owner, as long as there is one."""
+        return f"{self.tag}:lease"
+
+    @property
+    def fence(self) -> str:
+        """The counter of acquisitions."""
+        return f"{self.tag}:fence"
+
+    @property
     def sharded(self) -> bool:
         return self.publish == "SPUBLISH"
 

@@ -179,9 +179,14 @@ def _header(
     extras: Extras,
 ) -> bytes:
     fields: list[Any] = [VERSION, publisher, sequence, time, path, kind, size, parts]
-    if extras is not NO_EXTRAS and (said := {name: value for name, value in extras._asdict().items() if value}):
+    if extras is not NO_EXTRAS and (said := _said(extras)):
         fields.append(said)  # only then: earlier versions of REEM refuse a ninth field
     return orjson.dumps(fields) + b"\n"
+
+
+@lru_cache(maxsize=16)
+def _said(extras: Extras) -> dict[str, float]:
+    return {name: value for name, value in extras._asdict().items() if value}
 
 
 def decode(payload: bytes, ships: Ships, view: View | None = None) -> Notice:

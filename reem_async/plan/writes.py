@@ -28,9 +28,11 @@ from .sizes import Staged, are_missing, looks_at, stage
 _NO_MEMBERS: frozenset[bytes] = frozenset()
 _STORED: list[Reply] = [b"OK", []]
 _ANNOUNCED: list[Reply] = [b"OK", [], b"OK"]
-"""The usual replies to a write without arrays: nothing is left to do.
+_USUAL: dict[int, list[Reply]] = {0: _STORED, 2: _ANNOUNCED, 3: [*_ANNOUNCED, b"OK"]}
+"""The usual replies to a write without arrays, by the commands of its announcement: nothing is left to do.
 
-If subscribers are notified, the replies to the note and to the notice follow; the number of subscribers is left out."""
+If subscribers are notified, the replies to the note and to the notice follow; the number of subscribers is left out. An
+owner renews its lease before them."""
 
 
 def set_change(
@@ -142,7 +144,7 @@ def _change(
     notices = it.announcement.commands(it.path)
     commands += (it.command, *after, *notices)
     # Most writes are small and without arrays: one comparison recognises their replies.
-    usual = None if main else _ANNOUNCED if notices else _STORED
+    usual = None if main else _USUAL.get(len(notices))
 
     def decode(replies: Sequence[Reply] | None) -> Any:
         if replies is None:  # a watched key has changed

@@ -19,6 +19,7 @@ from ..errors import BadData, ClusterNode, NotAllowed, Stale, is_of_command
 from ..plan import Reply, wire_commands
 from ..plan.arguments import check_number
 from ..plan.keys import Keys
+from ..plan.leases import FenceFilter
 from ..plan.notices import Notice
 from ..plan.paths import Path, show
 from ..plan.placeholders import PlaceholderSlot
@@ -56,7 +57,7 @@ class Follower(Listener):
         stored: bool = False,
         largest: float = math.inf,
         heartbeat: float = math.inf,
-        timed: bool = False,
+        ttl: float | None = None,
     ) -> None:
         super().__init__(Topic(keys.channel.encode()))
         self.keys = keys
@@ -64,8 +65,10 @@ class Follower(Listener):
         self.stored = stored
         self.local = largest == math.inf  # else it wants no large values
         self.heartbeat = heartbeat
-        self._timed = timed  # it notes when updates arrive
-        # If timed: since when the newest update of the copy counts, on the monotonic clock; -inf if the copy was found
+        # With a ttl it notes when updates arrive, except those that are ignored while there is an owner
+        self._owners = None if ttl is None else FenceFilter(ttl)
+        # With a ttl: since when the newest update of the copy counts, on the monotonic clock; -inf if the copy was
+        # found, or is not of the owner
         self.live_since = -math.inf
         self._manager = manager
         self._transport, self._tasks = manager.transport, manager.tasks
@@ -119,16 +122,18 @@ class Follower(Listener):
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         self._looks.heard += 1
-        if self._timed:
-            notice = notice._replace(arrived=time.monotonic())
-        self._replica.on_notice(notice)
+        self._replica.on_notice(self._judged(notice, time.monotonic()))
         if self._replica.outputs:
             self._perform()
+
+    def _judged(self, notice: Notice, now: float) -> Notice:
+        counts = self._owners is not None and self._owners.admits(notice.lease, now)
+        return notice._replace(arrived=now) if counts else notice
 
     @contained
     def on_early(self, notice: Notice) -> None:
         now = time.monotonic()
-        self._replica.on_early(notice._replace(arrived=now) if self._timed else notice, now)
+        self._replica.on_early(self._judged(notice, now), now)
         self._perform()
 
     @contained
@@ -359,9 +364,8 @@ class Follower(Listener):
             queue.put(Update(path, data, value, False, *stamp, *how, late, False, arrived))
 
     def _heard(self, notice: Notice) -> tuple[float, float | None]:
-        """Note since when an update counts; return how late it was, and when it arrived if that is noted."""
-        if notice.arrived is not None:
-            self.live_since = notice.arrived - notice.late
+        """Note since when an update counts; return how late it was, and when it arrived, if it counts with a `ttl`."""
+        self.live_since = -math.inf if notice.arrived is None else notice.arrived - notice.late
         return notice.late, notice.arrived
 
     def _tell_state(self, inner: Path, tree: Any, value: Any, origin: Origin, **how: Any) -> None:

@@ -122,7 +122,7 @@ class Mirror(Following):
             stored=True,
             largest=checked_largest(largest),
             heartbeat=math.inf if max_age is None else max_age / _PROBES,
-            timed=ttl is not None,
+            ttl=ttl,
         )
         self._link = Link(session, make, [])
         self._link.on_state = _waking(self)

@@ -2,7 +2,8 @@
 
 All clocks are this program's `time.monotonic`. A clock starts when the notice of an update arrives, so it needs neither
 the server nor the publisher, nor their clocks. Only published updates count, equal values too. What is found at the
-beginning or after a loss may be of any age, and plain writes have no publisher that could fall silent.
+beginning or after a loss may be of any age, and plain writes have no publisher that could fall silent. While the key
+has an owner, its updates alone count: see `plan.leases.FenceFilter`.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class LiveQueue(BoundedQueue):
                 "use Newest() or Last(n), or no ttl"
             )
         super().__init__(policy)
-        self._ttl = ttl
+        self.ttl = ttl
         self._silent = Update(show(path), None, None, origin=Origin.SILENCE, silent=True)
         self._live_since = -math.inf  # from when on the newest live update counts; or when the clock was started
         self._loop: asyncio.AbstractEventLoop | None = None  # where the clock runs
@@ -75,7 +76,7 @@ class LiveQueue(BoundedQueue):
         loop = asyncio.get_running_loop()
         if self._loop is not loop:
             self._live_since = max(self._live_since, time.monotonic())
-            self._wait(self._ttl)
+            self._wait(self.ttl)
 
     def put(self, update: Update) -> None:
         if update.arrived is not None and self._is_fresh(update):
@@ -97,7 +98,7 @@ class LiveQueue(BoundedQueue):
         return update
 
     def _is_fresh(self, update: Update) -> bool:
-        return time.monotonic() - _counts_from(update) <= self._ttl
+        return time.monotonic() - _counts_from(update) <= self.ttl
 
     def _owe(self, number: int, missed: int | None) -> None:
         """Have the next update that is taken report a loss; `number` is below those of all updates."""
@@ -106,7 +107,7 @@ class LiveQueue(BoundedQueue):
     def _heard(self, update: Update) -> None:
         self._live_since = _counts_from(update)
         if self._timer is None or self._loop is not asyncio.get_running_loop():
-            self._wait(self._ttl)
+            self._wait(self.ttl)
 
     def _wait(self, seconds: float, *, looked: bool = False) -> None:
         self._loop = asyncio.get_running_loop()
@@ -114,7 +115,7 @@ class LiveQueue(BoundedQueue):
         self._timer = self._loop.call_later(seconds, _check, weakref.ref(self), looked)
 
     def _check(self, looked: bool) -> None:
-        left = self._live_since + self._ttl - time.monotonic()
+        left = self._live_since + self.ttl - time.monotonic()
         if self._end is not None:
             self._timer = None
         elif left > 0:  # a timer of its own for each update would cost more

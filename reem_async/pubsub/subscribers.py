@@ -119,8 +119,8 @@ class Watch(Stream[Update]):
             full_path = keys.name, *path
             queue = LiveQueue(policy, checked_ttl(ttl, full_path), full_path)
         super().__init__(policy, queue)
-        timed = isinstance(queue, LiveQueue)
-        make = partial(Follower, keys, path, session.ships, session.cache, stored=stored, timed=timed)
+        ttl = queue.ttl if isinstance(queue, LiveQueue) else None
+        make = partial(Follower, keys, path, session.ships, session.cache, stored=stored, ttl=ttl)
         self._link = Link(session, make, [self.queue])
 
     @property

@@ -6,16 +6,17 @@ import builtins
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, overload
 
 import numpy as np
 
 from ..concurrency.queues import Newest, Policy, chosen
 from ..connection import RedisInterface
 from ..coordination.calls import call
+from ..coordination.lease import Lease, OwnedPublisher
 from ..coordination.parameters import Parameter, declared, prepared
 from ..coordination.services import QUEUE, Service
-from ..errors import BadType, Conflict, Contended, MissingDocument, MissingKey, WrongType
+from ..errors import BadKey, BadType, Conflict, Contended, MissingDocument, MissingKey, Misuse, WrongType
 from ..plan.arguments import Handle
 from ..plan.documents import number_text
 from ..plan.paths import Path, check_element, check_name, parse, show
@@ -591,6 +592,39 @@ class Accessor(Handle):
     def _service(self, function: Callable[..., Any], concurrency: int, queue: int) -> Service:
         return Service(self._reader.session, self._reader.keys, self._path, function, concurrency, queue)
 
+    def own(self, *, ttl: float = 0.2, name: str | None = None, take: bool = False) -> OwnedAccessor:
+        """Return this top-level key for its one owner: `async with kvs["cmd"].own(name="joystick") as cmd:`.
+
+        Inside, `cmd` is written like a place of a PublishSpace, and can be read. Each write notifies subscribers and
+        renews the lease, in one transaction and one round trip (two in a cluster). The lease expires `ttl` seconds
+        after the last write; `await cmd.renew()` renews it without one. Leaving the block releases it. Programs that
+        do not call `own` are not kept from writing: readers with a `ttl` ignore them while there is an owner.
+
+        Entering takes three round trips and makes a connection that the owner keeps. It raises:
+
+        - Owned: Another program owns the key. The error says which, and for how long.
+        - NotAllowed: The user lacks a right; the error names it.
+
+        A write raises LeaseLost, with nothing written, if the lease has expired or another owner has it; then
+        `cmd.lost` is true. To own the key again, call `await cmd.acquire()` or enter another `own`. If the connection
+        breaks, a write raises as in a PublishSpace; the next one reconnects, and is made if the lease is still there.
+
+        Args:
+            ttl: Seconds for which the lease lasts after each write, 0.001 to 3600. Write at least twice as often.
+            name: How errors of others name the owner, 1 to 64 characters; the name of the program if not given.
+            take: Take the key from another owner, whose next write raises LeaseLost.
+
+        Raises:
+            BadKey: It is not a top-level key.
+            BadType, BadValue: An argument that cannot be used.
+        """
+        if self._path:
+            raise BadKey(
+                f"{show(self.full_path)}: only a whole top-level key can be owned; use kvs[{self._reader.name!r}].own()"
+            )
+        session = self._reader.session
+        return OwnedAccessor.of(self._reader, Lease(session, self._reader.keys, ttl, name, take))
+
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)
 
@@ -598,6 +632,68 @@ class Accessor(Handle):
 def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> Any:
     """Make an accessor from the parts of a pickled one."""
     return kind(kind._reads(session, path[0]), writer(session, path[0]), path[1:])
+
+
+class OwnedAccessor(Accessor):
+    """A top-level key that this program owns: what `Accessor.own` returns. See there."""
+
+    __slots__ = ("_lease",)
+    _lease: Lease
+
+    @classmethod
+    def of(cls, reader: DocumentReader, lease: Lease) -> OwnedAccessor:
+        """Return the handle of a lease, which is not acquired yet."""
+        made = cls(reader, OwnedPublisher(lease, reader.session), ())
+        made._lease = lease
+        return made
+
+    def __getitem__(self, key: str | int) -> Accessor:
+        # Only the top-level key is owned, acquired and released.
+        return Accessor(self._reader, self._writer, (check_element(key, self.full_path),))
+
+    @property
+    def lost(self) -> bool:
+        """Whether the next write raises LeaseLost, as far as is known without asking the server."""
+        return self._lease.lost
+
+    @property
+    def fence(self) -> int:
+        """The fencing number of this acquisition, which its updates carry: higher than that of any owner before."""
+        return self._lease.number
+
+    async def acquire(self) -> None:
+        """Become the owner, as entering the block does; three round trips.
+
+        Raises:
+            Owned: Another program owns the key.
+            NotAllowed: The user lacks a right.
+        """
+        await self._lease.acquire()
+
+    async def renew(self) -> None:
+        """Renew the lease without a write. One round trip, two in a cluster.
+
+        Raises:
+            LeaseLost: It has expired, or another owner has it.
+        """
+        await self._lease.renew()
+
+    async def release(self) -> None:
+        """Stop to be the owner: others need not wait until the lease expires. One round trip, two in a cluster.
+
+        Nothing is done if this is not the owner, or if the server cannot be reached. Idempotent.
+        """
+        await self._lease.release()
+
+    async def __aenter__(self) -> Self:
+        await self.acquire()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.release()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        raise Misuse(f"{show(self.full_path)}: a lease cannot be copied or sent to another process; call own() there")
 
 
 class Edit:

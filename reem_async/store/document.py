@@ -126,6 +126,7 @@ class DocumentWriter:
         self.keys = session.keys(name)
         self.name = self.keys.name
         self.encoder = Encoder(session, self.keys)
+        self._run: Callable[[Plan], Awaitable[Any]] = session.run  # runs a plan and those that follow from it
         self._outages = outages
 
     def turn(self, identity: PublisherIdentity | None = None) -> Turn:
@@ -281,7 +282,7 @@ class DocumentWriter:
             it = self._setting(turn, path, text, attachments)
             if attachments or self.session.local.early:
                 await it.announcement.share(path)
-            await self.session.run(change(it, self.session.cache))
+            await self._run(change(it, self.session.cache))
         except MissingTop:
             # Only for `kvs["cam"]["image"] = array`, so that no {} must be written first.
             if not attachments or len(path) != 1 or attachments[0].suffix != suffix(path):
@@ -292,7 +293,7 @@ class DocumentWriter:
             return
         turn.release()  # the refusal was announced with numbers of its own; the value is not shared again
         it = self._setting(turn, path, text, (into_new(self.keys, attachments[0]),))
-        await self.session.run(change(it, self.session.cache))
+        await self._run(change(it, self.session.cache))
 
     async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
         shipped = next((each for each in assignments if each.attachments), None)
@@ -302,7 +303,7 @@ class DocumentWriter:
         if shipped is not None or self.session.local.early:
             for each in changes:
                 await each.announcement.share(each.path)
-        await self.session.run(together(changes, self.session.cache))
+        await self._run(together(changes, self.session.cache))
 
     async def _put_instead(
         self, turn: Turn, path: Path, text: bytes, attachments: Attachments, before: RawRead
@@ -312,7 +313,7 @@ class DocumentWriter:
         await self._if_still(before, set_change(self.keys, path, text, attachments, announcement=turn.reserve()))
 
     async def _expire(self, turn: Turn, milliseconds: int | None) -> None:
-        await self.session.run(expiry(self.keys, milliseconds))
+        await self._run(expiry(self.keys, milliseconds))
 
     async def _take(self, turn: Turn, path: Path, before: RawRead) -> None:
         await self._if_still(before, delete_change(self.keys, path, announcement=turn.reserve(deleted=True)))
@@ -320,26 +321,26 @@ class DocumentWriter:
     async def _if_still(self, before: RawRead, it: DocumentChange) -> None:
         # The transaction fails if anything has changed, so the arrays that were read are all there are.
         it = it._replace(gone=tuple(slot.placeholder.suffix.encode() for slot, _, _ in before.slots))
-        await self.session.run(exchange(it, before.commands, before.raw, self.session.cache))
+        await self._run(exchange(it, before.commands, before.raw, self.session.cache))
 
     async def _remove(self, turn: Turn, path: Path) -> None:
         it = delete_change(self.keys, path, announcement=turn.reserve(deleted=True))
-        await self.session.run(change(it, self.session.cache))
+        await self._run(change(it, self.session.cache))
 
     async def _append(self, turn: Turn, path: Path, texts: Sequence[bytes], attachments: Attachments) -> None:
         if attachments:  # they would be stored even if there is no list
-            await self.session.run(appendable(self.keys, path))
+            await self._run(appendable(self.keys, path))
         it = append_change(self.keys, path, texts, attachments, announcement=turn.reserve())
-        await self.session.run(change(it, self.session.cache))
+        await self._run(change(it, self.session.cache))
 
     async def _calculate(self, turn: Turn, plan: Callable[[Announcement], Plan]) -> Any:
-        return await self.session.run(plan(turn.reserve()))
+        return await self._run(plan(turn.reserve()))
 
     async def _check_place(self, path: Path, attachments: Attachments) -> None:
         """Raise PathRefused if nothing can be set at `path`: the attachments would be stored for nothing."""
         plan = takes(self.keys, path, attachments, self.session.cache)
         if plan is not None:
-            await self.session.run(plan)
+            await self._run(plan)
 
     def _setting(self, turn: Turn, path: Path, text: bytes, attachments: Attachments) -> DocumentChange:
         return set_change(self.keys, path, text, attachments, turn.reserve(text, attachments))

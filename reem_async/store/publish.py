@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Self
 
-from ..errors import ConnectionLost, Contended, NotConnected
+from ..errors import ConnectionLost, Contended, LeaseLost, NotConnected
 from ..local.path import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys
+from ..plan.leases import HeldLease
 from ..plan.notices import (
     LARGEST_INLINE,
     NO_EXTRAS,
@@ -42,12 +43,19 @@ class PublishTurn(Turn):
     other.
     """
 
-    __slots__ = ("_announcements", "_identity", "_keys", "_order", "_session", "announced", "called")
+    __slots__ = ("_announcements", "_identity", "_keys", "_lease", "_order", "_session", "announced", "called")
 
-    def __init__(self, session: Session, keys: Keys, identity: PublisherIdentity | None = None) -> None:
+    def __init__(
+        self,
+        session: Session,
+        keys: Keys,
+        identity: PublisherIdentity | None = None,
+        lease: Callable[[], HeldLease] | None = None,
+    ) -> None:
         self.called: CallTime | None = None
         self.announced: list[UpdateAnnouncement] = []
         self._identity = identity or session
+        self._lease = lease  # returns the owner's lease, which each change renews, or raises LeaseLost
         self._session = session
         self._keys = keys
         # Shared by the interface: other stores, and threads, may publish to the same key.
@@ -60,7 +68,7 @@ class PublishTurn(Turn):
 
     async def __aexit__(self, *error: Any) -> None:
         # An update that the server refused, or that found no server, keeps its number: subscribers report a gap.
-        if isinstance(error[1], Contended):
+        if isinstance(error[1], Contended | LeaseLost):
             self.not_applied(len(self._announcements))
         # Before the next call's turn begins, which continues with the next number.
         self.release()
@@ -71,10 +79,12 @@ class PublishTurn(Turn):
     ) -> UpdateAnnouncement:
         if self.announced:
             return self.announced.pop(0)
+        lease = None if self._lease is None else self._lease()
         if text is None:
             announcement = UpdateAnnouncement(self._session, self._keys, self._identity, self.called, deleted)
         else:
             announcement = ValueAnnouncement(self._session, self._keys, self._identity, self.called, text, attachments)
+        announcement.lease = lease
         self._announcements.append(announcement)
         return announcement
 
@@ -91,11 +101,12 @@ class PublishTurn(Turn):
 class UpdateAnnouncement(Announcement):
     """Notifies subscribers of one change, without the value."""
 
-    __slots__ = ("_began", "_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time")
+    __slots__ = ("_began", "_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time", "lease")
 
     def __init__(
         self, session: Session, keys: Keys, identity: PublisherIdentity, called: CallTime | None, deleted: bool = False
     ) -> None:
+        self.lease: HeldLease | None = None  # the owner's, which is renewed with the change
         self._session = session
         self._keys = keys
         self._time = None if called is None else called.wall
@@ -109,7 +120,8 @@ class UpdateAnnouncement(Announcement):
         self._everywhere = identity.is_fresh(keys)
 
     def commands(self, path: Path) -> list[Command]:
-        return self._numbered(path, self._payload)
+        notices = self._numbered(path, self._payload)
+        return notices if self.lease is None else [self.lease.renewal, *notices]
 
     def unsent(self) -> None:
         self._reserved.append(self._made)
@@ -142,7 +154,12 @@ class UpdateAnnouncement(Announcement):
         return announce(*stamp, moment, path, deleted=self._deleted, extras=extras)
 
     def _when(self) -> tuple[float, Extras]:
-        """Return the time of the call, in seconds since 1970, and how late it is sent if an outage was in between."""
+        """Return the time of the call, in seconds since 1970, and what else the notice has to say.
+
+        That is how late it is sent, if an outage was in between, and the owner's fencing number.
+        """
+        if self.lease is not None:
+            return self._time or time.time(), self.lease.extras
         late = 0.0 if self._began is None else time.monotonic() - self._began
         return self._time or time.time(), Extras(late=late) if late else NO_EXTRAS
 
@@ -177,8 +194,9 @@ class ValueAnnouncement(UpdateAnnouncement):
         """
         local, sizes = self._session.local, sizes_of_parts(self._text, self._attachments)
         is_large = sum(sizes) >= LEAST
-        # An index from the end is resolved by the server, so such an update cannot be early.
-        is_early = local.early and not counts_from_end(path)
+        # An index from the end is resolved by the server, so such an update cannot be early. Nor can an owner's: the
+        # server alone knows whether it still is one.
+        is_early = local.early and self.lease is None and not counts_from_end(path)
         if not (is_large or is_early) or not local.host or notify_path(path) is not path:
             return
         if any(each.blob is None for each in self._attachments):

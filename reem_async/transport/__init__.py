@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
-from ..errors import SELF_EXPLANATORY, BadData, Contended, NotConnected, ReemError, Refused, WrongKind
+from ..errors import SELF_EXPLANATORY, BadData, Contended, LeaseLost, NotConnected, ReemError, Refused, WrongKind
 from ..plain.documents import is_document
 from ..plan import Command, Plan, Reply, wire_commands
 from ..plan.keys import count, first_page, page
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .options import Options
 
 _UNWATCH: Command = ("UNWATCH",)
-_UNAPPLIED = (Contended, NotConnected, Refused)  # errors of a plan that the server did nothing for
+_UNAPPLIED = (Contended, LeaseLost, NotConnected, Refused)  # errors of a plan that the server did nothing for
 
 
 class Held(Protocol):
@@ -30,6 +30,17 @@ class Held(Protocol):
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         """Send `commands` in one go and return their replies; error replies are returned, not raised."""
+
+
+class Keepable(Held, Protocol):
+    """A connection of one caller's own that it keeps over several calls."""
+
+    def fresh(self) -> bool:
+        """Return whether the connection still stands and leads to the right server, as far as one can see."""
+
+
+Guard = Callable[[Any], Held]
+"""Wraps a connection, a `Keepable` except in a cluster, before anything is sent over it."""
 
 
 class Transport(Held, Protocol):
@@ -45,8 +56,8 @@ class Transport(Held, Protocol):
     at_end: Callable[[], Awaitable[None]]
     sharded: bool
 
-    def hold(self) -> AbstractAsyncContextManager[Held]:
-        """Return a connection of the caller's own, given back on exit."""
+    def hold(self, guard: Guard | None = None) -> AbstractAsyncContextManager[Held]:
+        """Return a connection of the caller's own, given back on exit; with a guard, it may be kept for long."""
 
     @property
     def options(self) -> Options:
@@ -193,7 +204,7 @@ async def _drive_held(held: Held, plan: Plan, contention: Contention) -> Any:
     while type(outcome) is Plan and outcome.held:
         try:
             replies = await held.roundtrip(wire_commands(outcome))
-        except (Contended, NotConnected) as error:
+        except (Contended, LeaseLost, NotConnected) as error:
             raise _told(outcome, error) from error
         sent = outcome
         try:

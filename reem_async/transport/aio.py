@@ -15,7 +15,7 @@ from ..concurrency.tasks import Tasks
 from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, WrongLoop
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
-from . import Held, document_of
+from . import Guard, Held, document_of
 from .composite import OneServer
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .state import States
@@ -241,6 +241,7 @@ class AsyncTransport(OneServer):
         self._lanes: dict[bool, Wire] = {}
         self._opening: dict[bool, asyncio.Task[Wire]] = {}
         self._spare: list[Wire] = []
+        self._kept: set[Wire] = set()  # lent for long
         self._lendable = asyncio.Semaphore(_LENT)
         self._borrowers = 0  # callers that have a lent connection or wait for one
         self._open: set[Wire] = set()
@@ -251,13 +252,18 @@ class AsyncTransport(OneServer):
         self._left: dict[str, set[asyncio.Future[Any]]] = {}
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[Held]:
+    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled.
 
         A caller that finds 32 lent waits for one. It must not hold another one. If an attempt to connect fails
         meanwhile, that is its answer too: 1,500 callers would have to wait for 47 time limits of the same server.
+        A caller with a guard may keep its connection for long, so it does not count.
         """
         self.check()
+        if guard is not None:
+            async with self._one_more(time.monotonic(), guard) as held:
+                yield held
+            return
         lendable, asked = self._lendable, time.monotonic()
         self._borrowers += 1
         try:
@@ -268,14 +274,18 @@ class AsyncTransport(OneServer):
                 self._borrowers -= 1
 
     @asynccontextmanager
-    async def _one_more(self, asked: float) -> AsyncIterator[Held]:
+    async def _one_more(self, asked: float, guard: Guard | None = None) -> AsyncIterator[Held]:
         while self._spare and not self._spare[-1].alive:
             self._spare.pop()
         wire = self._spare.pop() if self._spare else await self._opened_to_lend(asked)
         lent = _Lent(self, wire)
+        held: Held = lent
+        if guard is not None:
+            self._kept.add(wire)
+            held = guard(lent)
         try:
             # It may have watched keys, and is not asked to forget them after an error: it is closed.
-            yield HeldText(lent, self._text) if wire.plain else lent
+            yield HeldText(held, self._text) if wire.plain else held
         except BaseException:
             if lent.is_uploading:  # its reply tells when what is on its way has arrived
                 self._leaving.add(wire)
@@ -283,6 +293,8 @@ class AsyncTransport(OneServer):
             else:
                 await wire.close()
             raise
+        finally:
+            self._kept.discard(wire)
         is_awaited = self._borrowers > _LENT
         if wire.alive and (is_awaited or len(self._spare) < _SPARE) and not self._closed:
             self._spare.append(wire)
@@ -370,7 +382,7 @@ class AsyncTransport(OneServer):
         return not self._opening and not any(wire.alive for wire in self._open)
 
     async def release(self) -> None:
-        wires = [*self._lanes.values(), *self._spare, *self._leaving]
+        wires = [*self._lanes.values(), *self._spare, *self._leaving, *self._kept]
         self._begin()
         await close_all(wires)
 
@@ -382,6 +394,9 @@ class _Lent:
         self._transport = transport
         self._wire = wire
         self.is_uploading = False  # something large was sent, and whether it has arrived is not known
+
+    def fresh(self) -> bool:
+        return self._wire.alive
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
         return self._upload(commands) if has_large(commands) else self._wire.roundtrip(commands)

@@ -23,7 +23,7 @@ from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed, ReemError
 from ..plan import Command, Reply
-from . import Held
+from . import Guard, Held
 from .composite import OneServer
 from .options import INFO_SERVER, Options, ServerSocket, server_run_id
 from .packing import SLOW, Piece, pack
@@ -185,7 +185,9 @@ class _Line:
 
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
-        return not self._poll.poll(0)  # nothing is due: an event is a stray reply, or the server has closed
+        return not self.broken and not self._poll.poll(
+            0
+        )  # nothing is due: an event is a stray reply, or the server has closed
 
     def lost(self, reason: str) -> ConnectionLost:
         self.close()
@@ -241,6 +243,7 @@ class BlockingTransport(OneServer):
         """Begin without connections and locks; in a forked child too, since those it has are its parent's."""
         self._idle: collections.deque[_Line] = collections.deque()
         self._lines: WeakList[_Line] = WeakList()  # all there are, also those in use
+        self._kept: set[_Line] = set()  # lent for long
         self._orders = Locks(ThreadLock)
 
     def _take(self) -> _Line:
@@ -316,14 +319,19 @@ class BlockingTransport(OneServer):
             self._give(line)
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[Held]:
+    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
         line = self._take()
+        held: Held = line
+        if guard is not None:
+            self._kept.add(line)
+            held = guard(line)
         try:
-            yield HeldText(line, self._text) if line.plain else line
+            yield HeldText(held, self._text) if line.plain else held
         except BaseException:
             line.close()
             raise
         finally:
+            self._kept.discard(line)
             self._give(line)
 
     async def pause(self, seconds: float) -> None:
@@ -348,6 +356,9 @@ class BlockingTransport(OneServer):
     async def close(self) -> None:
         self._closed = True
         self.retire()
+        for line in [*self._kept]:
+            if not line.broken:  # else a call is under way, and the next one finds the interface closed
+                line.close()
         self.states.closed()
 
     def retire(self) -> bool:

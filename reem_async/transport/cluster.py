@@ -24,7 +24,7 @@ import redis.exceptions
 from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected, TlsRefused
 from ..plan import Command, Reply
 from ..plan.sizes import are_missing, as_given, is_large, looks_at, stage
-from . import Contention, Held, Transport
+from . import Contention, Guard, Held, Transport
 from .addresses import address_of, listed
 from .composite import CompositeTransport, NewTransport
 from .options import Address, NodeOptions, Options
@@ -136,10 +136,10 @@ class ClusterTransport(CompositeTransport):
         return replies if problem is None else await self._apply(commands, bulk, problem, replies, owner)
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[Held]:
+    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
         held = HeldAcross(self)
         try:
-            yield held
+            yield held if guard is None else guard(held)
         except BaseException as error:
             await held.leave(error)
             raise

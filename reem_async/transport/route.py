@@ -213,6 +213,9 @@ class HeldAcross:
         self._lent: AbstractAsyncContextManager[Held] | None = None
         self._held: Held | None = None
         self._route = Route(cluster, None)
+        # The keys that are watched on their node; none while their slot moves. A transaction that publishes need not
+        # watch its keys again if all are among them.
+        self._watching: set[bytes] = set()
         self._giving_up: Route | None = None
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
@@ -220,10 +223,13 @@ class HeldAcross:
             return await self._begin(commands, bulk)
         if commands[-1][0] == "EXEC":
             return await self._end(commands, bulk)
+        if commands[0][0] == "UNWATCH":
+            self._watching.clear()
         return await asked_of(self._held, commands, self._route.asking, bulk)
 
     async def _begin(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         route = self._route = Route(self._cluster, slot_of(commands))
+        self._watching.clear()
         while True:
             problem: Exception | None
             try:
@@ -234,6 +240,8 @@ class HeldAcross:
                     replies = await asked_of(held, commands, route.asking, bulk)
                     problem = refusal(replies)
                     if problem is None:
+                        if not route.asking:
+                            self._watching.update(keys_in([each for each in commands if each[0] == "WATCH"]))
                         return replies
                     await held.roundtrip([_UNWATCH])
             except NotConnected as error:
@@ -246,7 +254,10 @@ class HeldAcross:
         Then the replies to all but EXEC say why.
         """
         assert self._held is not None
-        problem = (await watched(self._held, keys_in(commands), self._route))[0] if publishes(commands) else None
+        problem, keys = None, keys_in(commands)
+        if publishes(commands) and not self._watching.issuperset(keys):
+            problem = (await watched(self._held, keys, self._route))[0]
+        self._watching.clear()
         if problem is None:
             replies = await asked_of(self._held, commands, self._route.asking, bulk)
             problem = refusal(replies)

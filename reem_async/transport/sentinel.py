@@ -22,7 +22,7 @@ import redis.exceptions
 from ..concurrency.locks import WeakList
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
-from . import Held, Transport
+from . import Guard, Held, Transport
 from .addresses import address_of, listed
 from .composite import CompositeTransport, NewTransport
 from .options import Address, NodeOptions, Options, connecting_by, question, question_here
@@ -291,10 +291,12 @@ class SentinelTransport(CompositeTransport):
         self._states = self._now.states = states
 
     @asynccontextmanager
-    async def hold(self) -> AsyncIterator[Held]:
+    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
         node = self._current()
-        async with node.hold() as held:
-            yield _CheckedConnection(self, node, held)
+        # The guard is on the inside, where a server without JSON is sent text; it asks whether the node is the primary.
+        inside = None if guard is None else lambda kept: guard(_CheckedConnection(self, node, kept))
+        async with node.hold(inside) as held:
+            yield held if guard is not None else _CheckedConnection(self, node, held)
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         return self
@@ -342,10 +344,13 @@ class _Lookout:
 class _CheckedConnection:
     """A lent connection whose replies are checked, too."""
 
-    def __init__(self, transport: SentinelTransport, node: Transport, held: Held) -> None:
+    def __init__(self, transport: SentinelTransport, node: Transport, held: Any) -> None:
         self._transport = transport
         self._node = node
         self._held = held
+
+    def fresh(self) -> bool:
+        return self._transport._current() is self._node and bool(self._held.fresh())
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         return self._transport._checked(self._node, await self._held.roundtrip(commands, bulk=bulk))
