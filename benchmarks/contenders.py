@@ -53,7 +53,13 @@ HOST = {
     "reem-host-early": Contender(
         "REEM, early, at localhost", "reem_blocking", "#073b66", host="localhost", options={"local": "early"}
     ),
-    # A way of REEM's, such as early without waiting, is one line here; "publish" in its options is for PublishSpace.
+    "reem-host-queued": Contender(
+        "REEM, early without waiting",
+        "reem_blocking",
+        "#0b6b6b",
+        host="localhost",
+        options={"local": "early", "publish": {"wait": False}},  # "publish" is for PublishSpace
+    ),
     "zenoh": CONTENDERS["zenoh"],
     "pyzmq-ipc": Contender("pyzmq, ipc", "pyzmq_pubsub", "#e0a030", options={"ipc": True}),
     "redis-socket": Contender("redis-py, Unix socket", "redis_blocking", "#5c5c5c", options={"socket": True}),

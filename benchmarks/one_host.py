@@ -9,7 +9,12 @@ from .report import duration, label
 from .results import Results
 from .suite import ON_HOST
 
-HEADS = {"reem-local": "REEM auto", "reem-host-early": "REEM early", "zenoh": "zenoh"}
+HEADS = {
+    "reem-local": "REEM auto",
+    "reem-host-early": "REEM early",
+    "reem-host-queued": "REEM early, no wait",
+    "zenoh": "zenoh",
+}
 """Names for columns that are shorter than the contenders' own."""
 SIZES = {"state": "100 B", "scan": "10 KB", "image": "0.92 MB", "frame": "7.4 MB"}
 

@@ -456,3 +456,44 @@ def test_a_link_that_is_cut_again_and_again(publisher, server, reader):
         assert len(set(told)) == len(told)
         assert front.kvs.waiting == 0
         assert number // 2 < len(told) + front.kvs.dropped
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_early_updates_arrive_while_the_server_does_not_answer(publisher, server, paused, large):
+    """In the order of the calls; each once, and at rest mirror and server agree."""
+    url, told = f"redis://localhost:{server.port}", []
+    front = publisher(url, local="early", timeout=PATIENCE)
+    value = (lambda number: np.full(10_000, float(number))) if large else lambda number: number
+
+    def note(data, updated_path, update):
+        if update.sequence is not None:
+            told.append((update.sequence, update.early, float(np.max(data["n"]))))
+
+    with (
+        reem.RedisInterface(url, timeout=PATIENCE) as interface,
+        reem.KeyValueStore(interface)["a"].mirror() as mirror,
+        reem.CallbackSubscriber("a", interface, note) as subscriber,
+    ):
+        subscriber.listen()
+        front.write(["a"], {"n": value(0)})
+        for _ in range(20):  # the sender finds the subscribers
+            front.write(["a", "n"], value(0))
+            front.flush()
+            front.sleep(0.01)
+        front.sleep(0.3)
+        with paused():
+            for number in range(1, 4):
+                front.write(["a", "n"], value(number))
+                eventually(lambda number=number: told[-1][1:] == (True, number))
+        front.flush()
+        for number in range(4, sized(200, 1000)):
+            front.write(["a", "n"], value(number))
+            front.sleep(0.003)
+        front.write(["a", "n"], value(-1))
+        front.flush()
+        eventually(lambda: np.max(mirror.value()["n"]) == -1)
+        assert_same(mirror.value(), reem.KeyValueStore(interface)["a"].read())
+        # After a gap (merged updates), and of large ones without room in shared memory, the key is read: then those
+        # that the server has not confirmed may be delivered again, with the value that was read (promise 19).
+        numbers = [sequence for sequence, _, _ in told]
+        assert large or front.kvs.dropped or numbers == sorted(set(numbers))

@@ -44,6 +44,9 @@ class Announcement:
     async def share(self, path: Path) -> None:
         """Put a large value that is about to be set into shared memory. Raises NotConnected; then nothing was set."""
 
+    async def share_early(self, path: Path) -> None:
+        """Share the value with the subscribers on this host that are known, without a round trip."""
+
     def release(self) -> None:
         """Give back a number that was not used; the change is over."""
 

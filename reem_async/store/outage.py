@@ -359,7 +359,7 @@ class Outage:
 
     async def _send_next(self, turn: Turn, out: UnsentUpdates) -> bool:
         """Send the oldest kept call of a key, in its turn; return whether there was one."""
-        taken = out.take()  # first, so that it is never sent twice
+        taken = await self._taken(out)  # first, so that it is never sent twice
         if taken is None:
             return False
         number, it = taken
@@ -386,6 +386,9 @@ class Outage:
             out.sending = 0
             turn.release()
         return True
+
+    async def _taken(self, out: UnsentUpdates) -> tuple[int, Kept] | None:
+        return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
         """Count updates that were refused, or are not known to be stored."""

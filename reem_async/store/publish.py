@@ -170,7 +170,7 @@ class ValueAnnouncement(UpdateAnnouncement):
     If the server refuses the value, another notice has subscribers read the stored one.
     """
 
-    __slots__ = ("_attachments", "_early", "_slot", "_text")
+    __slots__ = ("_attachments", "_early", "_is_shared", "_slot", "_text")
 
     def __init__(
         self,
@@ -185,6 +185,7 @@ class ValueAnnouncement(UpdateAnnouncement):
         self._text = text
         self._attachments = attachments
         self._slot: Slot | None = None
+        self._is_shared = False  # with subscribers on this host, in early mode
         self._early: tuple[_Stamp, bytes] | None = None  # the notice that subscribers near by have, with its number
 
     async def share(self, path: Path) -> None:
@@ -192,6 +193,14 @@ class ValueAnnouncement(UpdateAnnouncement):
 
         In early mode, notify the subscribers on this host now. One more round trip for one update a second.
         """
+        await self._share(path, is_to_ask=True)
+
+    async def share_early(self, path: Path) -> None:
+        """In early mode, share with the subscribers on this host that are known; nothing is waited for."""
+        if self._session.local.early:
+            await self._share(path, is_to_ask=False)
+
+    async def _share(self, path: Path, *, is_to_ask: bool) -> None:
         local, sizes = self._session.local, sizes_of_parts(self._text, self._attachments)
         is_large = sum(sizes) >= LEAST
         # An index from the end is resolved by the server, so such an update cannot be early. Nor can an owner's: the
@@ -201,13 +210,17 @@ class ValueAnnouncement(UpdateAnnouncement):
             return
         if any(each.blob is None for each in self._attachments):
             return
-        if local.is_to_ask(self._keys):
+        if is_to_ask and local.is_to_ask(self._keys):
             await self._ask_host()
+        if self._is_shared:  # by the call, which has queued the update
+            return
         if is_large and local.audience(self._keys):
             pieces = [self._text, *(piece for each in self._attachments for piece in each.blob or ())]
-            self._slot = local.put(self._keys, pieces, sizes)
+            # Two threads must not write to the memory of a key at a time: one may queue, another one send.
+            async with self._session.transport.ordered(f"{self._keys.channel} memory"):
+                self._slot = local.put(self._keys, pieces, sizes)
         if is_early and (self._slot is not None or not is_large):
-            self._notify_early(self._reserved[0], path)
+            self._is_shared = self._notify_early(self._reserved[0], path)
 
     async def _ask_host(self) -> None:
         """Ask for the subscribers on this host; raises NotConnected."""
@@ -226,10 +239,11 @@ class ValueAnnouncement(UpdateAnnouncement):
                 break
             await session.transport.pause(_ANSWER)
 
-    def _notify_early(self, stamp: _Stamp, path: Path) -> None:
+    def _notify_early(self, stamp: _Stamp, path: Path) -> bool:
+        """Notify the subscribers on this host; return whether there are any."""
         channel, subscribers = self._keys.channel.encode(), self._session.local.subscribers
         if not subscribers.count(channel):
-            return
+            return False
         self._time = self._time or time.time()  # the update itself has the same, which identifies it
         if self._slot is None:
             moment, extras = self._when()
@@ -239,6 +253,7 @@ class ValueAnnouncement(UpdateAnnouncement):
         if len(payload) <= LARGEST_INLINE:
             self._early = stamp, payload
         subscribers.notify(channel, payload)
+        return True
 
     def retract(self, path: Path) -> Sequence[Command]:
         # Without a value, so that subscribers read the stored one.

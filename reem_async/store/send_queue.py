@@ -3,11 +3,13 @@
                  put (any thread)                    sender: one task, in the key's turn
     call  --------------------------->  queue  --------------------------------------->  server
            encode, number, own bytes   per key   oldest first, one transaction per call
+      |
+      +-- local="early": at once to the subscribers on this host that the sender has found
 
 It is an outage that begins with the first call (`Outage`): the same queue, bounds and order. What differs:
 
 - Calls put without the key's turn, which the sender holds for a round trip. They have a lock of their own, so their
-  numbers are in the order of the queue. The sender needs no lock to take: each step on the queue is one of C.
+  numbers are in the order of the queue.
 - Updates have their numbers from the call on, as those of a publisher of its own (`PublisherIdentity`). Other stores
   of the interface may publish to the same key meanwhile.
 - Updates of one place are merged only once some wait.
@@ -110,6 +112,8 @@ class SendQueue(Outage):
             self._session.transport.check()
             announcements = self._numbered(writer, own, called)
             self._put_kept(writer, Kept(own, size_of(own), called, announcements))
+            for it, announcement in zip(own, announcements, strict=True):
+                await announcement.share_early(it.path)
         await self._wake()
 
     def _calls(self, keys: Keys) -> AbstractAsyncContextManager[None]:
@@ -221,6 +225,10 @@ class SendQueue(Outage):
         async with self._calls(out.writer.keys):
             if not out.kept:
                 self._out.pop(out.writer.keys.document, None)
+
+    async def _taken(self, out: UnsentUpdates) -> tuple[int, Kept] | None:
+        async with self._calls(out.writer.keys):  # not before the call has shared it with subscribers on this host
+            return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
         self._count(keys, len(it.assignments))
