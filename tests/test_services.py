@@ -206,6 +206,18 @@ def test_functions_of_one_name_share_the_calls_and_a_function_may_call(kvs, serv
         kvs[key()].call(name=1)
 
 
+def test_the_node_says_what_it_serves(server_url, key):
+    with reem.RedisInterface(server_url, name=key("node")) as interface:
+        place = reem.KeyValueStore(interface)[key()]["act"]
+
+        def served():
+            return [node.serves for node in interface.nodes() if node.name == key("node")]
+
+        with place.serve(act), place.serve(act):
+            eventually(lambda: served() == [(f"{key()}.act",)])
+        eventually(lambda: served() == [()])
+
+
 async def test_a_call_that_is_left_cancels_its_function(akvs, raw, key):
     """By cancelling the task, and by the timeout. What waits is never begun then, though its values are there."""
     begun, cancelled, go_on = [], [], asyncio.Event()

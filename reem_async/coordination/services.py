@@ -208,12 +208,13 @@ class Served(Listener):
             raise explained(error) from None
         kept[self.id] = self
         self._session.activities.add("serves", self.where)
+        self._session.activities.add("serves", self.where)
 
     async def close(self) -> None:
         """Stop serving. Requests that wait go to other servers, and those being handled are given up."""
         if self.closed.is_set():
             return
-        self.closed.set()
+        self._end()
         self._manager.kept.pop(self.id, None)
         self._session.activities.remove("serves", self.where)
         try:
@@ -228,11 +229,15 @@ class Served(Listener):
             self._waiting.clear()
             self._workers.close()
 
+    def _end(self) -> None:
+        self.closed.set()
+        self._session.activities.remove("serves", self.where)
+
     def lost(self, reason: Exception) -> None:
         """Go on after a lost connection, which comes back; end with the interface."""
         super().lost(reason)
         if isinstance(reason, InterfaceClosed) and self.ready is None and not self.closed.is_set():
-            self.closed.set()
+            self._end()
             for request in self._requests.values():
                 request.leave()
             self._waiting.clear()
