@@ -13,7 +13,17 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import redis
-from conftest import RawCluster, aeventually, commands_run, line_of, python, server_without_right, sized
+from conftest import (
+    FRONTS,
+    RawCluster,
+    aeventually,
+    commands_run,
+    eventually,
+    line_of,
+    python,
+    server_without_right,
+    sized,
+)
 
 import reem
 import reem_async
@@ -238,6 +248,24 @@ def test_a_forked_child_does_not_own_what_its_parent_owns(server_url, key):
     assert done.stdout.endswith("3 False\n")
 
 
+def test_a_program_may_end_without_releasing_what_it_owns(server_url, key):
+    program = """
+        import asyncio, sys, reem, reem_async
+        async def main():
+            kvs = reem_async.KeyValueStore(sys.argv[1])
+            for number in range(40):  # more than there are connections that callers share
+                cmd = kvs[sys.argv[2] + str(number)].own()
+                await cmd.acquire()
+                await cmd.write(number)
+        asyncio.run(main())
+        cmd = reem.KeyValueStore(sys.argv[1])[sys.argv[2]].own()
+        cmd.acquire()
+        cmd.write(1)
+    """
+    done = python(program, server_url, key())
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 async def test_a_cancelled_write_never_follows_a_takeover(akvs, binterface, key):
     """The owner does not know what became of it; what it watches since is right."""
     rivals = reem_async.KeyValueStore(binterface)
@@ -400,3 +428,32 @@ async def test_a_lease_ends_with_its_interface_and_its_server(server):
         assert reem.KeyValueStore(again)["cmd"].read() == 4
         connections = again.client.client_list
         await aeventually(lambda: len(connections()) <= 3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["blocking", "asyncio"])
+def test_an_owner_goes_on_after_a_failover_or_has_lost_the_key(watched, name):
+    """Its connection to the primary of before is not used any more, though that still answers."""
+    watched.settle()
+    with contextlib.closing(FRONTS[name](watched.url)) as front:
+        cmd = front.kvs["lease"].own(ttl=60, take=True)
+        front.wait(cmd.acquire())
+        front.wait(cmd.write(0))
+        eventually(watched.fail_over)
+        number = 0
+
+        def written():
+            nonlocal number
+            number += 1
+            try:
+                front.wait(cmd.write(number))
+            except LeaseLost:
+                front.wait(cmd.acquire())
+            except (ConnectionLost, NotConnected):
+                pass
+            return watched.now().exists("lease") and front.read(["lease"]) == number
+
+        eventually(written)
+        front.wait(cmd.release())
+        assert not watched.now().exists("{lease}:lease")
+    watched.settle()

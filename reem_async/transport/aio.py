@@ -44,7 +44,7 @@ class AsyncTransport(OneServer):
         self._closed = False
         self._begin()
         self._failed_attempt: tuple[float, NotConnected] | None = None  # the last one for a lent connection, and when
-        self._text = Text(options.timeout)
+        self.text = Text(options.timeout)
         # Not cancelled by `close`: callers share an attempt to connect, which ends by itself, within its time limit.
         self._tasks = Tasks()
         self.states = States()
@@ -70,10 +70,10 @@ class AsyncTransport(OneServer):
         return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))
 
     async def _as_text(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        sent = self._text.shortcut(commands)
+        sent = self.text.shortcut(commands)
         if sent is not None:
-            return self._text.finished(commands, await self._as_it_is(sent, bulk=bulk))
-        return await self._text.roundtrip(self._as_it_is, self, commands, bulk)
+            return self.text.finished(commands, await self._as_it_is(sent, bulk=bulk))
+        return await self.text.roundtrip(self._as_it_is, self, commands, bulk)
 
     async def _as_it_is(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         large = has_large(commands)
@@ -251,19 +251,18 @@ class AsyncTransport(OneServer):
         # By document: what cancelled callers have left on its way. A later write to the same document waits for it.
         self._left: dict[str, set[asyncio.Future[Any]]] = {}
 
-    @asynccontextmanager
-    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
+    def hold(self, guard: Guard | None = None) -> AbstractAsyncContextManager[Held]:
         """Lend a connection of its own. It is broken if the caller leaves with an error or is cancelled.
 
         A caller that finds 32 lent waits for one. It must not hold another one. If an attempt to connect fails
         meanwhile, that is its answer too: 1,500 callers would have to wait for 47 time limits of the same server.
         A caller with a guard may keep its connection for long, so it does not count.
         """
+        return self._lend() if guard is None else _KeptConnection(self, guard)
+
+    @asynccontextmanager
+    async def _lend(self) -> AsyncIterator[Held]:
         self.check()
-        if guard is not None:
-            async with self._one_more(time.monotonic(), guard) as held:
-                yield held
-            return
         lendable, asked = self._lendable, time.monotonic()
         self._borrowers += 1
         try:
@@ -274,32 +273,38 @@ class AsyncTransport(OneServer):
                 self._borrowers -= 1
 
     @asynccontextmanager
-    async def _one_more(self, asked: float, guard: Guard | None = None) -> AsyncIterator[Held]:
+    async def _one_more(self, asked: float) -> AsyncIterator[Held]:
         while self._spare and not self._spare[-1].alive:
             self._spare.pop()
         wire = self._spare.pop() if self._spare else await self._opened_to_lend(asked)
         lent = _Lent(self, wire)
-        held: Held = lent
-        if guard is not None:
-            self._kept.add(wire)
-            held = guard(lent)
         try:
             # It may have watched keys, and is not asked to forget them after an error: it is closed.
-            yield HeldText(held, self._text) if wire.plain else held
+            yield HeldText(lent, self.text) if wire.plain else lent
         except BaseException:
-            if lent.is_uploading:  # its reply tells when what is on its way has arrived
-                self._leaving.add(wire)
-                self._tasks.start(self._close_idle(wire), "reem close")
-            else:
-                await wire.close()
+            await self.take_broken(lent)
             raise
-        finally:
-            self._kept.discard(wire)
         is_awaited = self._borrowers > _LENT
         if wire.alive and (is_awaited or len(self._spare) < _SPARE) and not self._closed:
             self._spare.append(wire)
         else:
             await wire.close()
+
+    async def open_kept(self) -> _Lent:
+        """Return a connection that its caller keeps for long."""
+        self.check()
+        wire = await self._opened()
+        self._kept.add(wire)
+        return _Lent(self, wire)
+
+    async def take_broken(self, lent: _Lent) -> None:
+        """Close a connection on which a call may be under way."""
+        self._kept.discard(lent.wire)
+        if lent.is_uploading:  # its reply tells when what is on its way has arrived
+            self._leaving.add(lent.wire)
+            self._tasks.start(self._close_idle(lent.wire), "reem close")
+        else:
+            await lent.wire.close()
 
     async def _opened_to_lend(self, asked: float) -> Wire:
         if self._failed_attempt is not None and self._failed_attempt[0] >= asked:
@@ -392,17 +397,38 @@ class _Lent:
 
     def __init__(self, transport: AsyncTransport, wire: Wire) -> None:
         self._transport = transport
-        self._wire = wire
+        self.wire = wire
         self.is_uploading = False  # something large was sent, and whether it has arrived is not known
 
     def fresh(self) -> bool:
-        return self._wire.alive
+        return self.wire.alive
 
     def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
-        return self._upload(commands) if has_large(commands) else self._wire.roundtrip(commands)
+        return self._upload(commands) if has_large(commands) else self.wire.roundtrip(commands)
 
     async def _upload(self, commands: Sequence[Command]) -> list[Reply]:
         self.is_uploading = True
-        replies = await self._transport.upload(self._wire, commands)
+        replies = await self._transport.upload(self.wire, commands)
         self.is_uploading = False
         return replies
+
+
+class _KeptConnection:
+    """Lends a connection behind a guard for long.
+
+    No generator: an event loop that ends would close it together with those that hold it, in any order.
+    """
+
+    def __init__(self, transport: AsyncTransport, guard: Guard) -> None:
+        self._transport = transport
+        self._guard = guard
+        self._lent: _Lent | None = None
+
+    async def __aenter__(self) -> Held:
+        self._lent = await self._transport.open_kept()
+        held = self._guard(self._lent)
+        return HeldText(held, self._transport.text) if self._lent.wire.plain else held
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._lent is not None:
+            await self._transport.take_broken(self._lent)

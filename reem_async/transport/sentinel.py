@@ -14,7 +14,7 @@ import threading
 import time
 import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
-from contextlib import asynccontextmanager, suppress
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import redis.exceptions
@@ -290,13 +290,17 @@ class SentinelTransport(CompositeTransport):
     def states(self, states: States) -> None:
         self._states = self._now.states = states
 
-    @asynccontextmanager
-    async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
+    def hold(self, guard: Guard | None = None) -> AbstractAsyncContextManager[Held]:
         node = self._current()
+        if guard is None:
+            return self._lend(node)
         # The guard is on the inside, where a server without JSON is sent text; it asks whether the node is the primary.
-        inside = None if guard is None else lambda kept: guard(_CheckedConnection(self, node, kept))
-        async with node.hold(inside) as held:
-            yield held if guard is not None else _CheckedConnection(self, node, held)
+        return node.hold(lambda kept: guard(_CheckedConnection(self, node, kept)))  # type: ignore[no-any-return]
+
+    @asynccontextmanager
+    async def _lend(self, node: Any) -> AsyncIterator[Held]:
+        async with node.hold() as held:
+            yield _CheckedConnection(self, node, held)
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         return self
