@@ -1,8 +1,8 @@
 """A robot stops in time, whatever fails: its commander is killed or stopped, a link is cut, the server is killed.
 
-The commander puts into each command when it publishes it, on the clock that all processes of a machine share. Each
-delay that is measured is from then to the report, so it includes the way of the command to the robot. For how long a
-busy machine did not run the robot's own loop does not count.
+No report may come before TTL has passed since the last command was published, on the clock that all processes of a
+machine share, nor later than that time and some milliseconds after the command has arrived. For how long a busy machine
+did not run the robot's own loop does not count.
 """
 
 import asyncio
@@ -77,18 +77,14 @@ class Observer:
     """What one follower knows: whether it is silent, and how long after the last command each silence was reported."""
 
     def __init__(self):
-        self.live, self.delays, self._last = False, [], None
-
-    def late(self, pauses):
-        """By how much the last report came after the end of TTL, and after `pauses` of the robot."""
-        return self.delays[-1] - TTL - pauses
+        self.live, self.delays, self.reported, self._last = False, [], 0.0, None
 
     def note(self, command):
         now = time.monotonic()
         if command is not None:
             self._last, self.live = command["t"], True
         elif self.live:
-            self.live = False
+            self.live, self.reported = False, now
             self.delays.append(now - self._last)
 
 
@@ -100,6 +96,7 @@ class Robot:
         self._over = False
         self.longest_pause = 0.0  # between two turns of its loop
         self._turned = time.monotonic()
+        self.arrived = 0.0  # when the last command arrived
         with contextlib.ExitStack() as stack:
             if front == "blocking":
                 self._follow(stack, url)
@@ -114,6 +111,10 @@ class Robot:
         now = time.monotonic()
         self.longest_pause, self._turned = max(self.longest_pause, now - self._turned), now
         self.mirror.note(mirror.value(default=None))
+
+    def _watched(self, update):
+        self.arrived = update.arrived or self.arrived
+        self.watch.note(update.data)
 
     def _called(self, data, updated_path):
         self.callback.note(data)
@@ -135,7 +136,7 @@ class Robot:
 
         def loop():
             for update in watch:
-                self.watch.note(update.data)
+                self._watched(update)
 
         for target in (poll, loop):
             thread = threading.Thread(target=target)
@@ -153,7 +154,7 @@ class Robot:
 
             async def loop():
                 async for update in place.watch(ttl=TTL):
-                    self.watch.note(update.data)
+                    self._watched(update)
 
             async with place.mirror(ttl=TTL) as mirror:
                 task = asyncio.create_task(loop())
@@ -202,7 +203,8 @@ def test_silence_is_reported_in_time_and_not_before(front, fault, times, slack):
             robot.longest_pause = 0.0
             break_()
             eventually(lambda: robot.is_(live=False))
-            late = [observer.late(robot.longest_pause) for observer in robot.observers]
+            end = robot.arrived + TTL + robot.longest_pause
+            late = [observer.reported - end for observer in robot.observers]
             assert max(late) <= slack, late
             mend()
             eventually(lambda: robot.is_(live=True))
