@@ -17,6 +17,7 @@ from conftest import EXAMPLES, Loop, eventually
 
 import reem
 import reem_async
+from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import BadInput, BadValue, InterfaceClosed, Silent, Stale
 from reem_async.plan.keys import keys_of
 from reem_async.pubsub.callbacks import arranged
@@ -257,6 +258,23 @@ def test_threads_wait_for_one_loop_with_and_without_a_limit(key, kvs, pspace):
             time.sleep(0.05)
         assert sorted(number for result in results for number in result.result(30)) == list(range(EXAMPLES))
         assert not watch._core.queue._sleepers
+
+
+async def test_silence_after_a_late_update_begins_when_that_gets_old():
+    queue, begun = LiveQueue(reem.Last(10), 0.4, ("a",)), time.monotonic()
+    queue.start_clock()
+    while (update := queue.take()) is EMPTY:
+        await asyncio.sleep(0.001)
+    assert update.silent
+    assert time.monotonic() - begun >= 0.4
+    arrived = time.monotonic()
+    queue.put(reem.Update("a", 1, 1, arrived=arrived, late=0.35))
+    queue.put(reem.Update("a", 2, 2, arrived=arrived, late=0.38))  # the other one counts for longer
+    assert [queue.take().value, queue.take().value] == [1, 2]
+    while (update := queue.take()) is EMPTY:
+        await asyncio.sleep(0.001)
+    assert update.silent
+    assert 0.05 <= time.monotonic() - arrived < 0.3
 
 
 BAD = [0, -1, 0.0, math.nan, math.inf, -math.inf, 1e300, True, "0.2", b"1", [1], np.nan, 1j]

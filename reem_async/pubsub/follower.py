@@ -92,6 +92,8 @@ class Follower(Listener):
     @contained
     def start(self, wire: Wire, beginning: Beginning) -> None:
         self._wire = wire
+        # Before a copy that is found takes the place of a live one: other threads ask.
+        self.live_since = -math.inf
         born, first, tracked = self.born, beginning is Beginning.FIRST, self.stored and bool(wire.tracked)
         self.born = None
         self._replica.begin(initial=first and born is None, tracked=tracked, born=first and born is not None)

@@ -166,10 +166,11 @@ class Mirror(Following):
             Silent: No update has arrived for `ttl`; a Stale.
         """
         follower = self._check_open()
+        tree = MISSING if follower.failure is not None else follower.at()  # before the check: see `Follower.start`
         refusal = self._refusal(follower)
         if refusal is not None and default is MISSING:
             raise refusal
-        found = MISSING if refusal is not None else follower.at()
+        found = MISSING if refusal is not None else tree
         return default if found is MISSING and default is not MISSING else own(found)
 
     def _check_begun(self) -> Follower:

@@ -105,9 +105,12 @@ class LiveQueue(BoundedQueue):
         self._gaps[number] = total([self._gaps.pop(number, 0), missed])
 
     def _heard(self, update: Update) -> None:
-        self._live_since = _counts_from(update)
+        self._live_since = max(self._live_since, _counts_from(update))
         if self._timer is None or self._loop is not asyncio.get_running_loop():
-            self._wait(self.ttl)
+            self._wait(self._left())
+
+    def _left(self) -> float:
+        return self._live_since + self.ttl - time.monotonic()
 
     def _wait(self, seconds: float, *, looked: bool = False) -> None:
         self._loop = asyncio.get_running_loop()
@@ -115,7 +118,7 @@ class LiveQueue(BoundedQueue):
         self._timer = self._loop.call_later(seconds, _check, weakref.ref(self), looked)
 
     def _check(self, looked: bool) -> None:
-        left = self._live_since + self.ttl - time.monotonic()
+        left = self._left()
         if self._end is not None:
             self._timer = None
         elif left > 0:  # a timer of its own for each update would cost more
