@@ -12,7 +12,7 @@ import time
 import weakref
 from collections.abc import AsyncIterator, Coroutine, Sequence
 from operator import attrgetter
-from typing import Any, Literal
+from typing import Any
 
 from .concurrency.locks import WeakList
 from .concurrency.tasks import Tasks
@@ -150,25 +150,26 @@ class Activities:
 
     def __init__(self, namespace: str) -> None:
         self._namespace = namespace
-        # Each name as often as it was added; each step is one of C.
-        self._names: dict[str, list[str]] = {"serves": [], "owns": []}
+        self._serves: list[str] = []  # each name as often as it was added; each step is one of C
         self.publishers: WeakList[PublisherIdentity] = WeakList()
+        self.leases: WeakList[Any] = WeakList()  # of coordination/lease.py
 
-    def add(self, kind: Literal["serves", "owns"], name: str) -> None:
-        """Note that the program serves or owns `name` from now on."""
-        self._names[kind].append(name)
+    def add_service(self, name: str) -> None:
+        """Note that the program serves `name` from now on."""
+        self._serves.append(name)
 
-    def remove(self, kind: Literal["serves", "owns"], name: str) -> None:
-        """Take back one `add`."""
+    def remove_service(self, name: str) -> None:
+        """Take back one `add_service`."""
         with contextlib.suppress(ValueError):
-            self._names[kind].remove(name)
+            self._serves.remove(name)
 
     def told(self, seconds: float, most: int) -> dict[str, list[str]]:
         """Return what the program serves and owns, and the top-level keys that it published in the last seconds."""
         channels = [channel for publisher in self.publishers for channel in publisher.recent(seconds)]
         names = {
             "publishes": [channel[1 : channel.index("}")].removeprefix(self._namespace) for channel in channels],
-            **self._names,
+            "serves": self._serves,
+            "owns": [lease.keys.name for lease in self.leases if lease.is_held],
         }
         return {kind: sorted({*found[:most]}) for kind, found in names.items()}
 

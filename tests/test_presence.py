@@ -81,10 +81,9 @@ def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, k
     one.wait(space["plan"].write([1]))
     activities = (one.interface._direct if kind == "blocking" else one.interface).session.activities
     for name in ("policy", "policy", "map"):
-        activities.add("serves", name)
-    activities.add("owns", "cmd")
-    activities.remove("serves", "policy")
-    activities.remove("owns", "nothing")
+        activities.add_service(name)
+    activities.remove_service("policy")
+    activities.remove_service("nothing")
 
     def nodes():
         if kind == "asyncio":
@@ -97,7 +96,7 @@ def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, k
     assert first.id != second.id
     assert first.host == second.host
     assert 0 <= first.since < PATIENCE
-    assert (first.serves, first.owns) == (("map", "policy"), ("cmd",))
+    assert (first.serves, first.owns) == (("map", "policy"), ())
     events = Events(unnamed, unnamed.interface)
     assert {events.next().node.id, events.next().node.id} == {first.id, second.id}
 
@@ -105,7 +104,7 @@ def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, k
     assert cli("snapshot", "save", os.devnull, "--force").stderr.count("_nodes") == 0
     table = cli("nodes").stdout.splitlines()
     assert len(table) == 2
-    assert any(line.split("\t")[4:] == ["plan", "map,policy", "cmd"] for line in table)
+    assert any(line.split("\t")[4:] == ["plan", "map,policy", "-"] for line in table)
     listed = [json.loads(line) for line in cli("nodes", "--json").stdout.splitlines()]
     assert {node["id"] for node in listed} == {first.id, second.id}
 
@@ -116,11 +115,23 @@ def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, k
     eventually(lambda: not list(raw.scan_iter(match=f"*{key.prefix}:_nodes*")))
 
 
-def test_a_service_is_listed_with_its_program(named, key):
-    one = named("blocking", "planner")
-    with one.kvs["policy"]["act"].serve(lambda: 1):
-        eventually(lambda: [node.serves for node in one.interface.nodes()] == [("policy.act",)])
-    eventually(lambda: [node.serves for node in one.interface.nodes()] == [()])
+@pytest.mark.parametrize("kind", FRONTS)
+def test_a_key_is_listed_with_its_owner_while_it_is_owned(named, kind):
+    one, other = named(kind, "joystick"), named("blocking", None)
+
+    def owned():
+        if kind == "asyncio":
+            one.run(asyncio.sleep(0.02))
+        return [node.owns for node in other.interface.nodes()]
+
+    cmd = one.kvs["cmd"].own(ttl=1.5, name="joystick")
+    one.wait(cmd.acquire())
+    eventually(lambda: owned() == [("cmd",)])
+    eventually(lambda: owned() == [()])  # it was not renewed
+    one.wait(cmd.acquire())
+    eventually(lambda: owned() == [("cmd",)])
+    one.wait(cmd.release())
+    eventually(lambda: owned() == [()])
 
 
 @pytest.mark.parametrize("front", FRONTS)

@@ -49,11 +49,17 @@ class Lease:
         self._renewed = 0.0  # when the server answered the last renewal, by this process's clock
         self._lost = "the lease was not acquired yet"
         self.connection = LeaseConnection(self, session)
+        session.activities.leases.add(self)
 
     @property
     def lost(self) -> bool:
         """Whether the next write raises LeaseLost, as far as is known without asking the server."""
         return bool(self._reason())
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the program owns the key, as far as is known. Another thread may ask, so nothing is noted."""
+        return not self._lost and time.monotonic() - self._renewed <= self._milliseconds / 1000
 
     @property
     def number(self) -> int:

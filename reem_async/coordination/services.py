@@ -207,8 +207,7 @@ class Served(Listener):
         except NotAllowed as error:
             raise explained(error) from None
         kept[self.id] = self
-        self._session.activities.add("serves", self.where)
-        self._session.activities.add("serves", self.where)
+        self._session.activities.add_service(self.where)
 
     async def close(self) -> None:
         """Stop serving. Requests that wait go to other servers, and those being handled are given up."""
@@ -216,7 +215,6 @@ class Served(Listener):
             return
         self._end()
         self._manager.kept.pop(self.id, None)
-        self._session.activities.remove("serves", self.where)
         try:
             await self._manager.unfollow_here(self)
             waiting = {*self._waiting}
@@ -231,7 +229,7 @@ class Served(Listener):
 
     def _end(self) -> None:
         self.closed.set()
-        self._session.activities.remove("serves", self.where)
+        self._session.activities.remove_service(self.where)
 
     def lost(self, reason: Exception) -> None:
         """Go on after a lost connection, which comes back; end with the interface."""
