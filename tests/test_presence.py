@@ -73,23 +73,17 @@ def named(server_url, key):
         yield open_as
 
 
-@pytest.mark.parametrize("kind", FRONTS)
-def test_nodes_are_listed_with_what_they_do_until_they_close(named, kind, raw, key, cli):
+def test_nodes_are_listed_with_what_they_do_until_they_close(named, raw, key, cli):
     """In the order of their names; two may have one name. No tool takes them for data, and nothing is left."""
-    one, other, unnamed = named(kind, "planner"), named("blocking", "planner"), named(kind, None)
-    space = (reem if kind == "blocking" else reem_async).PublishSpace(one.interface)
-    one.wait(space["plan"].write([1]))
-    activities = (one.interface._direct if kind == "blocking" else one.interface).session.activities
+    one, other, unnamed = named("blocking", "planner"), named("blocking", "planner"), named("blocking", None)
+    reem.PublishSpace(one.interface)["plan"] = [1]
+    activities = one.interface._direct.session.activities
     for name in ("policy", "policy", "map"):
         activities.add_service(name)
     activities.remove_service("policy")
     activities.remove_service("nothing")
 
-    def nodes():
-        if kind == "asyncio":
-            one.run(asyncio.sleep(0.02))
-        return unnamed.wait(unnamed.interface.nodes())
-
+    nodes = unnamed.interface.nodes
     eventually(lambda: sorted(node.publishes for node in nodes()) == [(), ("plan",)])
     first, second = sorted(nodes(), key=lambda node: not node.publishes)
     assert (first.name, second.name, first.pid, second.pid) == ("planner", "planner", os.getpid(), os.getpid())
