@@ -21,8 +21,9 @@ import reem
 import reem_async
 from reem_async.local import mailbox
 from reem_async.local.host import host, reason_against
-from reem_async.local.mailbox import FOLLOWS, JOINED, PUBLISHER, SUBSCRIBER, UPDATE, Mailbox
+from reem_async.local.mailbox import FOLLOWS, JOINED, PUBLISHER, SUBSCRIBER, UPDATE, Mailbox, Subscribers
 from reem_async.plan.keys import keys_of
+from reem_async.pubsub.early import EarlyInbox
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
 
@@ -210,6 +211,35 @@ def test_ctrl_c_at_any_instant_leaves_a_program_that_is_notified_early(server_ur
             process.send_signal(signal.SIGINT)
             assert line_of(process.stdout.fileno()).strip() == "early"
         assert len(os.listdir(folder)) == 2
+
+
+async def test_after_the_folder_was_removed_updates_are_early_again(server_url, key, folder):
+    """As by a program that empties /tmp."""
+    async with Pair(server_url, key("cam")) as pair:
+        for _ in range(2):
+            assert await pair.go_round()
+            shutil.rmtree(folder)
+            assert not await pair.go_round()
+            pair.one.session.local._audiences.clear()  # so that the publisher asks now, not within a second
+            await pair.go_round()
+        assert len(os.listdir(folder)) == 2
+
+
+async def test_all_subscribers_of_a_key_are_notified_early_though_a_queue_has_room_for_few_answers(folder):
+    """A publisher's queue often has room for 10 of them."""
+    publisher, inboxes = Subscribers(), [EarlyInbox(lambda *_: None) for _ in range(30)]
+    address = publisher.ask(b"channel")
+    for inbox in inboxes:
+        inbox.answer(b"channel", address)
+    publisher.take_answers()
+    assert publisher.count(b"channel") < len(inboxes)
+    async with asyncio.timeout(PATIENCE):
+        while publisher.count(b"channel") < len(inboxes):
+            await asyncio.sleep(0.01)
+            publisher.take_answers()
+    for each in (publisher, *inboxes):
+        each.close()
+    assert not os.listdir(folder)
 
 
 async def test_a_program_that_is_stopped_costs_nothing_but_its_own_early_updates(server_url, key, folder):

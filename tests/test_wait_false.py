@@ -5,6 +5,7 @@ import contextlib
 import os
 import pickle
 import random
+import re
 import signal
 import sys
 import threading
@@ -13,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import redis
 from chaos.proxy import Proxy
 from conftest import FRONTS, PATIENCE, assert_same, eventually, python, sized
 
@@ -20,6 +22,7 @@ import reem
 import reem_async
 from reem_async.concurrency.queues import Every, Last
 from reem_async.errors import BadInput, BadType, BadValue, InterfaceClosed, Misuse, NotConnected, PathRefused
+from reem_async.plan.keys import keys_of
 from reem_async.store import outage, send_queue
 
 
@@ -497,3 +500,32 @@ def test_early_updates_arrive_while_the_server_does_not_answer(publisher, server
         # that the server has not confirmed may be delivered again, with the value that was read (promise 19).
         numbers = [sequence for sequence, _, _ in told]
         assert large or front.kvs.dropped or numbers == sorted(set(numbers))
+
+
+def test_an_early_update_that_was_kept_in_an_outage_says_how_late_it_is(publisher, server, reader):
+    """So that it does not count as fresh where it is sent at last (`ttl=`)."""
+    with Proxy(server.port) as proxy, redis.Redis.from_url(server.url) as admin, admin.pubsub() as channel:
+        front = publisher(proxy.url, "newest", local="early", timeout=PATIENCE)
+        with reader["a"].watch(Every(1000)) as watch:
+            for number in range(20):  # the sender finds the subscriber
+                front.write(["a"], number)
+                front.flush()
+                front.sleep(0.01)
+            channel.subscribe(keys_of("a").channel)
+            assert channel.get_message(timeout=PATIENCE)["type"] == "subscribe"
+            front.sleep(0.3)  # what the server reports as changed has been read
+            proxy.black_hole()
+            front.write(["a"], -1)  # on its way, and lost
+            front.sleep(0.1)
+            front.write(["a"], -2)
+            while (update := next(watch)).value != -2:
+                pass
+            assert update.early
+            front.sleep(0.2)
+            proxy.reset()
+            proxy.heal()
+            front.flush()
+            message = channel.get_message(timeout=PATIENCE)
+            late = re.search(rb'"late":([0-9.]+)', message["data"])
+            assert late is not None
+            assert float(late[1]) >= 0.2

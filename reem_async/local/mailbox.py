@@ -82,10 +82,19 @@ class Mailbox:
         self._buffer = bytearray(_LARGEST) if role == SUBSCRIBER else None
         _all.add(self)
 
+    @property
+    def is_there(self) -> bool:
+        """Whether others can find it: it is open, and its file was not removed, as when a program empties /tmp."""
+        return self.close.alive and os.path.exists(f"{self._folder}/{self.address}")
+
+    def try_send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> None:
+        """Send without waiting; raises OSError, which is a BlockingIOError if the receiver's queue is full."""
+        self._socket.sendto(_HEAD.pack(kind, len(channel)) + channel + content, f"{self._folder}/{address}")
+
     def send(self, address: str, kind: bytes, channel: bytes, content: bytes = b"") -> bool:
         """Send without waiting; return False if that address does not exist any more."""
         try:
-            self._socket.sendto(_HEAD.pack(kind, len(channel)) + channel + content, f"{self._folder}/{address}")
+            self.try_send(address, kind, channel, content)
         except (ConnectionRefusedError, FileNotFoundError):
             return False
         except OSError:  # its queue is full, this mailbox is closed, or the system has no memory for it now
@@ -179,7 +188,7 @@ class Subscribers:
 
     def ask(self, channel: bytes) -> bytes:
         """Return the address at which the subscribers of a channel are to answer; empty if there is none now."""
-        if self._mailbox is None or not self._mailbox.close.alive:  # a forked child needs its own
+        if self._mailbox is None or not self._mailbox.is_there:  # a forked child needs its own
             try:
                 self._mailbox = Mailbox(PUBLISHER)
             except OSError:
@@ -192,7 +201,8 @@ class Subscribers:
     def take_answers(self) -> list[bytes]:
         """Note the answers that have arrived; return the channels that a subscriber has joined."""
         joined: list[bytes] = []
-        while self._mailbox is not None and (it := self._mailbox.receive()) is not None:
+        mailbox = self._mailbox  # another thread may close the interface meanwhile
+        while mailbox is not None and (it := mailbox.receive()) is not None:
             address, known = it.content.decode(errors="replace"), self._known.get(it.channel)
             if it.kind == JOINED:
                 joined.append(it.channel)

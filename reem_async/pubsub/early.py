@@ -11,6 +11,9 @@ if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
     from ..local.mailbox import FOLLOWS, JOINED, SUBSCRIBER, UPDATE, Mailbox, is_address, publishers
 
 _AT_ONCE = 100  # datagrams that are taken in one turn of the event loop
+# The queue of a publisher often has room for 10 answers. It reads them when it publishes.
+_RETRY = 0.03  # seconds until an answer is sent once more
+_RETRIES = 10  # of an answer
 
 
 class EarlyInbox:
@@ -26,6 +29,8 @@ class EarlyInbox:
         self._loop = asyncio.get_running_loop()
 
     def _opened(self) -> Mailbox | None:
+        if self._mailbox is not None and not self._mailbox.is_there:
+            self.close()
         if self._mailbox is None:
             try:
                 self._mailbox = Mailbox(SUBSCRIBER)
@@ -45,9 +50,20 @@ class EarlyInbox:
     def answer(self, channel: bytes, publisher: bytes) -> None:
         """Answer a publisher that asks, through the server, for the subscribers of a channel."""
         address = publisher.decode(errors="replace")
-        mailbox = self._opened() if is_address(address) else None
-        if mailbox is not None:
-            mailbox.send(address, FOLLOWS, channel, mailbox.address.encode())
+        if is_address(address) and self._opened() is not None:
+            self._answer(channel, address, _RETRIES)
+
+    def _answer(self, channel: bytes, address: str, retries: int) -> None:
+        mailbox = self._mailbox
+        if mailbox is None:
+            return
+        try:
+            mailbox.try_send(address, FOLLOWS, channel, mailbox.address.encode())
+        except BlockingIOError:  # many subscribers have answered
+            if retries:
+                self._loop.call_later(_RETRY, self._answer, channel, address, retries - 1)
+        except OSError:  # the publisher is gone, or the system has no memory for it now
+            pass
 
     def read(self) -> None:
         """Take what has arrived."""

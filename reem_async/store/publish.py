@@ -33,6 +33,9 @@ from .send_queue import outages
 _ANSWERS, _ANSWER = 5, 0.001
 """How often an early publisher looks for the answers of new subscribers on this host, and seconds between two looks."""
 
+_PROMPT = 0.01
+"""Seconds after the call up to which a notice says what the early one said: after that, how late it is matters."""
+
 _Stamp = tuple[str, int]  # publisher and number of an update
 
 
@@ -260,9 +263,9 @@ class ValueAnnouncement(UpdateAnnouncement):
         return self._numbered(path, super()._payload)
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
-        if self._early is not None and self._early[0] == stamp:
-            return self._early[1]
         moment, extras = self._when()
+        if self._early is not None and self._early[0] == stamp and extras.late < _PROMPT:
+            return self._early[1]
         if self._slot is not None:
             return in_slot(*stamp, moment, path, self._slot, self._text, self._attachments, extras)
         return with_value(*stamp, moment, path, self._text, self._attachments, extras)
