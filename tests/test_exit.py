@@ -18,7 +18,7 @@ class AtEnd:
     def __del__(self):
         last()
 
-class Handler(logging.Handler):
+class Handler(logging.NullHandler):  # asyncio logs what a busy machine makes slow
     def close(self):
         last()
         super().close()
