@@ -36,6 +36,11 @@ def fast(name):
 PROMISES = dict(re.findall(r"^### (\d+\. .*?)\n(.*?)(?=^##|\Z)", TEXT, re.MULTILINE | re.DOTALL))
 
 
+def test_each_number_is_used_once():
+    numbers = [int(promise.partition(".")[0]) for promise in PROMISES]
+    assert sorted(numbers) == list(range(1, len(numbers) + 1))
+
+
 @pytest.mark.parametrize("promise", PROMISES)
 def test_the_fast_run_fails_if_a_promise_breaks(promise):
     """Some promises have nothing but a test that takes long or measures time: none may."""
