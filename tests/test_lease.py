@@ -340,7 +340,7 @@ def cut(raw, name, seconds):
 
 def test_no_write_of_a_former_owner_follows_a_takeover(server_url, raw, key):
     """In the order in which the server applied all writes, while two programs take a key from each other."""
-    name, seconds = key(), sized(3, int(os.environ.get("REEM_LEASE_SECONDS", "30")))
+    name, seconds = key(), sized(2, int(os.environ.get("REEM_LEASE_SECONDS", "30")))
     watching = applied(raw, name)
     next(watching)
     logs = [[], []]

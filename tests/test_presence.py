@@ -158,7 +158,9 @@ def test_who_leaves_without_a_word_is_gone_within_a_second(server, front, fault)
         assert again.since > there.since
 
 
-@pytest.mark.parametrize("keep", [True, False], ids=["with its data", "without"])
+@pytest.mark.parametrize(
+    "keep", [pytest.param(True, marks=pytest.mark.long, id="with its data"), pytest.param(False, id="without")]
+)
 def test_nodes_are_back_within_a_second_after_a_restart(tmp_path, keep):
     """And none is reported to have left, since it has not."""
     port = free_port()
@@ -183,7 +185,7 @@ def test_nodes_are_back_within_a_second_after_a_restart(tmp_path, keep):
     server.stop()
 
 
-@pytest.mark.parametrize("kind", ["cluster", "sentinel"])
+@pytest.mark.parametrize("kind", ["cluster", pytest.param("sentinel", marks=pytest.mark.long)])
 def test_nodes_of_several_servers(kind, request):
     if kind == "cluster":
         url = f"redis+cluster://127.0.0.1:{request.getfixturevalue('cluster_port')}"

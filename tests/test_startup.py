@@ -41,7 +41,9 @@ def cluster_port():
 
 
 @both
-@pytest.mark.parametrize("kind", ["one server", "cluster", "sentinel"])
+@pytest.mark.parametrize(
+    "kind", ["one server", *[pytest.param(it, marks=pytest.mark.long) for it in ("cluster", "sentinel")]]
+)
 def test_the_first_call_waits_for_the_server(name, kind, request):
     """Whichever call is the first, and however often it needs the server."""
     if kind == "sentinel":

@@ -437,7 +437,7 @@ def test_a_link_that_is_cut_again_and_again(publisher, server, reader):
             reader["a"].watch(Every(100_000)) as watch,
             reader["a"].mirror() as mirror,
         ):
-            end = time.monotonic() + sized(3, 30)
+            end = time.monotonic() + sized(2, 30)
             while time.monotonic() < end:
                 if rng.random() < 0.02:
                     rng.choice([proxy.reset, proxy.half_close, lambda: proxy.drop_reply(b"EXEC")])()

@@ -557,10 +557,6 @@ class Accessor(Handle):
         """Answer calls of the service at this place with a function: `@kvs["policy"].serve`, or with a `with` block.
 
         Example:
-            @kvs["policy"].serve
-            async def act(image, state):
-                return {"actions": model(image, state)}
-
             async with kvs["policy"].serve(act, concurrency=2):
                 ...
 
