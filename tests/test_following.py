@@ -134,7 +134,8 @@ def as_callback(request, following):
         pytest.skip("a thread cannot call a coroutine function")
 
     def made(function):
-        async def coroutine(data, updated_path, **kwargs):
+        async def coroutine(data, updated_path, *, update, **kwargs):
+            assert update.path == updated_path
             await asyncio.sleep(0)
             function(data, updated_path, **kwargs)
 
