@@ -127,8 +127,10 @@ async def test_numbers_of_a_long_list_are_updated(key, apspace, akvs, binterface
         updates = [update for update in log.updates() if len(update.path) == 3]
         sums = [math.fsum(log[key()]["l"].at(update.time)) for update in updates[:40]]
         assert sums == list(range(1, 41))
-        assert [len(log[key()]["l"].history()[0]), log[key()]["l"][60].at(log.start)] == [43, 0.0]
-        assert len(set(log[key()]["l"].history()[0])) == 43, "one value for each instant"
+        instants = log[key()]["l"].history()[0].tolist()
+        assert len(instants) in (43, 44)  # the append is fetched: it is one of them if that was before the deletion
+        assert len(set(instants)) == len(instants), "one value for each instant"
+        assert log[key()]["l"][60].at(log.start) == 0.0
         numbers = log[key()]["l"][50].history()[1].tolist()
         assert (numbers[0], 5 in numbers, numbers[-1]) == (0.0, True, 0.0)  # what follows the deleted one has moved
         assert_same(log[key()].at(log.end), whole)
