@@ -14,6 +14,7 @@ import pytest
 from clikit import begins, finished, invoked, is_recording, started
 from conftest import PLAIN, ROOT, assert_same, eventually
 from test_recording import IMAGE
+from test_recording_file import middle_chunk
 from test_unreadable import Pose
 
 from reem import KeyValueStore, NumpyShip, RedisInterface
@@ -112,7 +113,7 @@ def test_record_look_play_export(key, recorded, reem, kvs, tmp_path):
 def test_what_is_damaged_is_said_and_fails(key, recorded, reem, tmp_path):
     file, _ = recorded
     with open_log(file) as log:
-        info = log._container.chunks[len(log._container.chunks) // 2]
+        info = middle_chunk(log, key("a.n"))
     data = bytearray(file.read_bytes())
     data[info.offset + info.length - 5] ^= 1
     file.write_bytes(data)

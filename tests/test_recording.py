@@ -112,7 +112,7 @@ async def test_samples(key, akvs, binterface, file, tmp_path):
     async with Recorder(binterface, [], file, sample=keys) as recorder:
         await aeventually(lambda: recorder.status.messages >= 40)
         await akvs[key("arm")]["joint"].delete()
-        await asyncio.sleep(0.1)
+        await aeventually(lambda: "joint" not in recorder.writer_thread._trees[key("arm")])
     with open_log(file) as log:
         times, values = log[key("arm.joint")].history()
         assert set(values.tolist()) == {0.5}

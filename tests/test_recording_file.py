@@ -199,6 +199,13 @@ def test_metadata_says_who_when_and_what_is_missing(names, file_and_values):
         assert a.rate > 0
 
 
+def middle_chunk(log, path):
+    """The one in the middle of the chunks that have updates of a path."""
+    (number,) = [it.id for it in log._container.channels.values() if it.topic == "/" + path.replace(".", "/")]
+    chunks = [info for info in log._container.chunks if number in info.channels]
+    return chunks[len(chunks) // 2]
+
+
 def check(file, names, seen):
     """Whatever can be read is what was written, and what is missing is counted; returns how many of the values can."""
     found = 0
@@ -367,8 +374,7 @@ def test_a_damaged_index_of_messages_is_found_and_not_trusted(names, file_and_va
 def test_history_goes_on_from_a_keyframe_behind_what_is_damaged(names, file_and_values, tmp_path):
     file, _ = file_and_values
     with open_log(file) as log:
-        chunks = log._container.chunks
-        info = chunks[len(chunks) // 2]
+        info = middle_chunk(log, names("a"))
         whole = log[names("a")]["t"].history()
     damaged, data = tmp_path / "damaged.mcap", bytearray(file.read_bytes())
     data[info.offset + info.length - 5] ^= 1

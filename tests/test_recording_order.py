@@ -158,9 +158,7 @@ async def test_a_sampled_list_that_shrinks(key, akvs, binterface, file):
     async with Recorder(binterface, [], file, sample=samples) as recorder:
         await aeventually(lambda: recorder.status.messages >= 4)
         await akvs[key()]["l"].write([])
-        before = recorder.status.messages
-        await aeventually(lambda: recorder.status.messages > before)
-        await asyncio.sleep(0.2)
+        await aeventually(lambda: recorder.writer_thread._trees[key()] == {"l": []})
     with open_log(file) as log:
         assert set(log[key()]["l"][0].history()[1].tolist()) == {10}
         assert log[key()].at(log.end) == {"l": []}

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import aeventually, assert_same
+from conftest import PATIENCE, aeventually, assert_same
 from test_recording import FRAME, IMAGE
 
 import reem
@@ -31,13 +31,16 @@ def made(server_url, tmp_path_factory):
     with reem.RedisInterface(server_url) as interface:
         space = reem.PublishSpace(interface)
         space[f"{name}arm"] = {"n": 0, "image": IMAGE}
-        with reem.recording.Recorder(interface, [f"{name}*"], file):
+        with reem.recording.Recorder(interface, [f"{name}*"], file) as recorder:
             for number in range(1, 26):
                 space[f"{name}arm"]["n"] = number
                 if number % 10 == 0:
                     space[f"{name}arm"]["image"] = IMAGE + np.uint8(number)
                 if number == 5:
                     space[f"{name}late"] = [1.5, {"frame": FRAME}]
+                if number % 5 == 0:  # what is large is fetched before it is replaced or deleted
+                    interface._wait(recorder._core.fence())
+                    interface._wait(recorder._core._keys.settled(PATIENCE))
                 if number == 15:
                     del space[f"{name}late"]
                 time.sleep(0.02)
