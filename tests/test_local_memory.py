@@ -134,6 +134,7 @@ def test_a_call_that_is_refused_a_slot_leaves_it_to_who_has_it():
     assert number not in late
 
 
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_an_interrupt_in_the_middle_of_writing_leaves_every_slot_free():
     segment, place, reached = Segment(1000), 0, True
     while reached:

@@ -13,7 +13,6 @@ What is lost here, or arrives late, arrives through the server as well.
 
 from __future__ import annotations
 
-import array
 import collections
 import contextlib
 import os
@@ -37,7 +36,7 @@ _LARGEST = 1 << 17  # bytes of a datagram: twice the largest value that is not i
 _ANSWER = 1 << 11  # bytes of a datagram for a publisher: the name of a channel and an address
 _HEAD = struct.Struct("!cH")  # the kind, and the bytes of the channel
 _CREDENTIALS = struct.Struct("3i")  # struct ucred of <sys/socket.h>: process, user, group
-_ANCILLARY = socket.CMSG_SPACE(_CREDENTIALS.size) + socket.CMSG_SPACE(4)
+_ANCILLARY = socket.CMSG_SPACE(_CREDENTIALS.size)  # no room for descriptors: the kernel closes them
 _ADDRESS = re.compile(r"[0-9a-f]{16}[ps][0-9a-f]{16}")
 _PARENT = "/tmp"  # noqa: S108 - the owner of what is below is checked
 _ANSWERED = 2.5  # seconds for which the answer of a subscriber holds: publishers ask each second
@@ -106,17 +105,11 @@ class Mailbox:
         buffer = bytearray(_ANSWER) if self._buffer is None else self._buffer  # threads share a publisher's
         for _ in range(_INVALID):
             try:
-                size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
+                size, ancillary, flags, _ = self._socket.recvmsg_into([buffer], _ANCILLARY)
             except OSError:
                 return None
-            user = None
-            for _, kind, content in ancillary:
-                if kind == socket.SCM_CREDENTIALS and len(content) == _CREDENTIALS.size:
-                    _, user, _ = _CREDENTIALS.unpack(content)
-                elif kind == socket.SCM_RIGHTS:  # REEM sends no descriptors
-                    for number in array.array("i", content[: len(content) // 4 * 4]):
-                        os.close(number)
-            if user == os.getuid() and size >= _HEAD.size and not flags & socket.MSG_TRUNC:
+            users = [_CREDENTIALS.unpack(data)[1] for _, kind, data in ancillary if kind == socket.SCM_CREDENTIALS]
+            if users == [os.getuid()] and size >= _HEAD.size and not flags & socket.MSG_TRUNC:
                 kind, length = _HEAD.unpack_from(buffer)
                 end = _HEAD.size + length
                 if end <= size:

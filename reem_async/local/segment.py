@@ -14,11 +14,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import io
 import mmap
 import os
 import secrets
 import struct
-import weakref
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -59,18 +59,13 @@ _TAKEN = (errno.EAGAIN, errno.EACCES)
 
 
 def lock_for_reading(descriptor: int, number: int) -> bool:
-    """Lock a slot beside other readers; returns False if it is being written."""
+    """Return whether the slot is not being written, and is locked now."""
     return _set(descriptor, fcntl.F_RDLCK, number)
 
 
 def lock_for_writing(descriptor: int, number: int) -> bool:
-    """Lock a slot for oneself; returns False if it is being read."""
+    """Return whether the slot is not being read, and is locked now."""
     return _set(descriptor, fcntl.F_WRLCK, number)
-
-
-def unlock(descriptor: int, number: int) -> None:
-    with contextlib.suppress(OSError):
-        _set(descriptor, fcntl.F_UNLCK, number)
 
 
 def _set(descriptor: int, kind: int, number: int) -> bool:
@@ -102,12 +97,6 @@ def stamp_at(number: int) -> int:
     return _STAMPS + number * STAMP.size
 
 
-class _Writing:
-    """A slot in the hands of one call."""
-
-    __slots__ = ("__weakref__",)
-
-
 class Segment:
     """The shared memory of one publisher and top-level key. Raises OSError if there is no memory, or no descriptor.
 
@@ -118,7 +107,6 @@ class Segment:
         self.shape = Shape(SLOTS, -(-room // mmap.PAGESIZE) * mmap.PAGESIZE)
         self.used = 0.0  # when it was written last, on the clock of its owner
         self._oldest = list(range(SLOTS))
-        self._written: dict[int, weakref.ref[_Writing]] = {}
         # By which other processes reach it
         self.descriptor = os.memfd_create(NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         # Closed with the last reference: another thread may be writing when the interface is closed.
@@ -145,30 +133,14 @@ class Segment:
             pieces: Flat buffers of bytes. Several make up one part where a size spans them.
             sizes: The bytes of each part; see `plan.notices.starts`.
         """
-        for number in self._oldest:
-            writing = self._taken(number)
-            if writing is not None and lock_for_writing(self.descriptor, number):
-                try:
+        # Its own description: its lock goes with it, and keeps out a call that comes in between, in a `__del__`.
+        with io.FileIO(f"/proc/self/fd/{self.descriptor}", "r+") as file:
+            for number in self._oldest:
+                if lock_for_writing(file.fileno(), number):
                     stamp = self._write(number, pieces, sizes)
-                finally:
-                    unlock(self.descriptor, number)
-                    del writing
-                self._oldest = [*(other for other in self._oldest if other != number), number]
-                return number, stamp
+                    self._oldest = [*(other for other in self._oldest if other != number), number]
+                    return number, stamp
         return None
-
-    def _taken(self, number: int) -> _Writing | None:
-        """Return what keeps a slot from other calls of this process as long as it lives; None if one has it.
-
-        They have one description, so its lock does not keep them apart: a handler of signals may publish in the middle.
-        It ends before the call that it came into goes on, so a slot that was free here is free when it is claimed.
-        """
-        other = self._written.get(number)
-        if other is not None and other() is not None:
-            return None
-        writing = _Writing()
-        self._written[number] = weakref.ref(writing)
-        return writing
 
     def _write(self, number: int, pieces: Sequence[Any], sizes: Sequence[int]) -> int:
         STAMP.pack_into(self._map, stamp_at(number), 0)  # broken off in the middle, it belongs to no update

@@ -10,6 +10,8 @@ bytes that are there. Nothing is evaluated or unpickled.
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import math
 import re
 from functools import lru_cache
@@ -30,19 +32,11 @@ _CODE = re.compile(r"[<>|=][biufcSUVMm]\d{1,9}(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
 # Limits for foreign arrays: they bound the memory and the recursion that a header can cost.
 _MOST_FIELDS = 1000
 _MOST_DIMENSIONS = 64  # numpy's own limit
+_DEEPEST = 30  # types in types
 _LARGEST_ITEM = 1 << 20  # bytes: a record of many fields, or a long text
 _LARGEST_HEADER = 1 << 16  # bytes: enough for a thousand fields
 _WIDEST = {"f": 8, "c": 16}  # long doubles differ from machine to machine
-# The tokens of a header. There are no names, operators or f-strings, and integers are short.
-_TOKEN = re.compile(
-    r"""(?P<text>'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")|(?P<word>\d{1,15}(?![\w'"])|True|False)"""
-    r"""|(?P<opening>[\[({])|(?P<closing>[\])}])|(?P<between>[,:])|[ \n]+|(?P<other>[\s\S])"""
-)
-# The escapes that `repr` writes; others, such as \N{...}, are refused.
-_ESCAPE = re.compile(r"\\(?:x([0-9a-f]{2})|u([0-9a-f]{4})|U([0-9a-f]{8})|(.))")
-_SHORT_ESCAPES = {"n": "\n", "r": "\r", "t": "\t", "\\": "\\", "'": "'", '"': '"'}
-_PAIRS = {"(": ")", "[": "]", "{": "}"}
-_DEEPEST = 64  # brackets in brackets
+_TRIES = 100  # to parse a header in Python 3.11, see `_literal`
 _SHORT = 1 << 9  # bytes of a header of which 1024 are cached; of longer ones 16, see below
 _SMALL = 1 << 12  # bytes of data up to which copying them costs less than handling two pieces
 
@@ -190,7 +184,7 @@ def _parse_header(header: bytes) -> tuple[np.dtype[Any], tuple[int, ...]]:
         if set(fields) != {"descr", "fortran_order", "shape"} or fields["fortran_order"] is not False:
             raise ValueError(fields)
         return _dtype(fields["descr"]), _check_shape(fields["shape"])
-    except (TypeError, ValueError, KeyError, IndexError, RecursionError, MemoryError, OverflowError):
+    except (TypeError, ValueError, KeyError, IndexError, SyntaxError, RecursionError, MemoryError, OverflowError):
         raise BadData(f"an array has the header {header[10:100]!r}, which is not that of plain data") from None
 
 
@@ -199,87 +193,37 @@ _parse_short, _parse_long = lru_cache(maxsize=1024)(_parse_header), lru_cache(ma
 
 
 def _literal(text: str) -> Any:
-    """Return the value of a Python literal made of strings, short integers, two words and brackets.
+    """Return the value of a Python literal.
 
-    Not with `ast`: in Python 3.11 it raises SystemError at times when two threads use it at once.
-
-    Raises:
-        ValueError: It is something else, or nested too deep.
+    Python 3.11 raises SystemError at times when several threads parse (https://github.com/python/cpython/issues/106905).
     """
-    # One level for each open bracket: the bracket, and the items found in it so far. No recursion.
-    levels: list[tuple[str, list[Any]]] = [("", [])]
-    kind, items = levels[0]
-    complete = False  # whether an item is there that a comma or the end has to follow
-    for token in _TOKEN.finditer(text):
-        what = token.lastgroup
-        if what is None:
-            continue
-        if what == "between":
-            # Refused: at the beginning; in a dict a colon after a value, or a comma after a key.
-            if not complete or (kind == "{" and len(items) % 2 == 1) != (token["between"] == ":"):
-                raise ValueError(text)
-            complete = False
-        elif what == "closing":
-            if _PAIRS.get(levels.pop()[0]) != token["closing"]:
-                raise ValueError(text)
-            item = _closed(kind, items, complete)
-            kind, items = levels[-1]
-            items.append(item)
-            complete = True
-        # Refused: a foreign token, two items without a comma, too many items, too deep.
-        elif what == "other" or complete or len(items) >= _MOST_FIELDS or len(levels) > _DEEPEST:
-            raise ValueError(text)
-        elif what == "opening":
-            kind, items = token["opening"], []
-            levels.append((kind, items))
-        else:
-            word = token["word"]
-            items.append(
-                _unquoted(token["text"]) if what == "text" else word == "True" if word[0] in "TF" else int(word)
-            )
-            complete = True
-    if len(levels) != 1 or len(items) != 1 or not complete:
-        raise ValueError(text)
-    return items[0]
-
-
-def _closed(kind: str, items: list[Any], complete: bool) -> Any:
-    """Return the list, tuple or dict of items between brackets; `complete` if the last token is no comma."""
-    if kind == "[":
-        return items
-    if kind == "{":
-        return dict(zip(items[::2], items[1::2], strict=True))
-    if complete and len(items) == 1:
-        raise ValueError(items)  # brackets alone make no tuple
-    return tuple(items)
-
-
-def _unquoted(text: str) -> str:
-    """Return the text in quotes; raises ValueError or KeyError for escapes that `repr` does not write."""
-    return _ESCAPE.sub(lambda it: _SHORT_ESCAPES[it[4]] if it[4] else chr(int(it[1] or it[2] or it[3], 16)), text[1:-1])
+    for _ in range(_TRIES):
+        with contextlib.suppress(SystemError):
+            return ast.literal_eval(text)
+    raise ValueError(text)
 
 
 def _dtype(descr: Any) -> np.dtype[Any]:
     """Return the dtype of a description, built from an allow-list; raises ValueError or TypeError."""
-    dtype: np.dtype[Any] = np.lib.format.descr_to_dtype(_checked(descr, [0]))
+    dtype: np.dtype[Any] = np.lib.format.descr_to_dtype(_checked(descr, [0], 0))
     # Items of no bytes would let a few bytes claim any number of them.
     if dtype.hasobject or not 0 < dtype.itemsize <= _LARGEST_ITEM or dtype.kind not in _KINDS:
         raise ValueError(descr)
     return dtype
 
 
-def _checked(descr: Any, fields: list[int]) -> Any:
+def _checked(descr: Any, fields: list[int], depth: int) -> Any:
     """Return `descr`, refusing all but plain data."""
     if isinstance(descr, str):
         if not _CODE.fullmatch(descr) or int(re.findall(r"\d+", descr)[0]) > _WIDEST.get(descr[1], _LARGEST_ITEM):
             raise ValueError(descr)
         return descr
-    if not isinstance(descr, list):
+    if not isinstance(descr, list) or depth > _DEEPEST:
         raise TypeError(descr)
-    return [_checked_field(field, fields) for field in descr]
+    return [_checked_field(field, fields, depth + 1) for field in descr]
 
 
-def _checked_field(field: Any, fields: list[int]) -> tuple[Any, ...]:
+def _checked_field(field: Any, fields: list[int], depth: int) -> tuple[Any, ...]:
     fields[0] += 1
     if fields[0] > _MOST_FIELDS or not isinstance(field, tuple) or len(field) not in (2, 3):
         raise ValueError(field)
@@ -287,7 +231,7 @@ def _checked_field(field: Any, fields: list[int]) -> tuple[Any, ...]:
     names = name if isinstance(name, tuple) else (name,)
     if len(names) > 2 or not all(isinstance(text, str) for text in names):
         raise ValueError(name)
-    checked = (name, _checked(descr, fields))
+    checked = (name, _checked(descr, fields, depth))
     return (*checked, _check_shape(shape[0])) if shape else checked
 
 
