@@ -16,6 +16,7 @@ from conftest import PATIENCE, PLAIN, aeventually, eventually, subscribed
 
 import reem
 import reem_async
+from reem._portal import finish
 from reem_async.concurrency.timeouts import moved_last
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
 from reem_async.plan import Plan
@@ -297,12 +298,18 @@ async def test_followers_that_are_cut_off_are_told_whatever_else_works(server):
         assert heard == ["lost", "reconnecting", "connected"]
 
 
+def two_idle(transport):
+    """Two connections of the blocking front, the one that is taken next last."""
+    lines = [transport._take() or finish(transport._opened()) for _ in range(2)]
+    for line in lines:
+        transport._give(line)
+    return lines
+
+
 def test_a_blocking_call_that_finds_another_connection_has_lost_nothing(server):
     with reem.RedisInterface(server) as interface:
         transport, heard = interface._direct.session.transport, []
-        first, second = transport._take(), transport._take()
-        transport._give(first)
-        transport._give(second)
+        first, second = two_idle(transport)
         interface.on_state(lambda change: heard.append(change.state))
         killed_connections(server, id=str(second.exchange([("CLIENT", "ID")])[0]))
         eventually(lambda: not second.fresh())
@@ -317,8 +324,7 @@ def test_a_blocking_call_that_finds_another_connection_has_lost_nothing(server):
 def test_a_blocking_call_that_fails_leaves_no_state_behind_that_the_next_one_does_not_mend(server):
     with reem.RedisInterface(server, timeout=0.3) as interface:
         transport = interface._direct.session.transport
-        for line in [transport._take(), transport._take()]:
-            transport._give(line)
+        two_idle(transport)
         with stopped(server), pytest.raises(ConnectionLost):
             reem.KeyValueStore(interface)["foo"].read()
         assert interface.state == "lost"

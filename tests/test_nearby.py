@@ -20,7 +20,7 @@ from reem.errors import ConnectionLost, NotConnected
 from reem_async.server import EmbeddedServer
 from reem_async.tools.recording import open_log
 from reem_async.transport import options as options_module
-from reem_async.transport.options import NodeOptions, Options, SocketOptions, look_nearby
+from reem_async.transport.options import NodeOptions, Options, look_nearby
 
 pytestmark = pytest.mark.skipif(
     not hasattr(socket, "SO_PEERCRED"), reason="this system does not tell who listens at a socket"
@@ -132,16 +132,6 @@ def test_another_server_at_the_same_path_is_not_taken(server, connect):
         assert not any(ways(server) + ways(other))
 
 
-def test_not_even_if_its_process_had_the_same_number(server, connect, monkeypatch):
-    """As in two containers that share a folder, and both begin to count at 1."""
-    monkeypatch.setattr(SocketOptions, "_check_listener", lambda self, listening: None)
-    with EmbeddedServer() as other:
-        Path(server.socket_path).unlink()
-        shutil.move(other.socket_path, server.socket_path)
-        goes_on(connect(server.port))
-        assert not any(ways(server) + ways(other))
-
-
 def test_a_stranger_at_the_path_gets_no_password(connect):
     heard = []
     with (
@@ -151,14 +141,6 @@ def test_a_stranger_at_the_path_gets_no_password(connect):
         goes_on(connect(server.port, password="secret"))
         eventually(lambda: heard)
         assert set(heard) == {b""}  # connected to, and left without a word
-        assert not any(ways(server))
-
-
-@pytest.mark.parametrize("said", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 100, b""])
-def test_nonsense_at_the_path_does_no_harm(server, connect, monkeypatch, said):
-    monkeypatch.setattr(SocketOptions, "_check_listener", lambda self, listening: None)
-    with in_place_of(server, lambda connection: (connection.recv(1000), connection.sendall(said))):
-        goes_on(connect(server.port))
         assert not any(ways(server))
 
 

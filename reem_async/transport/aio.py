@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import partial
 from typing import Any
 
 from ..concurrency.locks import Locks
@@ -17,10 +18,10 @@ from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Guard, Held, document_of
 from .composite import OneServer
-from .options import INFO_SERVER, Options, ServerSocket, server_run_id
+from .options import Options, server_run_id
 from .state import States
 from .text import HeldText, Text
-from .wire import BUFFER, Wire, close_all, first_answer, open_wire
+from .wire import BUFFER, Wire, close_all, open_wire
 
 # Connections for WATCH that are kept for the next caller; more at the same time are made and closed again.
 _SPARE = 4
@@ -134,13 +135,6 @@ class AsyncTransport(OneServer):
         large: bool = False,
     ) -> Wire:
         """Return a new connection, unless the interface was closed while it was made."""
-        has_answered = False
-
-        def answered(replies: list[Reply] | Exception) -> None:
-            nonlocal has_answered
-            if isinstance(replies, list):
-                has_answered = True
-                self.states.opened(self._options.address, server_run_id(replies))
 
         def gone(wire: Wire, reason: Exception) -> None:
             self._open.discard(wire)
@@ -148,61 +142,34 @@ class AsyncTransport(OneServer):
                 self.states.lost(reason)
                 on_lost(wire, reason)
             elif not isinstance(reason, InterfaceClosed):
-                self._missed(reason, reconnect=has_answered)
+                self._missed(reason)
 
-        nearby = self._options.nearby
-        wire = await (open_wire(self._options, large=large) if nearby is None else self._nearest(nearby, large))
+        nearby, connect = self._options.nearby, partial(open_wire, large=large)
+        wire = await (connect(self._options) if nearby is None else nearby.connected(connect))
         # Closed while this was made: the connection has no other owner.
         if self._closed:
-            await wire.close()
+            await wire.discard()
             self.check()
-        self._open.add(wire)
+        if wire.alive:
+            self._open.add(wire)
         wire.on_push, wire.on_lost = on_push, gone
-        wire.send([INFO_SERVER], answered)
+        self.states.opened(self._options.address, server_run_id(wire.introduction))
         return wire
 
-    def _missed(self, reason: Exception, *, reconnect: bool) -> None:
+    def _missed(self, reason: Exception) -> None:
         """Find out whether the server is gone when a connection for calls breaks: the next call may be long after.
 
-        `reconnect`: then try to connect, once. Not for a server that hung up after the greeting.
+        Then try to connect, once.
         """
         for other in list(self._open):  # one that does not answer in time breaks as well; the last one tells
             if not other.busy:  # else what it owes already tells, and sooner: the last question would be waited for
                 other.send([_PING], lambda _: None)
-        if not self._open and self.states.lost(reason) and reconnect:
+        if not self._open and self.states.lost(reason):
             self._tasks.start(self._made_anew(), "reem connect")
 
     async def _made_anew(self) -> None:
         with contextlib.suppress(ReemError, OSError):  # the next call says what is the matter
             await self._lane(False)
-
-    async def _nearest(self, nearby: ServerSocket, large: bool) -> Wire:
-        """Return a new connection: through the server's socket, if it is found."""
-        through = await self._through(nearby, large)
-        if through is not None:
-            return through
-        wire = await open_wire(self._options, large=large)
-        # Only the server itself says where its socket is, so the first connection always goes to the address.
-        nearby.learn(await first_answer(wire, INFO_SERVER, self._options))
-        try:
-            through = await self._through(nearby, large)
-        except BaseException:
-            await wire.close()
-            raise
-        if through is None:
-            return wire
-        await wire.close()
-        return through
-
-    async def _through(self, nearby: ServerSocket, large: bool) -> Wire | None:
-        way = nearby.way
-        if way is None:
-            return None
-        try:
-            return await open_wire(way, large=large)
-        except ReemError as error:
-            nearby.give_up(way, error)
-            return None
 
     def check(self) -> None:
         if self._closed:
@@ -288,7 +255,7 @@ class AsyncTransport(OneServer):
         if wire.alive and (is_awaited or len(self._spare) < _SPARE) and not self._closed:
             self._spare.append(wire)
         else:
-            await wire.close()
+            await wire.discard()
 
     async def open_kept(self) -> _Lent:
         """Return a connection that its caller keeps for long."""
@@ -304,7 +271,7 @@ class AsyncTransport(OneServer):
             self._leaving.add(lent.wire)
             self._tasks.start(self._close_idle(lent.wire), "reem close")
         else:
-            await lent.wire.close()
+            await lent.wire.discard()
 
     async def _opened_to_lend(self, asked: float) -> Wire:
         if self._failed_attempt is not None and self._failed_attempt[0] >= asked:
@@ -321,7 +288,7 @@ class AsyncTransport(OneServer):
             # Answered in order, so behind what is on its way.
             await wire.roundtrip([_PING])
         self._leaving.discard(wire)
-        await wire.close()
+        await wire.discard()
 
     async def pause(self, seconds: float) -> None:
         await asyncio.sleep(seconds)

@@ -21,11 +21,11 @@ import redis.exceptions
 from ..concurrency.locks import Inherited, Locks, ThreadLock, WeakList
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
-from ..errors import ConnectionLost, InterfaceClosed, ReemError
+from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from . import Guard, Held
 from .composite import OneServer
-from .options import INFO_SERVER, Options, ServerSocket, server_run_id
+from .options import INFO_SERVER, Options, server_run_id
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
 from .state import States
@@ -78,7 +78,7 @@ class _Line:
         except ConnectionLost as error:
             raise options.unanswered(error) from error
         self.plain = bool(probed) and is_plain(probed[0])
-        self._states.opened(options.address, server_run_id([self.introduction]))
+        self._states.opened(options.address, server_run_id(self.introduction))
         lines.add(self)
 
     def _set_limit(self, limit: float) -> None:
@@ -195,6 +195,9 @@ class _Line:
         self._states.lost(error)
         return error
 
+    async def discard(self) -> None:
+        self.close()
+
     def close(self) -> None:
         self.broken, self.waiting = True, False
         self._connection.disconnect()
@@ -246,7 +249,8 @@ class BlockingTransport(OneServer):
         self._kept: set[_Line] = set()  # lent for long
         self._orders = Locks(ThreadLock)
 
-    def _take(self) -> _Line:
+    def _take(self) -> _Line | None:
+        """Return an idle connection, None if there is none."""
         if self._closed:
             self.check()
         stale: _Line | None = None
@@ -256,41 +260,18 @@ class BlockingTransport(OneServer):
             except IndexError:
                 if stale is not None:  # there was none left
                     stale.lost("the server closed an idle connection")
-                return self._opened()
+                return None
             if line.fresh():
                 return line
             line.close()
             stale = line
 
-    def _opened(self) -> _Line:
-        """Return a new connection: through the server's socket, if that is looked for and found."""
+    async def _opened(self) -> _Line:
         nearby = self._options.nearby
-        if nearby is None:
-            return _Line(self._options, self.states, self._lines)
-        through = self._through(nearby)
-        if through is not None:
-            return through
-        line = _Line(self._options, self.states, self._lines)
-        nearby.learn([line.introduction])
-        try:
-            through = self._through(nearby)
-        except BaseException:
-            line.close()
-            raise
-        if through is None:
-            return line
-        line.close()
-        return through
+        return await (self._connected(self._options) if nearby is None else nearby.connected(self._connected))
 
-    def _through(self, nearby: ServerSocket) -> _Line | None:
-        way = nearby.way
-        if way is None:
-            return None
-        try:
-            return _Line(way, self.states, self._lines)
-        except ReemError as error:
-            nearby.give_up(way, error)
-            return None
+    async def _connected(self, options: Options) -> _Line:
+        return _Line(options, self.states, self._lines)
 
     def _give(self, line: _Line) -> None:
         if line.broken:
@@ -307,20 +288,27 @@ class BlockingTransport(OneServer):
                 self._idle.pop().close()
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        line = self._take()
+        line = self._take() or await self._opened()
         try:
             if not line.plain:
                 return line.exchange(commands, bulk)
             sent = self._text.shortcut(commands)
             if sent is not None:
                 return self._text.finished(commands, line.exchange(sent, bulk))
-            return await self._text.roundtrip(line.roundtrip, _BorrowedConnection(self, line), commands, bulk)
+        finally:
+            self._give(line)
+        return await self._text.roundtrip(self._as_it_is, self, commands, bulk)
+
+    async def _as_it_is(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
+        line = self._take() or await self._opened()
+        try:
+            return line.exchange(commands, bulk)
         finally:
             self._give(line)
 
     @asynccontextmanager
     async def hold(self, guard: Guard | None = None) -> AsyncIterator[Held]:
-        line = self._take()
+        line = self._take() or await self._opened()
         held: Held = line
         if guard is not None:
             self._kept.add(line)
@@ -368,25 +356,6 @@ class BlockingTransport(OneServer):
 
     async def release(self) -> None:
         self._close_idle()
-
-
-class _BorrowedConnection:
-    """A connection that is taken already, lent once more; it is broken if the caller leaves with an error."""
-
-    def __init__(self, transport: BlockingTransport, line: _Line) -> None:
-        self._line = line
-        self._text = transport._text
-        self.ordered = transport.ordered
-
-    def hold(self) -> _BorrowedConnection:
-        return self
-
-    async def __aenter__(self) -> Held:
-        return HeldText(self._line, self._text)
-
-    async def __aexit__(self, kind: object, *_: object) -> None:
-        if kind is not None:
-            self._line.close()
 
 
 # redis-py closes only the child's descriptors of the parent's connections, without a word to the server.

@@ -15,8 +15,8 @@ import ssl
 import struct
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
 
 import redis
 import redis.asyncio
@@ -40,6 +40,8 @@ from .packing import Packer
 from .parsing import LARGEST
 
 Address = tuple[str, int]  # host and port
+
+Connection = TypeVar("Connection", bound=Any)  # of either front
 
 INFO_SERVER: Command = ("INFO", "server")
 """Asked once per connection. Restarts are not noticed without the right to it."""
@@ -276,37 +278,6 @@ def _size(given: Any) -> int:
     return size
 
 
-def connecting_by(connection: Any, way: Callable[..., Any]) -> Any:
-    """Have a connection of redis-py connect by `way`, which is given the connection and its own way."""
-    connect = connection.connect
-    connection.connect = lambda: way(connection, connect)
-    return connection
-
-
-async def question(connection: Any, commands: Sequence[Command], check: Callable[[Any, Any], None]) -> None:
-    """Send `commands` on a new asyncio connection; `check` looks at the last reply. What is raised closes it."""
-    try:
-        for command in commands:
-            await connection.send_command(*command)
-            reply = await connection.read_response()
-        check(reply, connection)
-    except BaseException:
-        await connection.disconnect(nowait=True)
-        raise
-
-
-def question_here(connection: Any, commands: Sequence[Command], check: Callable[[Any, Any], None]) -> None:
-    """Do as `question`, on a blocking connection."""
-    try:
-        for command in commands:
-            connection.send_command(*command)
-            reply = connection.read_response()
-        check(reply, connection)
-    except BaseException:
-        connection.disconnect()
-        raise
-
-
 _CERTIFICATE = (
     "if it asks clients for certificates, give one that it trusts, with its key: the options ssl_certfile and "
     "ssl_keyfile (in the URL: ?ssl_certfile=FILE&ssl_keyfile=FILE)"
@@ -374,11 +345,10 @@ def _shown(reason: BaseException, text: str) -> str:
     return f"{text:.200}" or type(reason).__name__
 
 
-def server_run_id(replies: Any) -> str | None:
-    """Return what the server's process calls itself, None if it did not say (or if an error is given)."""
-    # An error, or a user without the right: restarts are then not noticed, and all else goes on.
-    text = replies[0] if isinstance(replies, list) and replies else None
-    found = _RUN.search(text) if isinstance(text, bytes | bytearray) else None
+def server_run_id(introduction: Any) -> str | None:
+    """Return what the server's process calls itself in the reply to `INFO_SERVER`; None if it did not say."""
+    # A user without the right gets an error: restarts are then not noticed, and all else goes on.
+    found = _RUN.search(introduction) if isinstance(introduction, bytes | bytearray) else None
     return None if found is None else found[1].decode()
 
 
@@ -403,27 +373,50 @@ class ServerSocket:
         # How to reach it through the socket; None as long as none is known, or of use.
         self.way: SocketOptions | None = None
 
-    def learn(self, replies: Any) -> None:
+    def _learn(self, introduction: Any) -> None:
         """Note what the server at the address says of itself, asked who it is.
 
         Where its port is another one, something stands in between, on purpose: a tunnel, or a proxy.
         """
-        process = server_run_id(replies)
+        process = server_run_id(introduction)
         # The socket of this process was tried and does not work (another container, no right to it): not again.
         if process is None or process == self._vain:
             return
-        port, pid, path = (pattern.search(replies[0]) for pattern in (_PORT, _PID, _SOCKET))
+        port, pid, path = (pattern.search(introduction) for pattern in (_PORT, _PID, _SOCKET))
         if port and pid and path and int(port[1]) == int(self._options.settings.get("port", 6379)):
             self.way = SocketOptions(self._options, os.fsdecode(path[1]), process, int(pid[1]))
 
-    def give_up(self, way: SocketOptions, error: Exception) -> None:
-        """Note that `way` could not be gone. As long as the same process is at the address, it is not tried again.
+    async def connected(self, connect: Callable[[Options], Awaitable[Connection]]) -> Connection:
+        """Return a new connection that `connect` makes: through the socket, if it is found."""
+        by_socket = await self._through(connect)
+        if by_socket is not None:
+            return by_socket
+        connection = await connect(self._options)
+        # Only the server itself says where its socket is, so the first connection always goes to the address.
+        self._learn(connection.introduction)
+        try:
+            by_socket = await self._through(connect)
+        except BaseException:
+            await connection.discard()
+            raise
+        if by_socket is None:
+            return connection
+        await connection.discard()
+        return by_socket
 
-        Raises the error if it says that the server does not answer in time: it will not at its address either.
-        """
-        if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
-            raise error
-        self._vain, self.way = way.process, None
+    async def _through(self, connect: Callable[[Options], Awaitable[Connection]]) -> Connection | None:
+        way = self.way
+        if way is None:
+            return None
+        try:
+            return await connect(way)
+        except ReemError as error:
+            # A server that does not answer in time will not at its address either.
+            if isinstance(error.__cause__, TimeoutError | redis.exceptions.TimeoutError):
+                raise
+            # As long as the same process is at the address, its socket is not tried again.
+            self._vain, self.way = way.process, None
+            return None
 
 
 class SocketOptions(Options):
@@ -444,7 +437,7 @@ class SocketOptions(Options):
         return self._by_address
 
     def asynchronous_connection(self) -> Any:
-        connection = connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
+        connection = super().asynchronous_connection()
         log_in = connection.on_connect_check_health
 
         async def check_first(**options: Any) -> None:
@@ -456,7 +449,7 @@ class SocketOptions(Options):
         return connection
 
     def blocking_connection(self) -> Any:
-        connection = connecting_by(super().blocking_connection(), self._connect)
+        connection = super().blocking_connection()
         log_in = connection.on_connect_check_health
 
         def check_first(**options: Any) -> None:
@@ -466,14 +459,6 @@ class SocketOptions(Options):
         connection.on_connect_check_health = check_first
         return connection
 
-    async def _connect_asynchronously(self, connection: Any, connect: Any) -> None:
-        await connect()
-        await question(connection, [INFO_SERVER], self._check_process)
-
-    def _connect(self, connection: Any, connect: Any) -> None:
-        connect()
-        question_here(connection, [INFO_SERVER], self._check_process)
-
     def _check_listener(self, listening: Any) -> None:
         """Raise redis.exceptions.ConnectionError if another process listens there: it gets no password."""
         with socket.socket(fileno=os.dup(listening.fileno())) as connected:
@@ -481,8 +466,3 @@ class SocketOptions(Options):
             told = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         if _CREDENTIALS.unpack(told)[0] != self._pid:
             raise redis.exceptions.ConnectionError("another process listens at the server's socket")
-
-    def _check_process(self, reply: Any, _: Any) -> None:
-        """Raise redis.exceptions.ConnectionError if it is another server: its number may be another system's."""
-        if server_run_id([reply]) != self.process:
-            raise redis.exceptions.ConnectionError("another server answers at the server's socket")

@@ -25,14 +25,13 @@ from ..plan import Command, Reply
 from . import Guard, Held, Transport
 from .addresses import address_of, listed
 from .composite import CompositeTransport, NewTransport
-from .options import Address, NodeOptions, Options, connecting_by, question, question_here
+from .options import Address, NodeOptions, Options
 from .state import States
 
 if TYPE_CHECKING:
     from .wire import Wire
 
 _LOOK_PAUSE = 1.0  # seconds between questions to the sentinels
-_ROLE: Command = ("ROLE",)
 _MASTERS: Command = ("SENTINEL", "MASTERS")
 _UNFIT = (b"down", b"disconnected")
 """What the sentinels' flags of a server hold if it cannot be used: s_down, o_down, disconnected."""
@@ -92,24 +91,31 @@ class SentinelOptions(Options):
         return f"{'rediss' if self.tls else 'redis'}+sentinel://{self._hosts}/{self.service}{database}"
 
     def asynchronous_connection(self) -> Any:
-        return connecting_by(super().asynchronous_connection(), self._connect_asynchronously)
+        connection = super().asynchronous_connection()
+        connect = connection.connect
+
+        async def connect_to_primary() -> None:
+            self._go_to(connection, await self.find_primary(_ask))
+            await connect()
+            _check_role(connection)
+
+        connection.connect = connect_to_primary
+        return connection
 
     def blocking_connection(self) -> Any:
-        return connecting_by(super().blocking_connection(), self._connect)
+        connection = super().blocking_connection()
+        connect = connection.connect
 
-    async def _connect_asynchronously(self, connection: Any, connect: Callable[[], Awaitable[None]]) -> None:
-        connection.host, connection.port = await self.find_primary(_ask)
-        self._note((connection.host, connection.port))
-        await connect()
-        await question(connection, [_ROLE], _check_role)
+        def connect_to_primary() -> None:
+            self._go_to(connection, self.primary())
+            connect()
+            _check_role(connection)
 
-    def _connect(self, connection: Any, connect: Callable[[], None]) -> None:
-        connection.host, connection.port = self.primary()
-        self._note((connection.host, connection.port))
-        connect()
-        question_here(connection, [_ROLE], _check_role)
+        connection.connect = connect_to_primary
+        return connection
 
-    def _note(self, address: Address) -> None:
+    def _go_to(self, connection: Any, address: Address) -> None:
+        connection.host, connection.port = address
         before, self.found = self.found, address
         if before not in (None, address):
             self.changed()
@@ -205,8 +211,9 @@ async def _ask_blocking(sentinel: Options, limit: float) -> Any:
         connection.disconnect()
 
 
-def _check_role(role: Any, connection: Any) -> None:
-    if not isinstance(role, list) or role[0] not in (b"master", "master"):
+def _check_role(connection: Any) -> None:
+    greeting = connection.handshake_metadata
+    if (greeting.get(b"role") or greeting.get("role")) not in (b"master", "master"):
         raise redis.exceptions.ConnectionError(f"{connection.host}:{connection.port} is not the primary any more")
 
 

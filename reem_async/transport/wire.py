@@ -24,7 +24,7 @@ from ..concurrency.timeouts import LOOKS, confirmed, moved_last, server_timeout,
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
-from .options import Options, is_this_machine
+from .options import INFO_SERVER, Options, is_this_machine
 from .packing import SLOW, Piece, pack
 from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
 from .text import PROBE, is_plain, lists_json, over_wire
@@ -66,6 +66,7 @@ class Wire(asyncio.BufferedProtocol):
         self.pace = 0.0
         # The server tells of keys that were read here and then changed (CLIENT TRACKING); None if not asked.
         self.tracked: bool | None = None
+        self.introduction: Reply = None  # the reply to INFO_SERVER
         self.plain = False  # the server has no JSON module; what reads documents is sent as what reads their text
         self._timeout = timeout
         self._reader = reader
@@ -233,7 +234,7 @@ class Wire(asyncio.BufferedProtocol):
         with contextlib.suppress(RuntimeError):  # the event loop has ended, and the connection with it
             self._loop.call_soon_threadsafe(self.abort, reason)
 
-    async def close(self) -> None:
+    async def discard(self) -> None:
         await close_all([self])
 
     def hang_up(self) -> asyncio.Future[None]:
@@ -393,7 +394,7 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
     """Connect, log in, and return the wire; `large` replies are received in place.
 
     Raises:
-        NotConnected: No server listens there.
+        NotConnected: No server listens there, or it does not answer.
         Refused: The server refused the login.
     """
     connection = options.asynchronous_connection()
@@ -406,21 +407,16 @@ async def open_wire(options: Options, *, large: bool = False) -> Wire:
         raise refused from (refused.__cause__ if refused is error else error)
     wire = Wire(options.timeout, (LargeReader if large else SmallReader)(options.largest))
     wire.take_over(connection)
-    if not lists_json(connection.handshake_metadata):
-        (reply,) = await first_answer(wire, PROBE, options)
-        wire.plain = is_plain(reply)
-    return wire
-
-
-async def first_answer(wire: Wire, question: Command, options: Options) -> list[Reply]:
-    """Ask something over a new connection, which is closed if that goes wrong. Raises NotConnected if it breaks."""
+    known = lists_json(connection.handshake_metadata)
     try:
-        return await wire.roundtrip([question])
+        wire.introduction, *probed = await wire.roundtrip([INFO_SERVER] if known else [INFO_SERVER, PROBE])
     except BaseException as error:
-        await wire.close()
+        await wire.discard()
         if isinstance(error, ConnectionLost):
             raise options.unanswered(error) from error
         raise
+    wire.plain = bool(probed) and is_plain(probed[0])
+    return wire
 
 
 async def close_all(wires: Collection[Wire]) -> None:

@@ -448,7 +448,7 @@ async def _subscribed(interface: RedisInterface) -> tuple[Any, Any]:
     try:
         usual, near = await wire.roundtrip([(subscribe, keys.channel), (subscribe, session.local.channel(keys))])
     finally:
-        await wire.close()
+        await wire.discard()
     return usual, near
 
 
