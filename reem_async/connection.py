@@ -46,8 +46,8 @@ class RedisInterface:
             of an update for each top-level key. Beyond that, values go through the server.
         wait: Seconds for which the first connection is tried again if the server is not up yet, for programs that start
             at boot. Each call waits up to this long, counted from the first one that found no server; then it raises
-            NotConnected. What waiting cannot cure is raised at once: a wrong password or certificate, a missing right,
-            something that is no server of Redis. Once connected, calls to a lost server raise at once.
+            NotConnected. A warning in the log says why it waits. A wrong password or a missing right is raised at once.
+            Once connected, calls to a lost server raise at once.
         name: What other programs call this one: `nodes` lists it, with host, process id and what it publishes, serves
             and owns. It costs four small round trips a second, from the first connection on, until the interface is
             closed. Several programs may have one name. Without a name nothing is sent.

@@ -19,7 +19,7 @@ from .concurrency.tasks import Tasks
 from .concurrency.timeouts import LONGEST
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
 from .local.path import LocalPath
-from .plan import Plan
+from .plan import Plan, Reply
 from .plan.arguments import check_number
 from .plan.keys import DOCUMENT, Keys, keys_of
 from .plan.paths import LONGEST_TOP_KEY, Pattern, check_namespace, check_top_key, escaped
@@ -244,11 +244,11 @@ class Session(PublisherIdentity):
 
     async def initialize(self) -> None:
         await self.ships.ready()
-        await self.transport.states.startup.retried(self.transport, self._check_server)
-
-    async def _check_server(self) -> None:
         # Any key will do: the test is whether the server knows the command and the user may send it.
-        (reply,) = await self.transport.roundtrip([("JSON.TYPE", f"{self.namespace}reem")])
+        await self.run(Plan([("JSON.TYPE", f"{self.namespace}reem")], self._check_server))
+
+    def _check_server(self, replies: Sequence[Reply]) -> None:
+        (reply,) = replies
         # A missing right to JSON commands is an error; a missing right to this key is not.
         elsewhere = isinstance(reply, NotAllowed) and not is_of_command(reply)
         if isinstance(reply, Refused | ClusterReply) and not elsewhere:

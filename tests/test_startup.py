@@ -5,12 +5,10 @@ import contextlib
 import os
 import signal
 import socket
-import ssl
 import threading
 import time
 
 import pytest
-import redis
 from chaos.proxy import Proxy
 from conftest import FRONTS, PATIENCE, PLAIN, url_of_user
 from own_servers import HOST, caller, free_port, liar, own_server
@@ -18,7 +16,6 @@ from own_servers import HOST, caller, free_port, liar, own_server
 import reem
 import reem_async
 from reem_async.server import EmbeddedCluster, EmbeddedServer
-from reem_async.transport.startup import _may_pass
 
 both = pytest.mark.parametrize("name", FRONTS)
 LACKING = "-type" if PLAIN else "-type -json.type"
@@ -88,19 +85,14 @@ def test_a_server_that_is_lost_later_is_not_waited_for(name):
 
 @both
 def test_what_waiting_cannot_cure_is_raised_at_once(name):
-    """On one server, and where it is the sentinel that is asked."""
     with (
         own_server(f"user robot on >pw ~* &* +@all {LACKING}", "requirepass admin", wait=False) as guarded,
         liar(lambda _: None, greets=False) as closing,
-        liar(lambda _: b"SSH-2.0-OpenSSH_9.6\r\n", greets=False) as strange,
     ):
         begin = time.monotonic()
         refused = {
             url_of_user(guarded.url, "robot", "wrong"): reem.LoginRefused,
             guarded.url: reem.LoginRefused,
-            strange: reem.NotConnected,
-            strange.replace("redis://", "redis+sentinel://") + "/mymaster": reem.NotConnected,
-            strange.replace("redis://", "redis+cluster://"): reem.NotConnected,
         }
         if not PLAIN:  # with the module, the first call looks for its commands
             refused[url_of_user(guarded.url, "robot", "pw")] = reem.NotAllowed
@@ -113,21 +105,6 @@ def test_what_waiting_cannot_cure_is_raised_at_once(name):
         with caller(name, closing, wait=0.5) as made, pytest.raises(reem.NotConnected):
             made(made.interface.initialize)
         assert time.monotonic() - begin > 0.4
-
-
-@pytest.mark.parametrize(
-    ("reason", "passes"),
-    [
-        (ssl.SSLCertVerificationError("unknown authority"), False),
-        (ssl.SSLEOFError("closed in the middle"), True),
-        (redis.exceptions.ClusterDownError("no slots yet"), True),
-        (ConnectionResetError(), True),
-    ],
-)
-def test_a_certificate_is_not_waited_for_but_a_forwarder_is(reason, passes):
-    error = reem.TlsRefused("no TLS")
-    error.__cause__ = reason
-    assert _may_pass(error) is passes
 
 
 def test_ctrl_c_ends_the_wait():

@@ -15,7 +15,7 @@ from __future__ import annotations
 import random
 import secrets
 import time
-from collections.abc import AsyncIterator, Collection, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -177,8 +177,8 @@ class ClusterTransport(CompositeTransport):
 
     # The layout.
 
-    async def look(self, suspects: Collection[Address] = ()) -> None:
-        """Ask a node for the layout of the slots, unless that was just done; the `suspects` only if no other answers.
+    async def look(self) -> None:
+        """Ask a node for the layout of the slots, unless that was just done.
 
         Two nodes are asked in any case, more only within the call's time limit: the next look begins with the others.
 
@@ -193,7 +193,7 @@ class ClusterTransport(CompositeTransport):
             if self._looked > asked - _LOOK_PAUSE:
                 return
             if self._vain is None or self._vain[0] < asked:
-                reason = await self._ask_nodes(suspects)
+                reason = await self._ask_nodes()
                 if reason is None:
                     return
                 self._vain = time.monotonic(), reason
@@ -202,10 +202,10 @@ class ClusterTransport(CompositeTransport):
         kind = TlsRefused if isinstance(reason, TlsRefused) else NotConnected
         raise kind(f"no node of the cluster answers; the last one tried: {reason}") from reason
 
-    async def _ask_nodes(self, suspects: Collection[Address]) -> Exception | None:
+    async def _ask_nodes(self) -> Exception | None:
         """Ask one node after the other until one tells the layout; return None, or why the last one did not."""
         known = {*self._primaries, *self._nodes, *self._options.seeds}
-        order = {each: (each in suspects, self._failed.get(each, 0.0), random.random()) for each in known}  # noqa: S311
+        order = {each: (self._failed.get(each, 0.0), random.random()) for each in known}  # noqa: S311
         deadline = time.monotonic() + self.timeout
         reason: Exception | None = None
         for number, address in enumerate(sorted(known, key=order.__getitem__)):

@@ -6,7 +6,6 @@ import collections
 import logging
 import threading
 import time
-import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -57,16 +56,6 @@ class StateChanges(Stream[StateChange]):
         """Nothing to wait for: it follows from the beginning."""
 
 
-class _Turn:
-    """To call back: it ends with the call that has it, also where that is interrupted."""
-
-    over = False  # it has ended; a traceback may keep it
-
-
-def _nobody() -> None:
-    """Stand for a weak reference to no turn."""
-
-
 class States:
     """The state of one interface. Any thread may call; what is called back runs on the thread that noticed.
 
@@ -84,7 +73,7 @@ class States:
         self._queues: WeakList[BoundedQueue] = WeakList()
         self._callbacks: list[Callable[[StateChange], object]] = []
         self._untold: collections.deque[StateChange] = collections.deque()  # to the callbacks
-        self._turn: Callable[[], _Turn | None] = _nobody
+        self._telling = threading.Lock()  # held by the thread that calls back
         self._servers: dict[str, str] = {}
         _all.add(self)
 
@@ -153,31 +142,17 @@ class States:
 
     def tell(self) -> None:
         """Call back with what was not told yet, unless another call, of this or of another thread, is at it."""
-        if not self._untold:
-            return
-        turn = _Turn()
-        try:
-            while (change := self._next(turn)) is not None:
-                self._untold.popleft()  # not before: an interrupted call leaves it to the next one
-                for callback in tuple(self._callbacks):
-                    try:
-                        callback(change)
-                    except Exception:
-                        logger.exception("a callback for changes of the connection raised")
-        finally:
-            turn.over = True
-
-    def _next(self, turn: _Turn) -> StateChange | None:
-        """Return the next change to report if `turn` has or gets the turn, else None."""
-        with self._lock:
-            holder = self._turn()
-            if holder not in (None, turn) and not holder.over:
-                return None
-            if not self._untold:
-                self._turn = _nobody
-                return None
-            self._turn = weakref.ref(turn)
-            return self._untold[0]
+        while self._untold and self._telling.acquire(blocking=False):
+            try:
+                while self._untold:
+                    change = self._untold.popleft()
+                    for callback in tuple(self._callbacks):
+                        try:
+                            callback(change)
+                        except Exception:
+                            logger.exception("a callback for changes of the connection raised")
+            finally:
+                self._telling.release()
 
     def _change(self, state: State, reason: str, restarted: bool = False) -> None:
         self.last = StateChange(state, reason, time.time(), restarted)
@@ -187,8 +162,8 @@ class States:
             self._untold.append(self.last)
 
     def _forked(self) -> None:
-        # A thread that the child does not have may hold the lock, or have the turn.
-        self._lock, self._turn = threading.RLock(), _nobody
+        # A thread that the child does not have may hold them.
+        self._lock, self._telling = threading.RLock(), threading.Lock()
 
 
 _all = Inherited(States._forked)  # before that of `wire`, which notes a loss
