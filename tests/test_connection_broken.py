@@ -18,6 +18,7 @@ from test_connection import stopped
 
 import reem
 import reem_async
+from reem._portal import finish
 from reem_async.errors import ConnectionLost, InterfaceClosed, NotConnected, PartialWrite
 from reem_async.transport.blocking import BlockingTransport
 from reem_async.transport.options import Options
@@ -107,7 +108,7 @@ def test_a_connection_that_is_given_back_as_the_interface_is_closed_does_not_sta
 
         @property
         def broken(self):  # looked at between the two
-            transport.retire()
+            finish(transport.close())
             return False
 
         def close(self):
@@ -193,16 +194,3 @@ async def test_close_beside_a_server_that_stands_still_keeps_no_socket(server):
         with pytest.raises(InterfaceClosed):
             await writing
         await aeventually(lambda: sockets() == before, timeout=2)
-
-
-async def test_a_way_that_is_not_used_any_more_is_closed_once_nothing_is_due_on_it(server, clients):
-    interface = reem_async.RedisInterface(server)
-    transport = interface.session.transport
-    await interface.initialize()
-    waiting = asyncio.ensure_future(transport.roundtrip([("BLPOP", "nothing", "0.3")]))
-    await asyncio.sleep(0.05)
-    assert not transport.retire()
-    assert await waiting == [None]
-    assert transport.retire()
-    await aeventually(lambda: clients() == 0)
-    await interface.close()

@@ -12,7 +12,7 @@ from loadkit import load
 
 import reem
 import reem_async
-from reem_async.errors import BadType, ConnectionLost, NotConnected, ServerReadOnly
+from reem_async.errors import BadType, NotConnected, ServerReadOnly
 
 
 @pytest.fixture(params=list(FRONTS))
@@ -98,27 +98,6 @@ def test_a_primary_that_takes_no_writes_for_want_of_replicas_is_no_replica(front
     finally:
         primary.config_set("min-replicas-to-write", 0)
     assert states == []
-
-
-@pytest.mark.long
-def test_a_switch_leaves_no_connection_to_the_primary_of_before(front, watched):
-    watched.settle()
-    front.write(("switched",), 1)
-    transport = getattr(front.interface, "_direct", front.interface).session.transport
-    before = transport._now
-    eventually(watched.fail_over)
-
-    def moved():
-        with contextlib.suppress(ConnectionLost, NotConnected):
-            front.write(("switched",), 2)
-        return transport._now is not before
-
-    eventually(moved)
-    watched.settle()
-    front.write(("switched",), 3)
-    assert transport._demoted == []
-    assert not [line for line in getattr(before, "_lines", ()) if line() is not None]
-    assert not [wire for wire in getattr(before, "_open", ()) if wire.alive]
 
 
 @pytest.mark.long

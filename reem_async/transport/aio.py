@@ -342,16 +342,10 @@ class AsyncTransport(OneServer):
                     await farewell.aclose()
         self._begin()
 
-    def retire(self) -> bool:
-        """Close the connections on which nothing is due, since no new calls will come; return whether all are closed.
-
-        To be called again if not. One that is given back, in a blocking program, is closed then.
-        """
-        if self._loop is asyncio.get_running_loop():
-            for wire in (*self._lanes.values(), *self._spare):
-                if not wire.busy:
-                    wire.abort(InterfaceClosed("the server is not used any more"))
-        return not self._opening and not any(wire.alive for wire in self._open)
+    def drop(self, reason: Exception) -> None:
+        """Break all connections; new ones are made when needed. Any thread may call."""
+        for wire in list(self._open):
+            wire.abort_soon(reason)
 
     async def release(self) -> None:
         wires = [*self._lanes.values(), *self._spare, *self._leaving, *self._kept]

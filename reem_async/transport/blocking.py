@@ -71,6 +71,7 @@ class _Line:
         self._largest = options.largest
         self._large: LargeReader | None = None
         self.broken = False  # it is not to be used again; so it is while a call is under way
+        self.retired = False  # it is closed when it is given back
         self.waiting = False  # a call is under way that has nothing large to send
         known = lists_json(self._connection.handshake_metadata)
         try:
@@ -185,9 +186,8 @@ class _Line:
 
     def fresh(self) -> bool:
         """Return whether the connection still stands, as far as one can see without sending."""
-        return not self.broken and not self._poll.poll(
-            0
-        )  # nothing is due: an event is a stray reply, or the server has closed
+        # Nothing is due: an event is a stray reply, or the server has closed.
+        return not self.broken and not self.retired and not self._poll.poll(0)
 
     def lost(self, reason: str) -> ConnectionLost:
         self.close()
@@ -231,7 +231,6 @@ class BlockingTransport(OneServer):
     def __init__(self, options: Options) -> None:
         super().__init__(options)
         self._closed = False
-        self._keeps = True  # connections, for the next call
         self._text = Text(options.timeout)
         self._begin()
         _all.add(self)
@@ -279,7 +278,7 @@ class BlockingTransport(OneServer):
             self._close_idle()  # likely of the same fate; a new one says how things are
             return
         self._idle.append(line)
-        if not self._keeps:  # asked behind it: another thread closes what it finds
+        if self._closed or line.retired:  # asked behind it: another thread closes what it finds
             self._close_idle()
 
     def _close_idle(self) -> None:
@@ -343,16 +342,17 @@ class BlockingTransport(OneServer):
 
     async def close(self) -> None:
         self._closed = True
-        self.retire()
+        self._close_idle()
         for line in [*self._kept]:
             if not line.broken:  # else a call is under way, and the next one finds the interface closed
                 line.close()
         self.states.closed()
 
-    def retire(self) -> bool:
-        self._keeps = False
+    def drop(self, reason: Exception) -> None:
+        """Close all connections, those in use after their call; new ones are made when needed."""
+        for line in self._lines:
+            line.retired = True
         self._close_idle()
-        return True
 
     async def release(self) -> None:
         self._close_idle()

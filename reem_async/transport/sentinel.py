@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 
 import redis.exceptions
 
-from ..concurrency.locks import WeakList
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
 from . import Guard, Held, Transport
@@ -224,90 +223,63 @@ class SentinelTransport(CompositeTransport):
 
     def __init__(self, options: SentinelOptions, new_transport: NewTransport) -> None:
         self._options = options
-        self._new_transport = new_transport
-        self._now: Any = new_transport(options)
-        self._root = self._now  # for what must outlive a failover: locks and the event loop
-        self._states = self._root.states
-        # Ways to primaries of before on which calls still wait for replies.
-        self._demoted: list[Any] = []
-        # Subscription connections: a primary of before sends nothing any more, and would not be missed.
-        self._listening: WeakList[Wire] = WeakList()
+        self._root: Any = new_transport(options)
         self._lookout: _Lookout | None = None
-        self._moved = False
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
         """Send `commands` to the primary; raises NotConnected, with nothing applied, if it is none any more."""
-        now = self._current()
-        return self._checked(now, await now.roundtrip(commands, bulk=bulk))
+        self._look_out()
+        return self.checked(await self._root.roundtrip(commands, bulk=bulk))
 
-    def _current(self) -> Any:
-        """Return the way to the primary of the moment, and see to it that a change of it is noticed."""
+    def _look_out(self) -> None:
+        """See to it that a change of the primary is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
             self._lookout = _Lookout(self._options, self)
             self._options.changed = self._lookout.tell
-        if self._moved:
-            self._moved = False
-            self._renew()
-        if self._demoted:
-            self._demoted = [each for each in self._demoted if not each.retire()]
-        return self._now
 
     def on_moved(self) -> None:
-        """Take note that the sentinels name another primary. Runs on a thread of its own."""
-        self._moved = True
-        reason = ConnectionLost(f"the sentinels name another primary for {self._options.service!r}")
-        for wire in self._listening:
-            wire.abort_soon(reason)
+        """Break the connections to the primary of before: the next ones ask the sentinels. Any thread may call."""
+        self._root.drop(ConnectionLost(f"the sentinels name another primary for {self._options.service!r}"))
 
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
-        self._root.check()
-        wire: Wire = await self._current().listen(on_push, on_lost)
-        self._listening.add(wire)
+        self._look_out()
+        wire: Wire = await self._root.listen(on_push, on_lost)
         return wire
 
-    def _checked(self, asked: Transport, replies: list[Reply]) -> list[Reply]:
+    def checked(self, replies: list[Reply]) -> list[Reply]:
         for reply in replies:
             # The only sign, before the connection breaks, that the server was demoted. A primary that cannot save, or
             # that lacks replicas, refuses writes with another code.
             if isinstance(reply, redis.exceptions.ReadOnlyError) and "READONLY" in str(reply):
-                if asked is self._now:  # its connections serve the calls that wait for a reply on them
-                    self.states.lost(NotConnected(f"a primary of {self._options.address} became a replica"))
-                    self._renew()
+                reason = ConnectionLost(f"a primary of {self._options.address} became a replica")
+                self.states.lost(reason)
+                self._root.drop(reason)
                 raise NotConnected(
                     f"the server that was the primary of {self._options.address} is a replica now ({reply}); "
                     "nothing was applied: call again, the next connection asks the sentinels"
                 )
         return replies
 
-    def _renew(self) -> None:
-        # The user hears of one primary. What becomes of the connections to the old one is not its state.
-        demoted, fresh = self._now, self._new_transport(self._options)
-        demoted.states = States()
-        demoted.states.closed()
-        fresh.states = self._states
-        self._now = fresh
-        if not demoted.retire():
-            self._demoted.append(demoted)
-
     @property
     def states(self) -> States:
-        return self._states
+        states: States = self._root.states
+        return states
 
     @states.setter
     def states(self, states: States) -> None:
-        self._states = self._now.states = states
+        self._root.states = states
 
     def hold(self, guard: Guard | None = None) -> AbstractAsyncContextManager[Held]:
-        node = self._current()
+        self._look_out()
         if guard is None:
-            return self._lend(node)
-        # The guard is on the inside, where a server without JSON is sent text; it asks whether the node is the primary.
-        return node.hold(lambda kept: guard(_CheckedConnection(self, node, kept)))  # type: ignore[no-any-return]
+            return self._lend()
+        # The guard is on the inside, where a server without JSON is sent text.
+        return self._root.hold(lambda kept: guard(_CheckedConnection(self, kept)))  # type: ignore[no-any-return]
 
     @asynccontextmanager
-    async def _lend(self, node: Any) -> AsyncIterator[Held]:
-        async with node.hold() as held:
-            yield _CheckedConnection(self, node, held)
+    async def _lend(self) -> AsyncIterator[Held]:
+        async with self._root.hold() as held:
+            yield _CheckedConnection(self, held)
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         return self
@@ -318,11 +290,10 @@ class SentinelTransport(CompositeTransport):
     async def close(self) -> None:
         if self._lookout is not None:
             self._lookout.stop()
-        self._states.closed()
         await super().close()
 
     def _all(self) -> list[Transport]:
-        return list({id(each): each for each in (self._root, *self._demoted, self._now)}.values())
+        return [self._root]
 
 
 class _Lookout:
@@ -355,13 +326,12 @@ class _Lookout:
 class _CheckedConnection:
     """A lent connection whose replies are checked, too."""
 
-    def __init__(self, transport: SentinelTransport, node: Transport, held: Any) -> None:
+    def __init__(self, transport: SentinelTransport, held: Any) -> None:
         self._transport = transport
-        self._node = node
         self._held = held
 
     def fresh(self) -> bool:
-        return self._transport._current() is self._node and bool(self._held.fresh())
+        return bool(self._held.fresh())
 
     async def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:
-        return self._transport._checked(self._node, await self._held.roundtrip(commands, bulk=bulk))
+        return self._transport.checked(await self._held.roundtrip(commands, bulk=bulk))
