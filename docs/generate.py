@@ -151,7 +151,7 @@ def _signature(kind: str, name: str, ours: Any, theirs: Any) -> str:
     doc = inspect.getdoc(ours) or inspect.getdoc(theirs) or ""
     awaited = theirs is not None and _awaited(theirs)
     text = f".. py:{kind}:: {name}{_arguments(ours)}\n"
-    note = "asyncio: ``await`` the call." if awaited and not _awaited(ours) else ""
+    note = "asyncio: ``await`` the call." if awaited and not inspect.iscoroutinefunction(ours) else ""
     return text + "\n" + _indented(f"{restructured(doc)}\n\n{note}") + "\n"
 
 

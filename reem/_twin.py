@@ -1,11 +1,23 @@
-"""The documentation of the facade is that of the core."""
+"""The blocking front repeats nothing of the core: signatures, types and documentation are those of the core's methods.
+
+    read = runs(core.Accessor.read)
+
+is `read` as plain code calls it. The object has the core's in `_core` and its interface in `_interface`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+import functools
+from collections.abc import Callable, Coroutine
+from functools import partial
+from operator import attrgetter, methodcaller
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 Class = TypeVar("Class", bound=type)
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+Method = Callable[Concatenate[Any, Arguments], Result]
+Waiting = Callable[Concatenate[Any, Arguments], Coroutine[Any, Any, Result]]
 
 
 def for_plain_code(text: str) -> str:
@@ -37,3 +49,53 @@ def documented_by(core: type) -> Callable[[Class], Class]:
         return facade
 
     return decorate
+
+
+_CORE = attrgetter("_core")
+FOLLOWER = methodcaller("_follower")
+"""Returns the core's object on the background loop, for a class whose `_core` may be on the calling thread."""
+
+
+def _forwarded(method: Any, finish: Callable[[Any], Any], inner: Callable[[Any], Any]) -> Any:
+    """Return a method that calls that of the core's object, and hands the result to what `finish` returns."""
+    name = method.__name__
+
+    @functools.wraps(method)
+    def forward(self: Any, /, *args: Any, **options: Any) -> Any:
+        return finish(self)(getattr(inner(self), name)(*args, **options))
+
+    forward.__doc__ = for_plain_code(method.__doc__ or "")
+    return forward
+
+
+def runs(method: Waiting[Arguments, Result]) -> Method[Arguments, Result]:
+    """Return the blocking form of a coroutine method, which runs on the calling thread."""
+    return _forwarded(method, attrgetter("_interface._run"), _CORE)  # type: ignore[no-any-return]
+
+
+def waits(method: Waiting[Arguments, Result], inner: Callable[[Any], Any] = _CORE) -> Method[Arguments, Result]:
+    """Return the blocking form of a coroutine method, which runs on the background loop."""
+    return _forwarded(method, attrgetter("_interface._wait"), inner)  # type: ignore[no-any-return]
+
+
+def ends(method: Waiting[Arguments, None]) -> Method[Arguments, None]:
+    """Return what `waits` does, for a method that has nothing left to do once the interface is closed."""
+    return _forwarded(method, attrgetter("_interface._end"), _CORE)  # type: ignore[no-any-return]
+
+
+def calls(method: Method[Arguments, Result], inner: Callable[[Any], Any] = _CORE) -> Method[Arguments, Result]:
+    """Return a method that calls that of the core, which does not wait."""
+    return _forwarded(method, lambda self: lambda result: result, inner)  # type: ignore[no-any-return]
+
+
+def makes(
+    method: Method[Arguments, Any], wrap: Callable[[Any, Any], Result], inner: Callable[[Any], Any] = _CORE
+) -> Method[Arguments, Result]:
+    """Return a method that wraps what that of the core returns: `wrap(interface, object of the core)`."""
+    return _forwarded(method, lambda self: partial(wrap, self._interface), inner)  # type: ignore[no-any-return]
+
+
+def shares(attribute: Callable[[Any], Result], inner: Callable[[Any], Any] = _CORE) -> Result:
+    """Return a property that is that of the core; its type is that of the value, as for a dataclass's field."""
+    get: Any = attribute.fget  # type: ignore[attr-defined]
+    return property(lambda self: get(inner(self)), doc=get.__doc__)  # type: ignore[return-value]

@@ -10,6 +10,7 @@ import sys
 import weakref
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from importlib import import_module
+from operator import attrgetter
 from threading import Thread, current_thread, main_thread
 from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
 
@@ -17,16 +18,15 @@ import reem_async
 from reem_async.concurrency.queues import Ended
 from reem_async.concurrency.streams import next_on_thread
 from reem_async.connection import rebuilt
-from reem_async.coordination.presence import NodeInfo
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.local.path import MEMORY
 from reem_async.ships.base import SpecialDatatypeShip
 from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
 from reem_async.transport.composite import NewTransport
-from reem_async.transport.state import State, StateChange, StateChanges
+from reem_async.transport.state import StateChange, StateChanges
 
 from ._portal import LastPortal, Portal, Threads, finish
-from ._twin import documented_by
+from ._twin import calls, documented_by, runs, shares
 from .following import NodeWatch
 
 __all__ = [  # noqa: F822 - all but RedisInterface stood here in REEM 0.1.x, and old programs import it from here
@@ -192,6 +192,9 @@ class StateIterator:
             raise StopIteration from None
 
 
+_DIRECT = attrgetter("_direct")
+
+
 @documented_by(reem_async.RedisInterface)
 class RedisInterface:
     """A connection to one server; everything else is made from it.
@@ -225,46 +228,26 @@ class RedisInterface:
         self._closing.atexit = False
         _interfaces.add(self)  # see `_end_loops`
 
-    @property
-    def hostname(self) -> str:
-        """Where the server is, without credentials."""
-        return self._direct.hostname
-
-    @property
-    def namespace(self) -> str:
-        """What goes before every key and channel."""
-        return self._direct.namespace
-
-    @property
-    def client(self) -> Any:
-        """A plain client of redis-py for the same server, made when first asked for and closed with this interface."""
-        return self._direct.client
-
-    @property
-    def state(self) -> State:
-        """The state of the connection: "idle" before the first, "connected", "lost", "reconnecting" or "closed"."""
-        return self._direct.state
+    hostname = shares(reem_async.RedisInterface.hostname, _DIRECT)
+    namespace = shares(reem_async.RedisInterface.namespace, _DIRECT)
+    client = shares(reem_async.RedisInterface.client, _DIRECT)
+    state = shares(reem_async.RedisInterface.state, _DIRECT)
+    unreadable = shares(reem_async.RedisInterface.unreadable, _DIRECT)
+    on_state = calls(reem_async.RedisInterface.on_state, _DIRECT)
+    nodes = runs(reem_async.RedisInterface.nodes)
+    initialize = runs(reem_async.RedisInterface.initialize)
 
     def states(self) -> StateIterator:
         """Return an iterator over the state and its changes."""
         return StateIterator(self._direct.states())
 
-    def on_state(self, callback: Callable[[StateChange], object]) -> None:
-        """Call `callback` with each change of the state."""
-        self._direct.on_state(callback)
-
-    @property
-    def unreadable(self) -> int:
-        """How many messages and values could not be read by subscribers."""
-        return self._direct.unreadable
-
-    def nodes(self) -> list[NodeInfo]:
-        """Return the programs that are connected under a name, in the order of their names."""
-        return self._run(self._core.nodes())
-
     def watch_nodes(self) -> NodeWatch:
         """Return an iterator over the programs that join and leave, those that are there first."""
         return NodeWatch(self)
+
+    @property
+    def _interface(self) -> RedisInterface:
+        return self
 
     @property
     def _core(self) -> reem_async.RedisInterface:
@@ -312,9 +295,10 @@ class RedisInterface:
                 raise SystemExit from None  # the thread is about to be stopped anyway, without a word
             raise
 
-    def initialize(self) -> None:
-        """Connect now and check the server."""
-        self._run(self._core.initialize())
+    def _end(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        """Do what `_wait` does, or nothing: whatever closed the interface has ended this too."""
+        with contextlib.suppress(InterfaceClosed):
+            self._wait(coroutine)
 
     def close(self) -> None:
         """End all subscriptions and close all connections."""

@@ -10,7 +10,7 @@ from reem_async.coordination.presence import NodeWatch as NodeWatchCore
 from reem_async.errors import InterfaceClosed
 from reem_async.pubsub import subscribers as core
 
-from ._twin import documented_by
+from ._twin import documented_by, shares, waits
 
 
 class Following:
@@ -49,14 +49,8 @@ class Watch(Following):
         self._interface = interface
         self._core = watch
 
-    @property
-    def dropped(self) -> int:
-        """How many updates were skipped since they were not taken in time."""
-        return int(self._core.dropped)
-
-    def listen(self) -> None:
-        """Begin to follow."""
-        self._interface._wait(self._core.listen())
+    dropped = shares(core.Watch.dropped)
+    listen = waits(core.Watch.listen)
 
     def close(self) -> None:
         """Stop following and end the loop."""

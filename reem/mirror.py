@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from reem_async.errors import InterfaceClosed
-from reem_async.plan.paths import Path
 from reem_async.plan.trees import MISSING
 from reem_async.pubsub import mirror as core
 
-from ._twin import documented_by
+from ._twin import documented_by, ends, shares, waits
 from .connection import quiet_at_exit
 from .following import Following
 
@@ -30,52 +27,21 @@ class Mirror(Following):
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
     `stale="keep"` they return the last known value through an outage. With `ttl` they raise Silent once no update has
     been published for that long, whatever the reason.
-    Use it with `with`, or `listen()` and `close()`.
+    Use it with `with`, or `listen()` and `close()`. `mirror` of an accessor makes one, and explains the arguments.
 
     Args:
         interface: The server.
-        path: The path, top-level key first.
-        max_age: Largest `age` of an answer in seconds, 0.005 at least; None for any, as long as the connection stands.
-            The server is probed three times in that time. Use at least three times the round trip.
-        largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
-            what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
-        stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
-            how old that is.
-        ttl: Seconds for which answers count, from the arrival of the last published update on this program's clock;
-            None for any. A shorter break of the connection is not noticed, unless `max_age` is given too. What is found
-            at the beginning or after a break does not count until the next update arrives, nor do plain writes.
+        mirror: The core's, which lives on the background loop.
     """
 
-    def __init__(
-        self,
-        interface: RedisInterface,
-        path: Path,
-        *,
-        max_age: float | None = None,
-        largest: int | None = None,
-        stale: Literal["raise", "keep"] = "raise",
-        ttl: float | None = None,
-    ) -> None:
+    def __init__(self, interface: RedisInterface, mirror: core.Mirror) -> None:
         self._interface = interface
-        session = interface._followers.session
-        self._core = core.Mirror(
-            session, session.keys(path[0]), path[1:], max_age=max_age, largest=largest, stale=stale, ttl=ttl
-        )
-        self.channel, self.max_age, self.stale, self.ttl = self._core.channel, max_age, stale, self._core.ttl
+        self._core = mirror
+        self.channel, self.max_age, self.stale, self.ttl = mirror.channel, mirror.max_age, mirror.stale, mirror.ttl
 
-    @property
-    def age(self) -> float:
-        """Seconds since the server was last asked whether it has what is in the copy, and has answered that it has."""
-        return self._core.age
-
-    def listen(self) -> None:
-        """Begin to follow. When this returns, the copy is there. Idempotent; two or three round trips."""
-        self._interface._wait(self._core.listen())
-
-    def close(self) -> None:
-        """Stop following; reading raises Stale from then on. Idempotent."""
-        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
-            self._interface._wait(self._core.close())
+    age = shares(core.Mirror.age)
+    listen = waits(core.Mirror.listen)
+    close = ends(core.Mirror.close)
 
     def value(self, default: Any = MISSING) -> Any:
         """Return a copy of the value, None if nothing is there. No round trip; any thread may call."""

@@ -23,7 +23,7 @@ from reem_async.tools.recording import (
 )
 from reem_async.tools.recording.times import Instant
 
-from ._twin import documented_by
+from ._twin import documented_by, shares, waits
 from .connection import RedisInterface
 
 __all__ = [
@@ -74,22 +74,10 @@ class Recorder:
             queue_bytes=queue_bytes,
         )
 
-    @property
-    def status(self) -> RecorderStatus:
-        """How the recording is getting on. Any thread may ask."""
-        return self._core.status
-
-    def start(self) -> None:
-        """Begin to record."""
-        self._interface._wait(self._core.start())
-
-    def stop(self) -> None:
-        """End the recording."""
-        self._interface._wait(self._core.stop())
-
-    def wait(self, seconds: float | None = None) -> None:
-        """Wait while it records."""
-        self._interface._wait(self._core.wait(seconds))
+    status = shares(core.Recorder.status)
+    start = waits(core.Recorder.start)
+    stop = waits(core.Recorder.stop)
+    wait = waits(core.Recorder.wait)
 
     def __enter__(self) -> Self:
         self.start()
@@ -133,26 +121,8 @@ class Replayer:
         # Checked by the core, which has the same names.
         settings: dict[str, Any] = {"start": start, "end": end, "loop": loop, "patterns": patterns, "remap": remap}
         self._core = core.Replayer(interface._followers, log, rate=rate, **settings)
+        self.start, self.end = self._core.start, self._core.end
 
-    @property
-    def start(self) -> float:
-        """The first instant."""
-        return self._core.start
-
-    @property
-    def end(self) -> float:
-        """The last instant."""
-        return self._core.end
-
-    @property
-    def status(self) -> ReplayStatus:
-        """How it is getting on. Any thread may ask."""
-        return self._core.status
-
-    def play(self) -> ReplayStatus:
-        """Publish until the end."""
-        return self._interface._wait(self._core.play())
-
-    def step(self) -> LogUpdate | None:
-        """Publish the next update."""
-        return self._interface._wait(self._core.step())
+    status = shares(core.Replayer.status)
+    play = waits(core.Replayer.play)
+    step = waits(core.Replayer.step)

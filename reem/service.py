@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 from typing import Any
 
 from reem_async.coordination import services as core
-from reem_async.errors import BadType, InterfaceClosed
+from reem_async.errors import BadType
 
-from ._twin import documented_by
+from ._twin import documented_by, ends, waits
 from .connection import RedisInterface
 from .following import Following
 
@@ -38,16 +37,6 @@ class Service(Following):
         """Call the function here, in this program."""
         return self._core(*args, **arguments)
 
-    def listen(self) -> None:
-        """Begin to serve; when this returns, calls find it."""
-        self._interface._wait(self._core.listen())
-
-    def close(self) -> None:
-        """Stop serving."""
-        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
-            self._interface._wait(self._core.close())
-
-    def wait(self) -> None:
-        """Wait until it has stopped serving."""
-        with contextlib.suppress(InterfaceClosed):
-            self._interface._wait(self._core.wait())
+    listen = waits(core.Service.listen)
+    close = ends(core.Service.close)
+    wait = ends(core.Service.wait)

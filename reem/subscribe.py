@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from reem_async.concurrency.queues import Policy
 from reem_async.concurrency.scheduling import take_short_turns
-from reem_async.errors import BadType, InterfaceClosed
+from reem_async.errors import BadType
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
-from ._twin import documented_by
+from ._twin import documented_by, ends, makes, shares, waits
 from .connection import RedisInterface
 from .following import Following, Watch
 
@@ -29,15 +28,10 @@ class PatternWatch(Watch):
 
     Args:
         interface: The server.
-        patterns: Globs of paths such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
-        policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
-        largest: Bytes of an array up to which it is fetched; None for no limit. See `Mirror`.
+        watch: The core's, which lives on the background loop.
     """
 
-    def __init__(
-        self, interface: RedisInterface, patterns: Sequence[str], policy: Policy | None, *, largest: int | None
-    ) -> None:
-        watch = PatternWatchCore(interface._followers.session, patterns, policy, largest=largest)
+    def __init__(self, interface: RedisInterface, watch: PatternWatchCore) -> None:
         super().__init__(interface, watch)
         self.patterns = watch.patterns
 
@@ -50,34 +44,22 @@ class SilentSubscriber(Following):
         self, channel: str, interface: Any = None, policy: Policy | None = None, *, stored: bool = False
     ) -> None:
         self.interface = interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
+        self._interface = self.interface
         self.channel = channel
         self.stored = stored
         self._core = core.SilentSubscriber(channel, self.interface._followers, policy, stored=stored)
 
-    def listen(self) -> None:
-        """Begin to follow."""
-        self.interface._wait(self._core.listen())
-
-    def close(self) -> None:
-        """Stop following."""
-        with contextlib.suppress(InterfaceClosed):  # whatever closed the interface has closed this too
-            self.interface._wait(self._core.close())
+    listen = waits(core.SilentSubscriber.listen)
+    close = ends(core.SilentSubscriber.close)
+    local_copy = shares(core.SilentSubscriber.local_copy)
+    watch = makes(core.SilentSubscriber.watch, Watch)
 
     def value(self) -> Any:
         """Return a copy of the value as of now."""
         return self._core.value()
 
-    @property
-    def local_copy(self) -> Any:
-        """A copy of the value as of now, an empty dict if there is none."""
-        return self._core.local_copy
-
     def __getitem__(self, key: str | int) -> core.LocalAccessor:
         return self._core[key]
-
-    def watch(self, policy: Policy | None = None) -> Watch:
-        """Return an iterator over the updates."""
-        return Watch(self.interface, self._core.watch(policy))
 
     def __iter__(self) -> Watch:
         return self.watch()

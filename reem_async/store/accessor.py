@@ -517,7 +517,7 @@ class Accessor(Handle):
         declaration = prepared(self.full_path, name, default, on_change=on_change, **specification)
         return await declared(self._reader.session, declaration)
 
-    async def call(self, *, timeout: float | None = None, **arguments: Any) -> Any:  # noqa: ASYNC109
+    async def call(self, /, *, timeout: float | None = None, **arguments: Any) -> Any:  # noqa: ASYNC109
         """Ask the service at this place, and return its answer: `actions = await kvs["policy"].call(image=image)`.
 
         One of the programs that `serve` here calls its function with these arguments, at most once. Arguments and

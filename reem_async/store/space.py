@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 from ..errors import WriteOnly
 from ..plan.paths import Path, show
@@ -38,45 +38,17 @@ class PublishAccessor(Accessor):
     _how_to_read = "a KeyValueStore"
     _reads = WriteOnlyReader
 
-    def _refuse(self) -> NoReturn:
-        raise WriteOnly(_cannot_read(self.full_path))
-
-    @property
-    def reader(self) -> NoReturn:
-        """Raise WriteOnly."""
-        self._refuse()
-
     @property
     def writer(self) -> Publisher:
         """The publisher of the top-level key."""
         return Publisher(self._reader.name, self._reader.session.interface)
 
-    async def outline(self) -> NoReturn:
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         """Raise WriteOnly."""
-        self._refuse()
+        raise WriteOnly(_cannot_read(self.full_path))
 
-    def edit(self) -> NoReturn:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    def mirror(
-        self,
-        *,
-        max_age: float | None = None,
-        largest: int | None = None,
-        stale: Literal["raise", "keep"] = "raise",
-        ttl: float | None = None,
-    ) -> NoReturn:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    async def parameter(self, name: str, default: Any, **specification: Any) -> NoReturn:
-        """Raise WriteOnly."""
-        self._refuse()
-
-    def watch(self, policy: Any = None, *, stored: bool = True, ttl: float | None = None) -> NoReturn:
-        """Raise WriteOnly."""
-        self._refuse()
+    reader = property(_refuse)
+    edit = mirror = outline = parameter = watch = _refuse
 
 
 class Publisher(Writer):
