@@ -1,7 +1,7 @@
 """Programs that serve and call in the tests of services, to be stopped and killed.
 
 python -m servicekit serve URL KEY        serves KEY until it is killed, and prints "serving"
-python -m servicekit call URL KEY COUNT   makes so many calls and prints a line for each: number, outcome
+python -m servicekit call URL KEY COUNT [TIMEOUT]   makes so many calls and prints a line for each: number, outcome
 """
 
 import contextlib
@@ -37,7 +37,7 @@ def serve(url, key):
     service.wait()
 
 
-def call(url, key, count):
+def call(url, key, count, timeout="5"):
     """Call from four threads; each outcome is a right answer, or the name of an error."""
     place = reem.KeyValueStore(url)[key]
     numbers = iter(range(int(count)))
@@ -52,7 +52,7 @@ def call(url, key, count):
             array = np.full(LARGE, 1.0) if number % 50 == 0 else np.full(3, 1.0) if number % 3 == 0 else None
             ident = int(os.getpid()) * 1_000_000 + number
             try:
-                answer = place.call(number=ident, array=array, timeout=5)
+                answer = place.call(number=ident, array=array, timeout=float(timeout))
             except (reem.ServiceError, reem.ConnectionLost) as error:
                 outcome = type(error).__name__
             else:

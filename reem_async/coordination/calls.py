@@ -1,13 +1,13 @@
 """Calls of services: choose a server, send the request, wait for its answer, and notice when the server is gone.
 
-A call is in one of three states: not sent, sent (it may or may not have been handled), or refused by a server that did
-not begin it. Only what was not sent or was refused goes to another server, so no request is handled twice.
+Only a request that was not sent, or that a server has refused, goes to another server. So none is handled twice.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import random
 import secrets
 from collections.abc import Collection, Iterable
@@ -17,6 +17,7 @@ from typing import Any
 
 from ..concurrency.timeouts import check_timeout, time_limit
 from ..errors import (
+    BadData,
     Busy,
     CallTimeout,
     ConnectionLost,
@@ -25,24 +26,33 @@ from ..errors import (
     NotAllowed,
     RedisError,
     ReemError,
+    RemoteError,
     ServiceError,
     ServiceLost,
 )
 from ..plan import Command, Plan, Reply, blamed
 from ..plan.keys import Keys
+from ..plan.notices import assembled
 from ..plan.paths import Path, escaped, show
+from ..plan.reads import with_bytes
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import SubscriptionManager, manager_of
 from ..session import Session
 from ..store.encoding import Encoder
 from . import messages
-from .messages import ID, Encoded, Message, Names
+from .messages import ID, Content, Encoded, Message, Names
 
 DEFAULT_TIMEOUT = 10.0  # seconds for which a call waits if neither it nor `reem.timeout` says
 _PERIOD = 0.3  # seconds between pings to the servers from which answers are due
 _MISSES = 3  # pings in a row without an answer after which a server is taken for lost
 _LOOKS = 1.0  # seconds after which a caller asks again which servers there are, while it calls
 _HOLDS = 1.0  # seconds for which it counts how many requests wait at a server, by its last message
+_SHARED = 2
+"""Calls in progress to one server up to which the answer may be in shared memory: it has six slots for a caller, who
+may look into three."""
+_DEEPEST = 128  # levels of a document
+_STATED = {"host": str, "pid": int, "calls": int, "rate": float, "median": float, "errors": int}
+"""What the words of a PONG are."""
 
 
 def new_id() -> str:
@@ -52,15 +62,13 @@ def new_id() -> str:
 async def call(session: Session, keys: Keys, path: Path, arguments: dict[str, Any], seconds: float | None) -> Any:
     """Do as `Accessor.call`."""
     limit = time_limit(DEFAULT_TIMEOUT) if seconds is None else check_timeout(seconds)
-    return await caller_of(session, keys).call(path, arguments, limit)
+    return await _caller_of(session, keys).call(path, arguments, limit)
 
 
-def caller_of(session: Session, keys: Keys) -> Caller:
+def _caller_of(session: Session, keys: Keys) -> Caller:
     """Return what calls the services under a top-level key in the running event loop; made when first asked for."""
-    manager = manager_of(session)
-    caller = manager.kept.get((Caller, keys.channel))
-    if not isinstance(caller, Caller):
-        caller = manager.kept[Caller, keys.channel] = Caller(session, keys, manager)
+    kept = manager_of(session).kept
+    caller: Caller = kept.get((Caller, keys.channel)) or kept.setdefault((Caller, keys.channel), Caller(session, keys))
     return caller
 
 
@@ -73,24 +81,27 @@ async def statistics(session: Session) -> list[dict[str, Any]]:
     Raises:
         NotAllowed: The user lacks a right; says which.
     """
-    command: Command = ("PUBSUB", "CHANNELS", f"{{{escaped(session.namespace)}*:serve@{'?' * ID}")
-    if session.transport.sharded:
-        command = ("PUBSUB", "SHARDCHANNELS", command[2])
     found: dict[str, Names] = {}
     for node in await session.transport.nodes():
-        (reply,) = await node.roundtrip([command])
-        if isinstance(reply, Exception):
-            raise explained(blamed(reply, command))
-        for channel in [name.decode(errors="replace") for name in reply]:
+        pattern = f"{{{escaped(session.namespace)}*:serve@{'?' * ID}"
+        for channel in await _channels(node, pattern, sharded=session.transport.sharded):
             if (names := Names.of(channel, session.keys, session.namespace)) is not None:
                 found[channel] = names
-    asked = [caller_of(session, names.keys).ask(channel) for channel, names in found.items()]
-    stated = await asyncio.gather(*asked)
+    stated = await asyncio.gather(*(_caller_of(session, names.keys).ask(channel) for channel, names in found.items()))
     rows = [
         {"service": show((names.keys.name, *names.path)), **said}
         for names, said in zip(found.values(), stated, strict=True)
     ]
     return sorted(rows, key=lambda row: (row["service"], str(row["host"]), row["pid"] or 0))
+
+
+async def _channels(node: Any, pattern: str, *, sharded: bool) -> list[str]:
+    """Ask a server which channels have a subscriber; one round trip."""
+    command: Command = ("PUBSUB", "SHARDCHANNELS" if sharded else "CHANNELS", pattern)
+    (reply,) = await node.roundtrip([command])
+    if isinstance(reply, Exception):
+        raise explained(blamed(reply, command))
+    return [name.decode(errors="replace") for name in reply if type(name) is bytes]
 
 
 async def publish(session: Session, keys: Keys, channel: str, payload: bytes, store: Iterable[Command] = ()) -> int:
@@ -118,11 +129,38 @@ def explained(error: Exception) -> Exception:
     )
 
 
+async def opened(session: Session, content: Content | None, prefix: str, where: str) -> Any:
+    """Return the value of a message; a round trip if it is stored under keys that begin with `prefix`.
+
+    Raises:
+        BadData: It has expired, or its parts make no value.
+    """
+    if content is None:
+        raise BadData(f"{where}: the message has no value")
+    pieces, ships = content.pieces, session.ships
+    if content.is_stored:
+        pieces = await session.run(messages.fetch(content, prefix, ships, where))
+    await ships.ready()
+    values: dict[tuple[str, str], Any] = {}
+    try:
+        for (label, tail), piece in zip(content.names, pieces[1:], strict=True):
+            ship = ships.labelled(label, where)
+            if not content.is_stored and ship.blob is None:
+                raise BadData(f"{where}: the ship {label!r} of this interface reads in another way than the sender's")
+            value = ship.ship.interpret_read([piece if ship.blob is not None else with_bytes(piece)])
+            values[label, tail] = await value if inspect.isawaitable(value) else value
+        return assembled(bytes(pieces[0]), values, _DEEPEST)
+    except BadData:
+        raise
+    except Exception as error:  # a ship may raise anything over foreign bytes
+        raise BadData(f"{where}: a value cannot be rebuilt: {error!s:.200}") from error
+
+
 class Instance:
     """One server of a service, as its callers in this event loop see it."""
 
-    def __init__(self, name: str, channel: str) -> None:
-        self.id = name
+    def __init__(self, channel: str) -> None:
+        self.id = channel[-ID:]
         self.channel = channel
         self.calls = 0  # calls from here that wait for its answer
         self.host = ""  # what names its host, for shared memory; empty if not known, or if it cannot read ours
@@ -144,15 +182,18 @@ class Directory:
         self.names = names
         self.instances: dict[str, Instance] = {}
         self.looked = 0.0  # when the Redis server was asked last
-        self.looking: asyncio.Task[None] | None = None
 
-    def found(self, ids: Collection[str], now: float) -> None:
-        """Note that these are all; those that were known keep what is known of them."""
-        self.instances = {it: self.instances.get(it) or Instance(it, self.names.channel(it)) for it in ids}
-        self.looked = now
+    async def look(self, session: Session) -> None:
+        """Ask the Redis server which servers there are. Those that were known keep what is known of them."""
+        node = await session.transport.owner(self.names.channel("0" * ID).encode())
+        channels = await _channels(node, self.names.pattern, sharded=self.names.keys.sharded)
+        found = {name[-ID:]: name for name in channels if messages.is_id(name[-ID:])}
+        self.instances = {it: self.instances.get(it) or Instance(channel) for it, channel in found.items()}
+        self.looked = asyncio.get_running_loop().time()
 
-    def best(self, refused: Collection[str], now: float) -> Instance | None:
+    def best(self, refused: Collection[str]) -> Instance | None:
         """Return the server that seems to have the least to do, none of `refused`."""
+        now = asyncio.get_running_loop().time()
         left = [each for it, each in self.instances.items() if it not in refused]
         least = min([each.load(now) for each in left], default=0.0)
         fit = [each for each in left if each.load(now) <= least]
@@ -162,7 +203,7 @@ class Directory:
 class State(Enum):
     """What became of a request; the text is what a timeout says of it."""
 
-    UNSENT = "the request was not sent"
+    UNSENT = "the request was not sent"  # or a server has refused it
     SENT = "the request may or may not have been handled"
     ANSWERED = "the request was handled, and its answer was not fetched in time"
 
@@ -177,13 +218,11 @@ class PendingCall:
         self.deadline = deadline  # by the clock of the event loop
         self.instance: Instance | None = None  # the server that has it, or may have it
         self.state = State.UNSENT
-        self.is_delivered = False  # the server has received it
-        self.has_stored = False  # its arguments are on the Redis server, or may be
-        self.answer: asyncio.Future[Message] | None = None
-        self.limit: asyncio.Timeout | None = None
+        self.stored: list[str] = []  # keys of its arguments that are on the Redis server, or may be
+        self.answer: asyncio.Future[Message] = asyncio.get_running_loop().create_future()  # of that server
 
     def end(self, outcome: Message | Exception) -> None:
-        if self.answer is None or self.answer.done():
+        if self.answer.done():
             return
         if isinstance(outcome, Exception):
             self.answer.set_exception(outcome)
@@ -195,19 +234,20 @@ class PendingCall:
 class Caller(Listener):
     """The calls of this event loop to the services under one top-level key, with the channel of their answers."""
 
-    def __init__(self, session: Session, keys: Keys, manager: SubscriptionManager) -> None:
+    def __init__(self, session: Session, keys: Keys) -> None:
         self.id = new_id()
         super().__init__(Topic(messages.answers(keys, self.id).encode()))
         self.takes_messages = True
         self._session = session
         self._keys = keys
-        self._manager = manager
+        self._manager: SubscriptionManager = manager_of(session)
         self._directories: dict[Path, Directory] = {}
         self._pending: dict[str, PendingCall] = {}
+        self._called: set[Directory] = set()  # since the last look at them
         self._following = asyncio.Lock()
         self._follows = False  # the channel of answers is subscribed
-        self._pinging: asyncio.Task[None] | None = None
-        self._asked: dict[str, asyncio.Future[Message]] = {}  # questions to servers how they are doing
+        self._watching: asyncio.Task[None] | None = None
+        self._asked: dict[str, asyncio.Future[Message]] = {}  # servers that are asked what they have to say
 
     # What the subscription manager calls.
 
@@ -226,14 +266,12 @@ class Caller(Listener):
             call.end(reason if isinstance(reason, InterfaceClosed) else broken)
 
     def on_message(self, payload: bytes) -> None:
-        message = messages.decode(payload)
+        message = messages.decode(payload, self._session.local.view)
         now = asyncio.get_running_loop().time()
         if message.kind == messages.PONG:
             for directory in self._directories.values():
                 if (instance := directory.instances.get(message.sender)) is not None:
                     instance.answered(message.number, now)
-            return
-        if message.kind == messages.STATED:
             if (asked := self._asked.get(message.call)) is not None and not asked.done():
                 asked.set_result(message)
             return
@@ -243,24 +281,18 @@ class Caller(Listener):
             return
         call.instance.answered(message.number, now)
         if message.content is not None:
-            message = self._seen(call.instance, message)
-        if message.content is None or not message.content.is_missing:
-            call.end(message)
+            call.instance.host = "" if message.content.is_missing else message.words[0]
+            if message.content.is_missing:
+                self._manager.tasks.start(self._tell(messages.UNREAD, call), "reem answer unread")
+                return
+        call.end(message)
 
-    def _seen(self, instance: Instance, message: Message) -> Message:
-        """Return an answer with its bytes in shared memory, and report to the server whether they were there."""
-        assert message.content is not None
-        instance.host = message.words[0]
-        content = message.content.seen(self._session.local.view)
-        if content.view is not None or content.is_missing:
-            kind = messages.UNREAD if content.is_missing else messages.RECEIVED
-            payload = messages.bare(Message(kind, message.call, self.id))
-            self._manager.tasks.start(self._report(instance, payload), "reem report answer")
-        return message._replace(content=content)
-
-    async def _report(self, instance: Instance, payload: bytes) -> None:
-        with contextlib.suppress(ReemError, RedisError, OSError):
-            await publish(self._session, self._keys, instance.channel, payload)
+    async def _tell(self, kind: str, call: PendingCall) -> None:
+        """Send the server of a call a word about it."""
+        if call.instance is not None:
+            with contextlib.suppress(ReemError, RedisError, OSError):  # the call notices what is the matter
+                payload = messages.bare(Message(kind, call.id, self.id))
+                await publish(self._session, self._keys, call.instance.channel, payload)
 
     # One call.
 
@@ -269,224 +301,156 @@ class Caller(Listener):
         if directory is None:
             directory = self._directories[path] = Directory(Names(self._keys, path))
         call = PendingCall(show((self._keys.name, *path)), directory, asyncio.get_running_loop().time() + limit)
-        prefix = directory.names.request(call.id)
+        prefix = directory.names.values(messages.CALL, call.id)
         value = await Encoder(self._session, self._keys._replace(tag=prefix)).encoded(path, arguments)
         self._pending[call.id] = call
         try:
-            async with asyncio.timeout_at(call.deadline) as call.limit:
-                if not self._follows:
-                    await self._follow()
-                return await self._result(call, value)
+            async with asyncio.timeout_at(call.deadline):
+                await self._follow()
+                message = await self._result(call, value, prefix)
+                if message.kind == messages.FAILED:
+                    raise RemoteError(call.where, *message.words)
+                answer = directory.names.values(messages.ANSWER, call.id)
+                result = await opened(self._session, message.content, answer, call.where)
+                call.stored = []  # the server has fetched the arguments
+                return result
         except TimeoutError:
             raise CallTimeout(f"{call.where}: no answer within {limit:g} s; {call.state.value}") from None
         finally:
             del self._pending[call.id]
-            stored = messages.keys_of(prefix, value) if call.has_stored else []
-            if (call.state is State.SENT or stored) and not self._session.closed:
-                self._manager.tasks.start(self._give_up(call, stored), "reem leave call")
+            if (call.state is State.SENT or call.stored) and not self._session.closed:
+                self._manager.tasks.start(self._give_up(call), "reem leave call")
 
     async def _follow(self) -> None:
-        async with self._following:
-            if not self._follows:
-                try:
-                    await self._manager.follow_here(self)
-                except NotAllowed as error:
-                    raise explained(error) from None
+        if not self._follows:
+            async with self._following:
+                if not self._follows:
+                    try:
+                        await self._manager.follow_here(self)
+                    except NotAllowed as error:
+                        raise explained(error) from None
 
-    async def _result(self, call: PendingCall, value: Encoded) -> Any:
-        loop, directory = asyncio.get_running_loop(), call.directory
-        busy: set[str] = set()
-        gone: set[str] = set()
+    async def _result(self, call: PendingCall, value: Encoded, prefix: str) -> Message:
+        """Return the answer of a server that has taken the request: a value, or what its function raised."""
+        directory = call.directory
+        refused: dict[str, str] = {}  # servers that did not begin it, and why
         is_complete = False  # all that are there are known
         while True:
-            instance = directory.best(busy | gone, loop.time())
+            instance = directory.best(refused)
             if instance is None:
                 if is_complete:
-                    raise _refused(call.where, len(busy))
-                await self._look(directory)
+                    raise _refusal(call.where, [*refused.values()].count(messages.BUSY))
+                await directory.look(self._session)
                 is_complete = True
                 continue
-            message = await self._ask(call, instance, value)
-            if message is not None and message.kind == messages.UNREAD:
-                instance.host = ""  # once more to the same, which did not begin it
-            elif message is None or message.kind == messages.CLOSED:
-                is_complete = False  # another one may have taken its place
-                gone.add(instance.id)
-                directory.instances.pop(instance.id, None)
-            elif message.kind == messages.BUSY:
-                busy.add(instance.id)
-            elif message.kind == messages.FAILED:
-                raise messages.remote_error(message, call.where)
-            elif message.kind == messages.DROPPED:
-                raise ServiceLost(f"{call.where}: the server stopped serving before it had finished this request")
+            message = await self._ask(call, instance, value, prefix)
+            if message.kind == messages.UNREAD:
+                instance.host = ""  # once more to the same
+            elif message.kind in (messages.BUSY, messages.CLOSED):
+                refused[instance.id] = message.kind
+                if message.kind == messages.CLOSED:
+                    directory.instances.pop(instance.id, None)
+                    is_complete = False  # another one may have taken its place
             else:
-                return await self._opened(call, message)
+                call.state = State.ANSWERED
+                return message
+            call.state = State.UNSENT
 
-    async def _ask(self, call: PendingCall, instance: Instance, value: Encoded) -> Message | None:
-        """Send a request to a server; return its answer, None if the server is gone and never had the request."""
-        loop = asyncio.get_running_loop()
-        answer = call.answer = loop.create_future()
-        call.instance, call.state, call.is_delivered = instance, State.SENT, False
+    async def _ask(self, call: PendingCall, instance: Instance, value: Encoded, prefix: str) -> Message:
+        """Send a request to a server, and return its answer: CLOSED too if it never had the request."""
+        call.answer = asyncio.get_running_loop().create_future()
+        call.instance, call.state = instance, State.SENT
         instance.calls += 1
         try:
-            if not await self._send(call, instance, value):
-                call.state = State.UNSENT
-                return None
-            call.is_delivered = True
-            self._look_around(call.directory)
-            message = await self._wait(call, answer)
+            if not await self._send(call, instance, value, prefix):
+                return Message(messages.CLOSED, call.id, instance.id)
+            self._called.add(call.directory)
+            if self._watching is None:
+                self._watching = self._manager.tasks.start(self._watch(), "reem watch services")
+            return await call.answer
         finally:
             instance.calls -= 1
-        was_begun = message.kind not in (messages.BUSY, messages.CLOSED, messages.UNREAD)
-        call.state = State.ANSWERED if was_begun else State.UNSENT
-        return message
 
-    async def _wait(self, call: PendingCall, answer: asyncio.Future[Message]) -> Message:
-        """Return the answer; raises TimeoutError at the deadline.
-
-        `asyncio.timeout` would cancel this task though the answer has come while the event loop was busy.
-        """
-        assert call.limit is not None
-        call.limit.reschedule(None)
-        timer = asyncio.get_running_loop().call_at(call.deadline, call.end, TimeoutError())
-        try:
-            return await answer
-        finally:
-            timer.cancel()
-            call.limit.reschedule(call.deadline)
-
-    def _look_around(self, directory: Directory) -> None:
-        """Begin to watch the servers that were asked, and ask now and then whether there are others."""
-        tasks = self._manager.tasks
-        if self._pinging is None:
-            self._pinging = tasks.start(self._ping(), "reem ping services")
-        if directory.looking is None and asyncio.get_running_loop().time() - directory.looked > _LOOKS:
-            directory.looking = tasks.start(self._look_again(directory), "reem look for services")
-
-    async def _send(self, call: PendingCall, instance: Instance, value: Encoded) -> int:
+    async def _send(self, call: PendingCall, instance: Instance, value: Encoded, prefix: str) -> int:
         left = max(call.deadline - asyncio.get_running_loop().time(), 0.0)
         local = self._session.local
-        message = Message(messages.CALL, call.id, self.id, left, [local.host])
-        if messages.is_small(value):
-            return await publish(self._session, self._keys, instance.channel, messages.inline(message, value))
-        if instance.host and instance.host == local.host:
-            slot = messages.put(local, self._keys, call.directory.names.channel(""), value)
-            if slot is not None:
-                payload = messages.in_slot(message, value, slot)
-                return await publish(self._session, self._keys, instance.channel, payload)
-        prefix = call.directory.names.request(call.id)
-        payload, commands = messages.stored(message, value, prefix, left)
-        if call.has_stored:  # for a server that has refused it
+        message = Message(messages.CALL, call.id, self.id, left, [local.host if instance.calls <= _SHARED else ""])
+        slots = self._keys._replace(channel=call.directory.names.channel(""))
+        put = partial(local.put, slots) if local.host and instance.host == local.host else None
+        payload, commands, _ = messages.packed(message, value, prefix, left, put)
+        if call.stored:  # for a server that has refused it
             commands = []
-        call.has_stored = True
+        elif commands:
+            call.stored = messages.keys_of(prefix, value)
         return await publish(self._session, self._keys, instance.channel, payload, commands)
 
-    async def _opened(self, call: PendingCall, message: Message) -> Any:
-        content = message.content
-        if content is None:
-            raise ServiceError(f"{call.where}: the server answered with {message.kind!r}, which is no answer")
-        ships = self._session.ships
-        if content.is_stored:
-            plan = messages.fetch(content, call.directory.names.answer(call.id), ships, call.where)
-            pieces = await self._session.run(plan) if plan.commands else [content.data]
-        else:
-            pieces = messages.pieces_of(content)
-        call.has_stored = False  # the server has fetched the arguments
-        return await messages.opened(content, pieces, ships, call.where)
-
-    async def _give_up(self, call: PendingCall, stored: list[str]) -> None:
+    async def _give_up(self, call: PendingCall) -> None:
         """Have the server give up a call that was left, and remove what it has not fetched."""
-        with contextlib.suppress(ReemError, RedisError, OSError):
-            if call.state is State.SENT and call.instance is not None:
-                payload = messages.bare(Message(messages.CANCEL, call.id, self.id))
-                await publish(self._session, self._keys, call.instance.channel, payload)
-            if stored:
+        if call.state is State.SENT:
+            await self._tell(messages.CANCEL, call)
+        if call.stored:
+            with contextlib.suppress(ReemError, RedisError, OSError):
                 await self._session.transport.settle(self._keys.document)  # they may still be on their way
-                await self._session.transport.roundtrip([("UNLINK", *stored)])
+                await self._session.transport.roundtrip([("UNLINK", *call.stored)])
 
-    # Which servers there are.
+    # Whether the servers are still there, and whether there are others.
 
-    async def _look(self, directory: Directory) -> None:
-        """Ask the Redis server which channels of the service have a subscriber; one round trip."""
-        channel = directory.names.channel("0" * ID).encode()
-        node = await self._session.transport.owner(channel)
-        command: Command = ("PUBSUB", "SHARDCHANNELS" if self._keys.sharded else "CHANNELS", directory.names.pattern)
-        (reply,) = await node.roundtrip([command])
-        if isinstance(reply, Exception):
-            raise explained(blamed(reply, command))
-        ids = [name[-ID:].decode("ascii", "replace") for name in reply if type(name) is bytes]
-        directory.found([it for it in ids if messages.is_id(it)], asyncio.get_running_loop().time())
-
-    async def _look_again(self, directory: Directory) -> None:
-        try:
-            with contextlib.suppress(ReemError, RedisError, OSError):  # the next call notices what is the matter
-                await self._look(directory)
-        finally:
-            directory.looking = None
-
-    async def ask(self, channel: str) -> dict[str, Any]:
-        """Return what a server says of itself; None for each if it says nothing within a second."""
-        if not self._follows:
-            await self._follow()
-        number = new_id()
-        answer = self._asked[number] = asyncio.get_running_loop().create_future()
-        said = dict.fromkeys(("host", "pid", "calls", "rate", "median", "errors", "waiting"))
-        try:
-            await publish(self._session, self._keys, channel, messages.bare(Message(messages.ASKED, number, self.id)))
-            async with asyncio.timeout(_LOOKS):
-                message = await answer
-            host, process, calls, errors, median, age = message.words
-            rate = int(calls) / max(float(age), 1.0)
-            return said | {
-                "host": host, "pid": int(process), "calls": int(calls), "rate": rate,
-                "median": float(median) if median else None, "errors": int(errors), "waiting": int(message.number),
-            }  # fmt: skip
-        except (TimeoutError, ValueError):  # it hangs, or is no server of REEM
-            return said
-        finally:
-            del self._asked[number]
-
-    # Whether they are still there.
-
-    async def _ping(self) -> None:
-        """Ping the servers from which answers are due, and end the calls to those that are gone."""
+    async def _watch(self) -> None:
+        """While there are calls, look for servers, and ping those from which answers are due."""
         try:
             while True:
                 await asyncio.sleep(_PERIOD)
-                due = {
-                    call.instance: call.directory
-                    for call in self._pending.values()
-                    if call.is_delivered and call.instance is not None and call.answer and not call.answer.done()
-                }
-                if not self._pending:
+                calls = [*self._pending.values()]
+                called, self._called = self._called, {call.directory for call in calls}
+                if not called:
                     return
-                await asyncio.gather(*(self._ping_one(*each) for each in due.items()))
+                due = {call.instance: call.directory for call in calls if call.instance and not call.answer.done()}
+                for directory in called:
+                    if asyncio.get_running_loop().time() - directory.looked > _LOOKS:
+                        with contextlib.suppress(ReemError, RedisError, OSError):  # the next call notices it
+                            await directory.look(self._session)
+                await asyncio.gather(*(self._ping(*each) for each in due.items()))
         finally:
-            self._pinging = None
+            self._watching = None
 
-    async def _ping_one(self, instance: Instance, directory: Directory) -> None:
+    async def _ping(self, instance: Instance, directory: Directory) -> None:
+        """Send a ping to a server, and end the calls to it if it is gone."""
         # Counted in pings and not in seconds: while this event loop is busy, no answer can be seen.
-        if instance.misses >= _MISSES:
-            self._lose(instance, directory, f"its server has not answered for {_MISSES * _PERIOD:g} s")
-            return
-        instance.misses += 1
-        payload = messages.bare(Message(messages.PING, "", self.id))
-        try:
-            count = await publish(self._session, self._keys, instance.channel, payload)
-        except (ReemError, RedisError, OSError):
-            instance.misses -= 1  # the Redis server does not answer: that says nothing of this one
-            return
-        if not count:
-            self._lose(instance, directory, "its server has ended, or has lost its connection")
-
-    def _lose(self, instance: Instance, directory: Directory, why: str) -> None:
+        why = f"its server has not answered for {_MISSES * _PERIOD:g} s"
+        if instance.misses < _MISSES:
+            payload = messages.bare(Message(messages.PING, new_id(), self.id))
+            try:
+                if await publish(self._session, self._keys, instance.channel, payload):
+                    instance.misses += 1
+                    return
+            except (ReemError, RedisError, OSError):
+                return  # the Redis server does not answer: that says nothing of this one
+            why = "its server has ended, or has lost its connection"
         directory.instances.pop(instance.id, None)
         for call in self._pending.values():
-            if call.instance is instance and call.is_delivered:
+            if call.instance is instance:
                 call.end(ServiceLost(f"{call.where}: {why}; the request may or may not have been handled"))
 
+    async def ask(self, channel: str) -> dict[str, Any]:
+        """Return what a server says of itself; None for each if it says nothing within a second."""
+        await self._follow()
+        ping = Message(messages.PING, new_id(), self.id)
+        answer = self._asked[ping.call] = asyncio.get_running_loop().create_future()
+        said: dict[str, Any] = dict.fromkeys((*_STATED, "waiting"))
+        try:
+            await publish(self._session, self._keys, channel, messages.bare(ping))
+            async with asyncio.timeout(_LOOKS):
+                message = await answer
+            stated = zip(_STATED.items(), message.words, strict=True)
+            said |= {name: read(word) if word else None for (name, read), word in stated}
+            return said | {"waiting": int(message.number)}
+        except (TimeoutError, ValueError):  # it hangs, or is no server of REEM
+            return said
+        finally:
+            del self._asked[ping.call]
 
-def _refused(where: str, busy: int) -> ServiceError:
+
+def _refusal(where: str, busy: int) -> ServiceError:
     if busy:
         return Busy(
             f"{where}: each of {busy} servers has as many requests waiting as its `queue` allows; "

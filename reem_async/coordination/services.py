@@ -17,11 +17,11 @@ import queue
 import socket
 import statistics
 import threading
-import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from ..concurrency.scheduling import take_short_turns
 from ..concurrency.tasks import is_being_cancelled
@@ -36,18 +36,17 @@ from ..errors import (
     ServerNotReady,
     WrongLoop,
 )
-from ..plan import Command
+from ..plan import Command, Reply
 from ..plan.arguments import whole
 from ..plan.keys import Keys
-from ..plan.notices import Slot
 from ..plan.paths import Path, shorten, show
 from ..pubsub.listeners import Listener, Topic
-from ..pubsub.manager import SubscriptionManager, manager_of
+from ..pubsub.manager import manager_of
 from ..session import Session
 from ..store.encoding import Encoder
 from . import messages
-from .calls import explained, new_id, publish
-from .messages import Encoded, Message, Names
+from .calls import explained, new_id, opened, publish
+from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")
 
@@ -55,13 +54,12 @@ QUEUE = 100  # requests that wait at most, unless another number is given
 _LEFT = 1000  # calls that are remembered as left before their request came: it may be large and on its way
 _RETRY = 0.1  # seconds between tries to send an answer while the connection is down
 _PAUSE = 0.5  # seconds between tries to begin
-_PERIOD, _STALE = 0.25, 0.75  # seconds between looks at whether messages arrive in time, and after which they do not
-_SHARED = 2
-"""Answers in shared memory that a caller has not taken yet: of the six slots, the caller may look into three."""
+_PERIOD, _STALE = 0.25, 0.75  # seconds between probes whether messages arrive in time, and after which they do not
+_REMEMBERED = 20  # answers in shared memory that may have to be sent again
 _RECENT = 200  # calls whose time is remembered
 
 
-class _Workers:
+class Workers:
     """The threads that call a plain function: as many as calls at a time, and daemons, so no program waits for them."""
 
     def __init__(self, name: str) -> None:
@@ -71,7 +69,7 @@ class _Workers:
         self._busy = 0
 
     async def run(self, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-        """Call a function on a thread and return what it returns. The call cannot be cancelled."""
+        """Call a function on a thread and return what it returns."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[tuple[Any, BaseException | None]] = loop.create_future()
         if self._busy == self._threads:
@@ -79,23 +77,16 @@ class _Workers:
             self._threads += 1
         self._busy += 1
         self._jobs.put((loop, done, function, arguments))
-        result, error = await _to_the_end(done)
+        result, error = await done
         self._busy -= 1
         if error is not None:
             raise error
         return result
 
     def close(self) -> None:
+        """End the threads, each after its call."""
         for _ in range(self._threads):
             self._jobs.put(None)
-
-
-async def _to_the_end(done: asyncio.Future[Any]) -> Any:
-    """Wait for what cannot be cancelled; a task that is cancelled meanwhile ends after it."""
-    while not done.done():
-        with contextlib.suppress(asyncio.CancelledError):
-            await asyncio.shield(done)
-    return done.result()
 
 
 def _work(jobs: queue.SimpleQueue[tuple[Any, ...] | None]) -> None:
@@ -113,65 +104,28 @@ def _work(jobs: queue.SimpleQueue[tuple[Any, ...] | None]) -> None:
 
 
 def _hand_over(done: asyncio.Future[Any], outcome: Any) -> None:
-    if not done.done():
+    if not done.done():  # cancelled with the interface
         done.set_result(outcome)
 
 
-class _Freshness:
-    """Whether messages arrive when they are sent, or wait somewhere first.
-
-    A stopped process, a busy event loop or a link that stood still gets old requests, with the message behind them that
-    their callers have left. So after a pause nothing is begun before all that waits has arrived.
-    """
-
-    def __init__(self, manager: SubscriptionManager) -> None:
-        self._manager = manager
-        self._proved = time.monotonic()
-        manager.tasks.start(self._keep(), "reem services")
-
-    async def _keep(self) -> None:
-        while True:
-            with contextlib.suppress(ReemError, RedisError):
-                await self.prove()
-            await asyncio.sleep(_PERIOD)
-
-    @property
-    def is_stale(self) -> bool:
-        return time.monotonic() - self._proved > _STALE
-
-    async def prove(self) -> None:
-        """Return when all that was published before now has arrived. Raises ConnectionLost."""
-        asked = time.monotonic()  # not when the reply was read: this program may have been stopped in between
-        await self._manager.fence(())
-        self._proved = asked
-
-
-class _Request:
+class Request:
     """One request, until it is answered or left."""
 
-    def __init__(self, message: Message, now: float) -> None:
+    def __init__(self, message: Message, leave: Callable[[Request], None]) -> None:
+        loop = asyncio.get_running_loop()
         self.message = message
         # The caller says how many seconds are left, since its clock is another one.
-        self.deadline = now + message.number
+        self.deadline = loop.time() + message.number
+        self.timer = loop.call_at(self.deadline, leave, self)
         self.is_left = False  # nothing waits for the answer any more
         self.cancel: Callable[[], object] | None = None  # ends an asynchronous function
 
-    def leave(self) -> None:
-        self.is_left = True
-        if self.cancel is not None:
-            self.cancel()
-
-
-class _Shared(NamedTuple):
-    """An answer in shared memory, until its caller has taken it."""
-
-    request: _Request
-    payload: bytes
-    memory: object  # keeps the memory from being given back
-
 
 class Served(Listener):
-    """One function that serves in one event loop: its channel, the requests that wait, and those being handled."""
+    """One function that serves in one event loop.
+
+    A request waits, is handled, and is over. It is in `_waiting` or `_handled`, and in neither afterwards.
+    """
 
     def __init__(
         self, session: Session, names: Names, function: Callable[..., Any], concurrency: int, bound: int
@@ -179,6 +133,7 @@ class Served(Listener):
         self.id = new_id()
         super().__init__(Topic(names.channel(self.id).encode()))
         self.takes_messages = True
+        self.heartbeat = _PERIOD
         self.where = show((names.keys.name, *names.path))
         self._session = session
         self._names = names
@@ -187,291 +142,235 @@ class Served(Listener):
         self._concurrency = concurrency
         self._bound = bound
         self._manager = manager_of(session)
-        self._workers = _Workers(f"reem serve {self.where}")
-        self._requests: dict[str, _Request] = {}  # waiting or being handled, by the id of the call
-        self._waiting: collections.deque[_Request] = collections.deque()
-        self._running = 0
+        self._workers = Workers(f"reem serve {self.where}")
+        self._waiting: collections.OrderedDict[str, Request] = collections.OrderedDict()  # by the id of the call
+        self._handled: dict[str, Request] = {}
         self._left: collections.OrderedDict[str, str] = collections.OrderedDict()  # calls and their callers
-        self._shared: dict[str, _Shared] = {}  # answers in shared memory that callers have not taken, by call
+        self._shared: collections.deque[tuple[Request, bytes]] = collections.deque(maxlen=_REMEMBERED)
         self.closed = asyncio.Event()
-        self._began = time.monotonic()
-        self.calls = self.errors = 0  # how many were answered, and with an exception
-        self.times: collections.deque[float] = collections.deque(maxlen=_RECENT)  # seconds that calls took
+        self._loop = asyncio.get_running_loop()
+        # All that was sent before this had arrived by now; see `_handle`.
+        self._proved = self._began = self._loop.time()
+        self._calls = self._errors = 0  # how many were answered, and with an exception
+        self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)  # seconds that calls took
 
     async def follow(self) -> None:
         """Begin to serve: when this returns, callers find this server."""
-        kept = self._manager.kept
-        self._fresh = kept.get(_Freshness) or kept.setdefault(_Freshness, _Freshness(self._manager))
         try:
             await self._manager.follow_here(self)
         except NotAllowed as error:
             raise explained(error) from None
-        kept[self.id] = self
+        self._manager.kept[self.id] = self
         self._session.activities.add_service(self.where)
 
     async def close(self) -> None:
         """Stop serving. Requests that wait go to other servers, and those being handled are given up."""
-        if self.closed.is_set():
-            return
-        self._end()
-        self._manager.kept.pop(self.id, None)
-        try:
+        if not self.closed.is_set():
+            self._manager.kept.pop(self.id, None)
             await self._manager.unfollow_here(self)
-            waiting = {*self._waiting}
-            for request in [*self._requests.values()]:
-                if not request.is_left:
-                    request.leave()
-                    kind = messages.CLOSED if request in waiting else messages.DROPPED
-                    await self._reply(request.message, self._bare(kind, request.message))
-        finally:
-            self._waiting.clear()
-            self._workers.close()
+            waiting = [each.message for each in self._waiting.values()]
+            self._end()
+            for message in waiting:
+                await self._reply(message, messages.CLOSED)
 
     def _end(self) -> None:
         self.closed.set()
         self._session.activities.remove_service(self.where)
+        for request in [*self._waiting.values(), *self._handled.values()]:
+            self._leave(request)
+        self._workers.close()
+
+    # What the subscription manager calls.
 
     def lost(self, reason: Exception) -> None:
         """Go on after a lost connection, which comes back; end with the interface."""
         super().lost(reason)
-        if isinstance(reason, InterfaceClosed) and self.ready is None and not self.closed.is_set():
+        if isinstance(reason, InterfaceClosed) and self.id in self._manager.kept and not self.closed.is_set():
             self._end()
-            for request in self._requests.values():
-                request.leave()
-            self._waiting.clear()
-            self._workers.close()
 
-    # Messages.
+    def probe(self, now: float) -> str:
+        """Ask for anything: only the time counts."""
+        return self._names.keys.document
+
+    def on_probe(self, kind: Reply, sent: float) -> None:
+        """Note that what was sent until then has arrived."""
+        self._proved = sent
 
     def on_message(self, payload: bytes) -> None:
         """Take a message of a caller."""
-        message = messages.decode(payload)
+        message = messages.decode(payload, self._session.local.view)
         match message.kind:
             case messages.CALL:
                 self._take(message)
             case messages.CANCEL:
-                request = self._requests.get(message.call)
+                request = self._waiting.get(message.call) or self._handled.get(message.call)
                 if request is None:
                     self._left[message.call] = message.sender
                     if len(self._left) > _LEFT:
                         self._left.popitem(last=False)
                 elif request.message.sender == message.sender:
-                    request.leave()
-                    self._drop_left()
+                    self._leave(request)
             case messages.PING:
-                self._send_soon(message, self._bare(messages.PONG, message))
-            case messages.ASKED:
-                self._send_soon(message, self._stated(message))
-            case messages.RECEIVED | messages.UNREAD:
-                sent = self._shared.get(message.call)
-                if sent is not None and sent.request.message.sender == message.sender:
-                    del self._shared[message.call]
-                    if message.kind == messages.UNREAD:
-                        self._manager.tasks.start(self._send_again(sent), "reem answer")
+                self._reply_soon(message, messages.PONG)
+            case messages.UNREAD:
+                for request, answer in self._shared:
+                    if (request.message.call, request.message.sender) == (message.call, message.sender):
+                        self._manager.tasks.start(self._send_again(request, answer), "reem answer")
 
     def _take(self, message: Message) -> None:
+        assert message.content is not None  # the message was checked
+        call = message.call
+        if self._left.pop(call, "") == message.sender or call in self._waiting or call in self._handled:
+            return
         if self.closed.is_set():
-            self._send_soon(message, self._bare(messages.CLOSED, message))
-        elif self._left.pop(message.call, "") != message.sender and message.call not in self._requests:
-            if len(self._waiting) >= self._bound:
-                self._drop_left()
-            if len(self._waiting) >= self._bound and self._running >= self._concurrency:
-                self._send_soon(message, self._bare(messages.BUSY, message))
-                return
-            assert message.content is not None  # the message was checked
-            content = message.content.seen(self._session.local.view)  # now: the caller may soon use the memory again
-            if content.is_missing:
-                self._send_soon(message, self._bare(messages.UNREAD, message))
-                return
-            message = message._replace(content=content)
-            request = self._requests[message.call] = _Request(message, asyncio.get_running_loop().time())
-            self._waiting.append(request)
+            self._reply_soon(message, messages.CLOSED)
+        elif len(self._waiting) >= self._bound:
+            self._reply_soon(message, messages.BUSY)
+        elif message.content.is_missing:
+            self._reply_soon(message, messages.UNREAD)
+        else:
+            self._waiting[call] = Request(message, self._leave)
             self._begin_next()
 
-    def _drop_left(self) -> None:
-        """Forget requests that wait in vain: their callers have left, or their time is over."""
-        now = asyncio.get_running_loop().time()
-        for request in [each for each in self._waiting if each.is_left or each.deadline <= now]:
-            self._waiting.remove(request)
-            self._requests.pop(request.message.call, None)
-
-    def _bare(self, kind: str, message: Message) -> bytes:
-        return messages.bare(Message(kind, message.call, self.id, self._busy))
-
-    def _stated(self, message: Message) -> bytes:
-        median = f"{statistics.median(self.times):.6f}" if self.times else ""
-        age = f"{time.monotonic() - self._began:.1f}"
-        words = [socket.gethostname(), str(os.getpid()), str(self.calls), str(self.errors), median, age]
-        return messages.bare(Message(messages.STATED, message.call, self.id, self._busy, words))
-
-    @property
-    def _busy(self) -> int:
-        """How many requests wait or are being handled."""
-        return len(self._waiting) + self._running
-
-    def _send_soon(self, message: Message, payload: bytes) -> None:
-        self._manager.tasks.start(self._reply(message, payload), "reem answer")
-
-    async def _reply(self, message: Message, payload: bytes) -> None:
-        with contextlib.suppress(ReemError, RedisError, OSError):  # the caller's pings find out
-            await publish(self._session, self._names.keys, self._channel_to(message), payload)
-
-    def _channel_to(self, message: Message) -> str:
-        return messages.answers(self._names.keys, message.sender)
+    def _leave(self, request: Request) -> None:
+        request.is_left = True
+        self._waiting.pop(request.message.call, None)
+        request.timer.cancel()
+        if request.cancel is not None:
+            request.cancel()
 
     # Requests.
 
     def _begin_next(self) -> None:
-        while self._running < self._concurrency and self._waiting:
-            request = self._waiting.popleft()
-            self._running += 1
+        while self._waiting and len(self._handled) < self._concurrency:
+            call, request = self._waiting.popitem(last=False)
+            self._handled[call] = request
             self._manager.tasks.start(self._handle(request), f"reem serve {self.where}")
 
-    async def _handle(self, request: _Request) -> None:
-        loop = asyncio.get_running_loop()
-        timer = loop.call_at(request.deadline, request.leave)
-        began = loop.time()
+    async def _handle(self, request: Request) -> None:
+        """Call the function for a request, and send the answer."""
+        began = self._loop.time()
         try:
-            if self._fresh.is_stale:
-                await self._fresh.prove()
-            if not request.is_left and loop.time() < request.deadline:
+            # A stopped process, a busy event loop or a link that stood still gets old requests, with the message
+            # behind them that their callers have left. So nothing is begun before all that waits has arrived.
+            if began - self._proved > _STALE:
+                try:
+                    await self._manager.fence(())
+                except (ReemError, RedisError):
+                    self._reply_soon(request.message, messages.CLOSED)
+                    return
+            if not request.is_left:
                 await self._answer(request)
-                self.times.append(loop.time() - began)
+                self._times.append(self._loop.time() - began)
         except (ReemError, RedisError) as error:
-            logger.warning("a request of %s was given up: %s", self.where, error)
-            self._send_soon(request.message, self._bare(messages.DROPPED, request.message))
+            logger.warning("an answer of %s could not be sent: %s", self.where, error)
         except asyncio.CancelledError:
             if not request.is_left:
                 raise
         finally:
-            timer.cancel()
-            self._requests.pop(request.message.call, None)
-            self._running -= 1
+            del self._handled[request.message.call]
+            request.timer.cancel()
             self._begin_next()
 
-    async def _answer(self, request: _Request) -> None:
-        message = request.message
-        prefix = self._names.answer(message.call)
-        encoder = Encoder(self._session, self._names.keys._replace(tag=prefix))
+    async def _answer(self, request: Request) -> None:
+        message, prefix = request.message, self._names.values(messages.ANSWER, request.message.call)
         try:
-            arguments = await self._arguments(message)
+            arguments = self._names.values(messages.CALL, message.call)
+            given = await opened(self._session, message.content, arguments, self.where)
+            if type(given) is not dict:
+                raise BadData(f"{self.where}: the arguments are {shorten(given)}, and not a dict")
+            request.message = message = message._replace(content=None)  # its memory is the caller's
             if request.is_left:
                 return
-            result = await self._called(request, arguments)
-            del arguments
-            if request.is_left:
-                return
-            value = await encoder.encoded(self._names.path, result)
+            result = await self._called(request, given)
+            del given
+            value = await Encoder(self._session, self._names.keys._replace(tag=prefix)).encoded(
+                self._names.path, result
+            )
         except BaseException as error:
             # The function may also raise CancelledError by itself. Ctrl-C ends the program, where it comes at all.
             was_cancelled = isinstance(error, asyncio.CancelledError) and (request.is_left or is_being_cancelled())
             if was_cancelled or (isinstance(error, KeyboardInterrupt) and self._is_async):
                 raise
-            self._count(failed=True)
+            self._calls += 1
+            self._errors += 1
             await self._send(request, self._failure(message, error))
         else:
-            self._count()
-            await self._send_value(request, value, prefix)
+            self._calls += 1
+            slots = self._names.keys._replace(channel=messages.answers(self._names.keys, message.sender))
+            local = self._session.local
+            put = partial(local.put, slots) if local.host and message.words[0] == local.host else None
+            await self._send_value(request, value, prefix, put)
 
-    def _count(self, *, failed: bool = False) -> None:
-        self.calls += 1
-        self.errors += failed
-
-    async def _arguments(self, message: Message) -> dict[str, Any]:
-        content, ships = message.content, self._session.ships
-        assert content is not None  # the message was checked
-        if content.is_stored:
-            plan = messages.fetch(content, self._names.request(message.call), ships, self.where)
-            pieces = await self._session.run(plan) if plan.commands else [content.data]
+    async def _called(self, request: Request, arguments: dict[str, Any]) -> Any:
+        if self._is_async:
+            result = self._function(**arguments)
         else:
-            pieces = messages.pieces_of(content)
-        arguments = await messages.opened(content, pieces, ships, self.where)
-        if type(arguments) is not dict:
-            raise BadData(f"{self.where}: the arguments are {shorten(arguments)}, and not a dict")
-        return arguments
-
-    async def _called(self, request: _Request, arguments: dict[str, Any]) -> Any:
-        if not self._is_async:
             result = await self._workers.run(self._function, arguments)
             if not inspect.isawaitable(result):
                 return result
-            waits = result
-        else:
-            waits = self._function(**arguments)
         task = asyncio.current_task()
-        request.cancel = None if task is None else task.cancel
+        request.cancel = task.cancel if task is not None else None
         try:
-            return await waits
+            return await result
         finally:
             request.cancel = None
 
+    # Answers.
+
+    def _message(self, kind: str, call: str, words: Sequence[str] = ()) -> Message:
+        return Message(kind, call, self.id, len(self._waiting) + len(self._handled), words)
+
     def _failure(self, message: Message, error: BaseException) -> bytes:
         trace = "".join(traceback.format_exception(type(error), error, _below_ours(error.__traceback__)))
-        return messages.failure(message.call, self.id, self._busy - 1, error, trace)
+        return messages.failure(self._message(messages.FAILED, message.call), error, trace)
 
-    async def _send_value(self, request: _Request, value: Encoded, prefix: str) -> None:
-        answer = Message(messages.ANSWER, request.message.call, self.id, self._busy - 1, [self._session.local.host])
-        if messages.is_small(value):
-            await self._send(request, messages.inline(answer, value))
-            return
-        if (slot := self._slot(request, value)) is not None:
-            payload = messages.in_slot(answer, value, slot)
-            self._shared[answer.call] = _Shared(request, payload, self._session.local.kept(self._answers(request)))
-            await self._send(request, payload)
-            return
-        await self._send_stored(request, answer, value, prefix)
+    def _reply_soon(self, message: Message, kind: str) -> None:
+        self._manager.tasks.start(self._reply(message, kind), "reem answer")
 
-    def _slot(self, request: _Request, value: Encoded) -> Slot | None:
-        """Put an answer into shared memory; None if the caller is elsewhere, or has others to take out first."""
-        message, local = request.message, self._session.local
-        if not local.host or message.words[0] != local.host:
-            return None
-        now = asyncio.get_running_loop().time()
-        for call in [call for call, sent in self._shared.items() if sent.request.deadline < now]:
-            del self._shared[call]
-        if sum(sent.request.message.sender == message.sender for sent in self._shared.values()) >= _SHARED:
-            return None
-        return messages.put(local, self._names.keys, self._answers(request), value)
+    async def _reply(self, message: Message, kind: str) -> None:
+        words: list[str] = []
+        if kind == messages.PONG:
+            rate = self._calls / max(self._loop.time() - self._began, 1.0)
+            median = statistics.median(self._times) if self._times else ""
+            words = [str(each) for each in (socket.gethostname(), os.getpid(), self._calls, rate, median, self._errors)]
+        channel = messages.answers(self._names.keys, message.sender)
+        with contextlib.suppress(ReemError, RedisError, OSError):  # the caller's pings find out
+            payload = messages.bare(self._message(kind, message.call, words))
+            await publish(self._session, self._names.keys, channel, payload)
 
-    def _answers(self, request: _Request) -> str:
-        return self._channel_to(request.message)
-
-    async def _send_again(self, sent: _Shared) -> None:
-        """Send an answer through the server that its caller could not read in shared memory."""
-        answer = messages.decode(sent.payload)
-        assert answer.content is not None
-        content = answer.content.seen(self._session.local.view)
-        prefix = self._names.answer(answer.call)
-        if content.is_missing:  # the memory is this program's own
-            error = BadData(f"{self.where}: the answer is not in shared memory any more")
-            await self._send(sent.request, self._failure(sent.request.message, error))
-            return
-        await self._send_stored(sent.request, answer, messages.again(content, prefix), prefix)
-
-    async def _send_stored(self, request: _Request, answer: Message, value: Encoded, prefix: str) -> None:
-        left = max(request.deadline - asyncio.get_running_loop().time(), 0.0)
-        payload, commands = messages.stored(answer, value, prefix, left)
+    async def _send_value(self, request: Request, value: Encoded, prefix: str, put: Put | None) -> None:
+        answer = self._message(messages.ANSWER, request.message.call, [self._session.local.host])
+        left = max(request.deadline - self._loop.time(), 0.0)
+        payload, commands, is_shared = messages.packed(answer, value, prefix, left, put)
+        if is_shared:
+            self._shared.append((request, payload))
         try:
             received = await self._send(request, payload, commands)
         except Refused as error:  # the memory of the Redis server is full, or its user may not write
-            await self._send(request, self._failure(request.message, error))
-            received = 0
-        if not received:
+            received = await self._send(request, self._failure(request.message, error))
+        if commands and not received:
             with contextlib.suppress(ReemError, RedisError, OSError):
                 await self._session.transport.roundtrip([("UNLINK", *messages.keys_of(prefix, value))])
 
-    async def _send(self, request: _Request, payload: bytes, commands: list[Command] | None = None) -> int:
+    async def _send_again(self, request: Request, payload: bytes) -> None:
+        """Send an answer through the server that its caller could not read in shared memory."""
+        content = messages.decode(payload, self._session.local.view).content
+        prefix = self._names.values(messages.ANSWER, request.message.call)
+        if content is None or content.is_missing:  # five newer answers are there
+            error = BadData(f"{self.where}: the answer is not in shared memory any more")
+            await self._send(request, self._failure(request.message, error))
+        else:
+            await self._send_value(request, messages.again(content, prefix), prefix, None)
+
+    async def _send(self, request: Request, payload: bytes, commands: Sequence[Command] = ()) -> int:
         """Publish an answer; while the connection is down, try again until nothing waits for it any more."""
-        channel = self._channel_to(request.message)
-        while not request.is_left:
+        channel = messages.answers(self._names.keys, request.message.sender)
+        while not request.is_left and self._loop.time() < request.deadline:
             try:
-                return await publish(self._session, self._names.keys, channel, payload, commands or ())
-            except (ServerNotReady, OSError):
-                await asyncio.sleep(_RETRY)
-            except Refused:
-                raise
-            except (ReemError, RedisError) as error:
-                if isinstance(error, InterfaceClosed):
+                return await publish(self._session, self._names.keys, channel, payload, commands)
+            except (ReemError, RedisError, OSError) as error:
+                if isinstance(error, InterfaceClosed | Refused) and not isinstance(error, ServerNotReady):
                     raise
                 await asyncio.sleep(_RETRY)
         return 0
