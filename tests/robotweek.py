@@ -277,8 +277,8 @@ class Week:
             if any(isinstance(each, np.ndarray) for each in (truth[name] or {}).values()):
                 continue  # an outage came before it was deleted again
             for when in ({}, {"at": time.time() - 0.1}):
-                where = f"{address[0]}view/{name}"
-                answer = httpx.get(where, params={"format": "json", **when}, timeout=PATIENCE, trust_env=False)
+                asked = {"path": name, **when}
+                answer = httpx.get(f"{address[0]}api/json", params=asked, timeout=PATIENCE, trust_env=False)
                 if (answer.json() if answer.status_code == 200 else None) != truth[name]:
                     found.append(f"page of {name} {when}: {answer.text[:300]} in place of {truth[name]!r:.300}")
         return found

@@ -9,7 +9,7 @@ import numpy as np
 import orjson
 import pytest
 from browserkit import client_of, live, served
-from conftest import assert_same, eventually, python, repeated, sized
+from conftest import eventually, python, repeated, sized
 from PIL import Image
 
 import reem
@@ -136,7 +136,10 @@ def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
         ("step", {}, 400),
         ("picture", {"path": "{}.raw"}, 400),
         ("nothing", {}, 404),
-        *((what, {}, 400) for what in ("series", "array", "image", "table", "line", "histogram", "bytes", "picture")),
+        *(
+            (what, {}, 400)
+            for what in ("series", "json", "array", "image", "table", "line", "histogram", "bytes", "picture")
+        ),
     ],
 )
 def test_what_cannot_be_shown_is_an_error_that_says_so(ask, robot, what, values, status):
@@ -158,48 +161,12 @@ def test_what_the_server_refuses_does_not_look_as_if_it_were_away(ask, raw, key)
     assert "without REEM" in answer.json()["error"]
 
 
-def test_downloads(ask, robot):
-    def get(path, **values):
-        return ask.http.get(f"/view/{robot}.{path}", params=values)
-
-    answer = get("image", format="npy")
-    assert answer.headers["content-disposition"].startswith(f'attachment; filename="{robot}.image.npy"')
-    assert_same(np.load(io.BytesIO(answer.content), allow_pickle=False), IMAGE)
-    part = get("image", format="npy", slice="3,:,0")
-    assert_same(np.load(io.BytesIO(part.content), allow_pickle=False), IMAGE[3, :, 0])
-    assert get("q", format="csv").text.split() == ["1.0", "2.5", "3.0"]
-    assert get("image", format="csv", slice="0,:,:").text.splitlines()[5] == ",".join(map(str, IMAGE[0, 5]))
-    with Image.open(io.BytesIO(get("image", format="png").content)) as image:
-        assert (np.asarray(image) == IMAGE).all()
-    assert get("n", format="json").json() == 1
-    whole = ask.http.get(f"/view/{robot}", params={"format": "json"}).json()
-    assert repr(whole["depth"]) == "[[0.5, nan], [2.0, 3.0]]"
-    assert whole["image"] == IMAGE.tolist()
-    assert whole["raw"] == "AAH/"
-    assert get("raw", format="bin").content == b"\x00\x01\xff"
-    assert 'filename="' + robot + ".image_0" in get("image", format="csv", slice="0,:,:").headers["content-disposition"]
-    for path, kind in (("n", "npy"), ("s", "csv"), ("n", "exe"), ("image", "csv"), ("raw", "png"), ("n", "bin")):
-        assert get(path, format=kind).status_code == 400, (path, kind)
-
-
-def test_what_json_cannot_hold_is_refused_and_not_left_out(ask, kvs, key):
-    kvs[key()] = {"z": np.zeros(1_000_001, np.uint8)}
-    answer = ask.http.get(f"/view/{key()}", params={"format": "json"})
-    assert answer.status_code == 400
-    assert f"{key()}.z" in answer.json()["error"]
-
-
-@pytest.mark.parametrize("kind", ["json", "csv"])
-def test_text_that_utf8_lacks_is_refused_as_a_file(ask, kvs, key, kind):
-    kvs[key()] = np.array(["\ud800", "plain"])
-    answer = ask.http.get(f"/view/{key()}", params={"format": kind})
-    assert answer.status_code == 400
-    assert "choose npy" in answer.json()["error"]
-
-
-def test_formulas_in_csv_are_quoted(ask, kvs, key):
-    kvs[key()] = np.array(["=1+1", "plain", "@x"])
-    assert ask.http.get(f"/view/{key()}", params={"format": "csv"}).text.split() == ["'=1+1", "plain", "'@x"]
+def test_what_is_edited_is_read_as_json(ask, robot, kvs, key):
+    kvs[key()] = {"n": 1, "s": "ä"}
+    assert ask.ask("json", path=key()).json() == {"n": 1, "s": "ä"}
+    for path in (robot, f"{robot}.image", f"{robot}.raw"):
+        answer = ask.ask("json", path=path)
+        assert (answer.status_code, "holds arrays" in answer.json()["error"]) == (400, True), path
 
 
 def test_bytes_that_are_a_picture_are_shown_as_one(ask, kvs, key):
@@ -300,7 +267,7 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
 
 
 def content(ask, name, at):
-    answer = ask.http.get(f"/view/{name}", params={"format": "json", "at": at})
+    answer = ask.ask("json", path=name, at=at)
     return answer.json() if answer.status_code == 200 else None
 
 

@@ -440,25 +440,6 @@ def test_search_on_a_phone_covers_the_value(visit, kvs, key):
     expect(page.locator("h1")).to_have_text(key("arm"))
 
 
-@pytest.mark.long
-def test_downloads_are_whole_and_say_why_there_is_none(visit, kvs, key, tmp_path):
-    image = np.arange(60 * 40 * 3, dtype=np.uint8).reshape(60, 40, 3)
-    kvs[key()] = {"image": image, "z": np.array([1j]), "mixed": [1, "a"]}
-    page = visit.open(f"/view/{key()}.image")
-    page.get_by_role("tab", name="Table").click()
-    with page.expect_download() as done:
-        page.get_by_role("link", name="npy").click()
-    done.value.save_as(tmp_path / "a.npy")
-    assert (np.load(tmp_path / "a.npy") == image).all()
-    with page.expect_download() as done:
-        page.get_by_role("link", name="csv").click()
-    assert done.value.suggested_filename.startswith(f"{key()}.image[")
-    page = visit.open(f"/view/{key()}.mixed")
-    page.get_by_role("link", name="npy").click()
-    expect(page.locator("#toast")).to_contain_text("not an array")
-    visit.said.clear()  # the browser notes each answer of 400 there
-
-
 def test_the_scale_of_colours_is_there_again_after_other_tabs(visit, kvs, key):
     kvs[key()] = np.linspace(0, 1, 400).reshape(20, 20)
     page = visit.open(f"/view/{key()}")

@@ -10,9 +10,8 @@ import urllib.parse
 import numpy as np
 import pytest
 import redis
-from browserkit import client_of, live, served
 from clikit import CommandLine
-from conftest import PATIENCE, eventually
+from conftest import PATIENCE
 
 import reem
 import reem_async
@@ -109,16 +108,6 @@ async def test_an_event_says_whether_its_value_is_in_shared_memory(server_url, k
         for value, local in [({"n": 1}, False), ({"n": 2, "image": IMAGE}, True), ({"n": 3}, False)]:
             await space[key("cam")].write(value)
             assert (await anext(monitor)).local is local
-
-
-@only_where_there_is
-def test_the_page_says_which_key_is_shared(server_url, key, beside, pspace):
-    with served(live(server_url)) as (address, _), client_of(address) as page:
-        pspace[key("cam")] = {"image": IMAGE}
-        pspace[key("arm")] = {"n": 1}
-        eventually(lambda: {key("cam"), key("arm")} <= page.rows().keys())
-        eventually(lambda: page.rows()[key("cam")]["shared"])
-        assert not page.rows()[key("arm")]["shared"]
 
 
 @only_where_there_is

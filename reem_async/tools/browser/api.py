@@ -22,6 +22,7 @@ from ...errors import (
     BadData,
     BadInput,
     BadKey,
+    BadType,
     BadValue,
     MissingKey,
     NotAllowed,
@@ -34,6 +35,9 @@ from ...errors import (
     WrongKind,
 )
 from ...plan.paths import Path, show
+from ...plan.placeholders import Unfetched
+from ...plan.trees import walk
+from ..jsontext import json_text
 from .source import Node, NotKept, Series, Source, address, path_of, thinned, visible
 
 # Requests: parameters are checked, and errors become answers with the right status.
@@ -184,6 +188,7 @@ class Api:
         asked = self.tree, self.series, self.step, self.activity, self.search, self.parameters
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
+        routes.append(Route("/json", answered(self.json), methods=["GET"]))
         return [*routes, Route("/write", answered(self.write), methods=["POST"])]
 
     async def tree(self, request: Request) -> Response:
@@ -231,6 +236,15 @@ class Api:
         if self.allow_write and at is None and node.kind in ("dict", "list"):
             answer["editable"] = (node.count or 0) <= _MOST_ROWS
         return reply(answer)
+
+    async def json(self, request: Request) -> Response:
+        """Return a value as JSON, for the editor; raises BadType if arrays or bytes are in it."""
+        path = value_path_in(request)
+        value = (await self._source.value(path, at_of(request))).value
+        if any(isinstance(it, np.ndarray | bytes | Unfetched) for _, it in walk(value, path)):
+            raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
+        text = json_text(value, pretty=True).encode(errors="backslashreplace")  # half of a surrogate pair
+        return Response(text, media_type="application/json")
 
     async def series(self, request: Request) -> Response:
         status = self._source.status()

@@ -13,7 +13,6 @@ from importlib import resources
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
-import anyio.to_thread
 import orjson
 import uvicorn
 from starlette.applications import Starlette
@@ -25,10 +24,9 @@ from starlette.routing import Mount, Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ...errors import BadKey, ServerFailed
-from .api import Api, Events, answered, at_of
-from .arrays import Arrays, disposition, file_of
-from .pictures import Preview
-from .source import NotKept, Source, path_of, visible
+from .api import Api, Events
+from .arrays import Arrays
+from .source import Source, path_of, visible
 
 # Access checks: the Host header, the token, where a request comes from, and what answers carry.
 
@@ -299,25 +297,11 @@ class _Pages:
         return self._page()
 
     async def view(self, request: Request) -> Response:
-        """Return the page for one path, or the value there as a file."""
         try:
-            path = path_of(request.path_params["where"])
+            path_of(request.path_params["where"])
         except BadKey as error:
-            return PlainTextResponse(f"{visible(str(error))}\n", 400 if "format" in request.query_params else 404)
-        if "format" in request.query_params and path:
-            return await answered(self._download)(request)
+            return PlainTextResponse(f"{visible(str(error))}\n", 404)
         return self._page()
-
-    async def _download(self, request: Request) -> Response:
-        path, kind = path_of(request.path_params["where"]), request.query_params["format"]
-        value = (await self._source.value(path, at_of(request))).value
-        if isinstance(value, Preview):
-            raise NotKept("only a small picture of this array is kept for this instant; choose a later one")
-        chosen = request.query_params.get("slice")
-        content, media_type = await anyio.to_thread.run_sync(lambda: file_of(value, path, kind, chosen))
-        return Response(
-            content, headers={"content-disposition": disposition(path, kind, chosen)}, media_type=media_type
-        )
 
     async def static(self, request: Request) -> Response:
         name = request.path_params["name"]

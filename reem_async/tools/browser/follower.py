@@ -39,8 +39,6 @@ from .timeline import PENDING
 from .trees import framed, is_kept, same, weight
 
 _WAITING = 50_000  # updates that wait for this program before the oldest are skipped
-_MOST_SHARED = 10_000  # keys of which is remembered when their publisher has shared memory
-_SHARED_SECONDS = 10.0  # for so long a publisher is said to share memory after it has; as in `reem top`
 _RECENT = 16  # updates that are known again if they come twice, where there may be thousands of keys
 
 # Documents that are asked for at the same time.
@@ -295,7 +293,6 @@ class Follower:
         self._due: dict[str, None] = {}  # documents to be read
         self._owing: dict[str, None] = {}  # keys with arrays to be read
         self._news, self._owes = asyncio.Event(), asyncio.Event()
-        self._shared: dict[str, float] = {}  # when the last value of a key came that is in shared memory too
         self.names: set[str] = set()  # the top-level keys
         # Keys that were there when following began and were not read yet: what they hold is no change
         self.unread: set[str] = set()
@@ -335,10 +332,6 @@ class Follower:
         """Return whether the buffer has all changes of a key and its arrays, as far as is known."""
         return name in self._keys and self._keys[name].is_settled
 
-    def is_shared(self, name: str) -> bool:
-        """Return whether programs on the publisher's host could of late take what is published from its memory."""
-        return time.monotonic() - self._shared.get(name, -math.inf) < _SHARED_SECONDS
-
     def key(self, name: str) -> FollowedKey:
         if name not in self._keys:
             self._keys[name] = FollowedKey(self, name)
@@ -362,10 +355,6 @@ class Follower:
 
     def _take(self, event: Event) -> None:
         name = event.name
-        if event.local:
-            if len(self._shared) > _MOST_SHARED:
-                self._shared.clear()
-            self._shared[name] = time.monotonic()
         if len(event.path) == 1 and event.deleted:
             self.names.discard(name)
         elif len(event.path) == 1 or name not in self.history.names:

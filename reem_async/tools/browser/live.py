@@ -113,7 +113,7 @@ class LiveSource:
             if path not in found:
                 found[path] = self._past(path, when)
         last = self.history.last(paths, when)
-        return [self._stamped(found[path], last, when, live=at is None) for path in paths]
+        return [self._stamped(found[path], last, when) for path in paths]
 
     def _past(self, path: Path, at: float) -> Node | None:
         value = self.history.tree(path, at)
@@ -121,14 +121,11 @@ class LiveSource:
             return Node(path, "unknown", "not kept for this instant")
         return None if value is MISSING else node_of(path, value)
 
-    def _stamped(self, node: Node | None, last: dict[Path, float], when: float, *, live: bool) -> Node | None:
+    def _stamped(self, node: Node | None, last: dict[Path, float], when: float) -> Node | None:
         if node is None:
             return None
-        if len(node.path) > 1:
-            return node.stamped(last.get(node.path), None)
-        name = str(node.path[0])
-        shared = live and self._follower.is_shared(name)
-        return node.stamped(last.get(node.path), self.history.rate(name, when), shared=shared)
+        rate = self.history.rate(str(node.path[0]), when) if len(node.path) == 1 else None
+        return node.stamped(last.get(node.path), rate)
 
     async def children(self, path: Path, start: int, count: int, at: float | None) -> Page:
         """Return some of what is below a path: four round trips at most."""

@@ -91,10 +91,9 @@ class Node:
     value: Any = None  # a number, bool or None as it is; else None
     time: float | None = None  # when it was last seen to change, in seconds since 1970; None if that is not known
     rate: float | None = None  # updates per second of late; None if that is not known
-    shared: bool = False  # what is published there goes through shared memory, too, to programs on the publisher's host
 
-    def stamped(self, when: float | None, rate: float | None, *, shared: bool = False) -> Node:
-        return replace(self, time=when, rate=rate, shared=shared)
+    def stamped(self, when: float | None, rate: float | None) -> Node:
+        return replace(self, time=when, rate=rate)
 
     def as_json(self) -> dict[str, Any]:
         key = self.path[-1] if self.path else ""
@@ -108,7 +107,6 @@ class Node:
             "count": self.count,
             "time": self.time,
             "rate": self.rate,
-            "shared": self.shared,
         }
 
 

@@ -21,12 +21,6 @@ export class ArrayView {
     this.parent = parent;
   }
 
-  // What part of it a file of this format holds: a table and a picture have two axes, the others all of it.
-  chosen(format) { return { csv: this.slices.table, png: this.slices.image }[format]; }
-
-  // Whether there can be such a file.
-  offers(format) { return !this.about || { csv: "table", png: "image" }[format] === undefined || { csv: "table", png: "image" }[format] in this.about.views; }
-
   async update(node, signal) {
     const about = await getJson("array", { path: this.address, at: this.app.at }, signal);
     if (!this.about) this.build(about);

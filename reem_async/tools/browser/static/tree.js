@@ -111,7 +111,7 @@ export class Tree {
     setText(it, node.rate >= 2 ? `${Math.round(node.rate)} Hz` : seconds === null ? "–" : ageText(seconds));
     it.classList.toggle("stale", this.regular.has(node.address) && !node.rate && seconds > 5);
     const changed = seconds === null ? "not seen to change yet" : `changed ${ageText(seconds)}${seconds < 1 ? "" : " ago"}`;
-    it.title = node.shared ? `${changed}; arrays also through shared memory` : changed;
+    it.title = changed;
   }
 
   // A row is used again where the same place is found by a search, there with its whole path.

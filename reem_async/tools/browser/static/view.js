@@ -11,7 +11,6 @@ const BUSY = 6, OF_EACH = 3, BUSY_PAUSE = 5000, FRESH = 10;
 // The keys on the first page, the panes of each, ms until others may take their place, s in which a number must have come.
 const SCALARS = ["str", "int", "float", "bool", "NoneType"];
 const NUMBERS = ["int", "float", "bool"];
-const FORMATS = new Map([["numpy", ["npy", "csv", "png", "json"]], ["list", ["json", "csv", "npy"]], ["bytes", ["bin", "json"]]]);
 
 export class View {
   constructor(element, app) {
@@ -55,7 +54,6 @@ export class View {
       if (kept) setText(this.note, `It is ${nameOf(node.kind)} now: ${node.text}. It is shown again once Edit is closed.`);
       else await this.body.update(node, signal);
       await this.parameters.update(signal);
-      this.offer();
     } catch (error) {
       if (error.name === "AbortError" || address !== this.address) return;
       if (![400, 404, 409, 422].includes(error.status)) throw error;
@@ -115,7 +113,6 @@ export class View {
     const age = node.time === null ? "" : ageText(Math.max(this.app.now() - node.time, 0));
     const words = [nameOf(node.kind), node.kind === "numpy" ? node.text : "", SCALARS.includes(node.kind) && node.kind !== "str" ? "" : size];
     if (node.rate >= 2) words.push(`${Math.round(node.rate)} Hz`);
-    if (node.shared) words.push("shared memory");
     if (age) words.push(age === "now" ? "changed now" : `changed ${age} ago`);
     setText(this.what, words.filter(Boolean).join(" · "));
     this.node = node;
@@ -123,46 +120,13 @@ export class View {
     this.snippet?.(node.snippets ?? {});
   }
 
-  // The files that there can be of what is shown now.
-  offer() {
-    for (const link of this.downloads ?? []) {
-      link.href = this.link(link.dataset.format);
-      link.hidden = !(this.body?.offers?.(link.dataset.format) ?? true);
-    }
-  }
-
-  link(format) {
-    return `/view/${encodeURIComponent(this.address)}?${query({ format, at: this.app.at, slice: this.body?.chosen?.(format) })}`;
-  }
-
-  // Fetched here and not by the browser, which would not tell why there is no such file.
-  async save(event) {
-    event.preventDefault();
-    const link = event.currentTarget;
-    try {
-      const response = await fetched(link.href);
-      const name = /filename\*=UTF-8''([^;]*)/.exec(response.headers.get("content-disposition") ?? "")?.[1];
-      const url = URL.createObjectURL(await bodyOf(response, "blob"));
-      const file = el("a", { href: url, download: name ? decodeURIComponent(name) : "" });
-      file.click();
-      setTimeout(() => URL.revokeObjectURL(url), 60000);
-    } catch (error) {
-      toast(error.message);
-    }
-  }
-
   extras(node) {
     const extras = [];
     this.editor = this.snippet = null;
     if (this.app.config.write && [...SCALARS, "dict", "list"].includes(node.kind) && node.editable !== false) extras.push((this.editor = this.editCard()));
-    const formats = FORMATS.get(node.kind) ?? ["json"];
-    this.downloads = formats.map((format) => el("a", { "data-format": format, href: this.linkFirst(format), onclick: (event) => this.save(event) }, format));
-    const snippet = Object.keys(node.snippets ?? {}).length ? this.snippetCard(node.snippets) : null;
-    const files = el("div", { class: "card row2" }, el("span", { class: "what" }, "Download"), ...this.downloads);
-    return [...extras, snippet, files].filter(Boolean);
+    if (Object.keys(node.snippets ?? {}).length) extras.push(this.snippetCard(node.snippets));
+    return extras;
   }
-
-  linkFirst(format) { return `/view/${encodeURIComponent(this.address)}?format=${format}`; }
 
   snippetCard(snippets) {
     const names = Object.keys(snippets), code = el("pre", {}, snippets[names[0]]);
@@ -184,7 +148,7 @@ export class View {
 
   async jsonText() {
     if (SCALARS.includes(this.node.kind) && this.node.kind !== "str") return this.node.text;
-    return bodyOf(await fetched(this.linkFirst("json")), "text");
+    return bodyOf(await fetched(`/api/json?${query({ path: this.address })}`), "text");
   }
 
   // What is wrong with what is in the field is said beside it, until it is changed.
