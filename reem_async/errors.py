@@ -1,120 +1,13 @@
-"""Every error REEM raises, by whose fault it is.
-
-    ReemError
-    +-- BadInput                 the value or path given; nothing was sent
-    |   +-- BadValue             also ValueError: an integer out of range, ...
-    |   |   +-- NotFinite        also redis ResponseError: NaN or infinity in a document
-    |   +-- BadType              also TypeError: a set, an object array, ...
-    |   |   +-- WrongType        also redis ResponseError: what is stored there is of another type than the call needs
-    |   +-- BadKey               also ValueError: a key that cannot be stored or addressed
-    |   +-- TooDeep              also ValueError, redis ResponseError: nested over 100 levels, or in a circle
-    +-- Misuse                   also RuntimeError: used in a way that cannot work
-    |   +-- InterfaceClosed
-    |   +-- WrongLoop            an interface used in two event loops, or a blocking call on REEM's own
-    |   +-- WriteOnly            also NotImplementedError: reading a PublishSpace
-    |   +-- ReadOnly             also NotImplementedError: writing to a subscriber
-    +-- MissingKey               also KeyError, redis ResponseError: nothing is stored there
-    |   +-- MissingDocument      not even the top-level key
-    +-- PathRefused              also KeyError, redis ResponseError: the parent is missing or cannot hold the element
-    |   +-- MissingTop           there is no top-level key to write into
-    +-- Overflow                 also OverflowError, redis ResponseError: arithmetic left the range; put back
-    +-- Conflict                 another client changed what was edited, or kept writing to the key; nothing written
-    |   +-- Contended            other clients kept writing to the key for the whole timeout
-    +-- Owned                    another program owns the top-level key
-    +-- LeaseLost                this program does not own the top-level key any more; nothing written
-    +-- Stale                    a mirror's copy is older than it may be, or its connection is down
-    |   +-- Silent               no update has arrived for as long as the mirror's `ttl` allows
-    +-- QueueFull                a subscriber with the policy Every fell too far behind
-    +-- ServiceError             a call of a service got no answer
-    |   +-- NoService            no program serves it; nothing was begun
-    |   +-- Busy                 every server of it has as many requests waiting as it allows; nothing was begun
-    |   +-- CallTimeout          also TimeoutError: no answer within the timeout
-    |   +-- ServiceLost          its server ended, stopped serving or does not answer any more
-    |   +-- RemoteError          its function raised an exception; has its type, message and traceback as text
-    +-- BadData                  what the server sent is not what REEM writes; nothing trusted
-    +-- ServerMissing            extra `server` not installed, or no usable server binary
-    +-- ServerFailed             an embedded server did not start: port taken, ...
+"""Every error REEM raises; docs/reference/errors.md lists them with causes and cures.
 
 Those that are also redis-py's ResponseError are what the server itself answered in REEM 0.0 and 0.1, whose programs
-catch them by that name.
-
-Errors that come from the server or from the connection stay `redis.exceptions.RedisError`:
-
-    redis.exceptions.RedisError
-    +-- ConnectionLost           (ReemError, redis ConnectionError) broken before the reply: outcome unknown
-    +-- NotConnected             (ReemError, redis ConnectionError) no server listening: nothing was applied
-    +-- WrongKind                (ReemError, redis ResponseError) a foreign Redis type is under that key
-    +-- PartialWrite             (ReemError, redis ResponseError) the server refused a part; says which
-    +-- Refused                  (ReemError) the server turned the call down: nothing of it was applied
-        +-- LoginRefused         also redis AuthenticationError: wrong user or password, or none given
-        +-- NotAllowed           also redis NoPermissionError: the user lacks a right; says which
-        +-- ServerFull           also redis OutOfMemoryError: `maxmemory` is reached
-        +-- ServerReadOnly       also redis ReadOnlyError: a replica, or a server that cannot save
-        +-- ServerNotReady       also redis BusyLoadingError: still loading, busy, or without its primary
-        +-- ClusterNode          also redis ResponseError: one node of a Redis Cluster
-        +-- NoJsonSupport        also redis ResponseError: its JSON is not all of RedisJSON
-
-`NotConnected` has a subclass `TlsRefused`: the server is there, but one side did not accept the other's certificate.
-
-One warning: `InsecureConnection`, a connection to another machine that others can listen to.
+catch them by that name. Errors that come from the server or from the connection stay `redis.exceptions.RedisError`.
 """
 
 from __future__ import annotations
 
 import redis.exceptions
 from redis.exceptions import RedisError as RedisError
-
-__all__ = [
-    "BadData",
-    "BadInput",
-    "BadKey",
-    "BadType",
-    "BadValue",
-    "Busy",
-    "CallTimeout",
-    "ClusterNode",
-    "Conflict",
-    "ConnectionLost",
-    "Contended",
-    "InsecureConnection",
-    "InterfaceClosed",
-    "LeaseLost",
-    "LoginRefused",
-    "MissingDocument",
-    "MissingKey",
-    "MissingTop",
-    "Misuse",
-    "NoJsonSupport",
-    "NoService",
-    "NotAllowed",
-    "NotConnected",
-    "NotFinite",
-    "Overflow",
-    "Owned",
-    "PartialWrite",
-    "PathRefused",
-    "QueueFull",
-    "ReadOnly",
-    "ReemError",
-    "Refused",
-    "RemoteError",
-    "ServerFailed",
-    "ServerFull",
-    "ServerMissing",
-    "ServerNotReady",
-    "ServerReadOnly",
-    "ServiceError",
-    "ServiceLost",
-    "Silent",
-    "Stale",
-    "TlsRefused",
-    "TooDeep",
-    "WriteOnly",
-    "WrongKind",
-    "WrongLoop",
-    "WrongType",
-]
-
 
 ClusterReply = (
     redis.exceptions.AskError  # MovedError is one of them
@@ -427,3 +320,10 @@ def turned_down(error: Exception) -> Refused:
     elif isinstance(error, redis.exceptions.ClusterDownError):
         fact = "the server is a node of a Redis Cluster that does not serve this key at the moment"
     return ClusterNode(f"{fact} (it says: {error!s:.120})", ALL_NODES)
+
+
+__all__ = [
+    name
+    for name, kind in vars().items()
+    if isinstance(kind, type) and issubclass(kind, ReemError | Warning) and kind.__module__ == __name__
+]

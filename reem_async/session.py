@@ -7,7 +7,6 @@ import contextlib
 import math
 import os
 import secrets
-import threading
 import time
 import weakref
 from collections.abc import AsyncIterator, Coroutine, Sequence
@@ -37,100 +36,53 @@ QUIET = 60.0
 """After this silence (seconds) a publisher's notices of a key go to all nodes again: clients that find keys by pattern
 have dropped the key by then."""
 
-_IDLE, _LOOKS = 120.0, 10.0
-"""Seconds after which the number of an idle top-level key is forgotten, and between searches for such keys.
-
-The first is longer than the server keeps the note of a key's last update."""
-_KEPT = 1000  # top-level keys that are never forgotten, however idle
+_KEPT = 10_000  # top-level keys whose last numbers a publisher remembers
 
 
-class _Numbers:
-    """The publisher's id, and the number of its last update of each top-level key; idle keys are forgotten.
+class PublisherIdentity:
+    """A publisher as subscribers know it: its id, and the number of its last update of each top-level key.
 
-    A key that is published again after that gets another id and starts from 1: numbers of one id never go back.
-    `_last` also has when that update was, and until when the key is fresh.
+    Of more than 10,000 keys, those that were published longest ago are forgotten. A key that is published again after
+    that gets another id and starts from 1: numbers of one id never go back.
     """
 
-    def __init__(self) -> None:
-        # A forked child shares the id until it publishes; then `next` gives it one of its own.
+    def __init__(self, transport: Transport) -> None:
+        self.transport = transport
+        self._begin_numbers()
+
+    def _begin_numbers(self) -> None:
         self._pid = os.getpid()
-        self._looked = 0.0
-        self._looking = threading.Lock()  # tried, never waited for
         self.publisher = secrets.token_hex(6)
+        # By channel: id and number, when that update was, and until when the key is fresh.
         self._last: collections.OrderedDict[str, tuple[str, int, float, float]] = collections.OrderedDict()
 
-    def next(self, channel: str) -> tuple[str, int]:
+    def stamp(self, keys: Keys) -> tuple[str, int]:
+        """Return the publisher's id, and the number of its next update of a top-level key."""
         if self._pid != os.getpid():  # a forked child is another publisher
-            self.__init__()  # type: ignore[misc]
-        now = time.monotonic()
+            self._begin_numbers()
+        channel, now = keys.channel, time.monotonic()
         # No lock between threads: calls on one key come one after the other (`Transport.ordered`), and those on other
         # keys touch other entries.
         publisher, number, before, fresh = self._last.get(channel) or (self.publisher, 0, -math.inf, 0.0)
         if now - before > QUIET:
             fresh = now + _FRESH
         self._last[channel] = publisher, number + 1, now, fresh
-        with contextlib.suppress(KeyError):  # another thread has just forgotten it
+        with contextlib.suppress(KeyError):  # another thread has just forgotten a key
             self._last.move_to_end(channel)
-        if len(self._last) > _KEPT and now - self._looked > _LOOKS and self._looking.acquire(blocking=False):
-            try:
-                self._looked = now
-                self._forget(now - _IDLE)
-            finally:
-                self._looking.release()
+            if len(self._last) > _KEPT:
+                self.publisher = secrets.token_hex(6)  # first: a key that comes back must not get the id it had
+                self._last.popitem(last=False)
         return publisher, number + 1
 
-    def recent(self, seconds: float) -> list[str]:
-        """Return the channels of the keys that were published in the last seconds, the newest first."""
-        since = time.monotonic() - seconds
-        if self._pid != os.getpid():  # what is there was published by the parent
-            return []
-        for _ in range(3):
-            with contextlib.suppress(RuntimeError):  # another thread publishes meanwhile
-                return [channel for channel, last in reversed(self._last.items()) if last[2] >= since]
-        return []
-
-    def is_fresh(self, channel: str) -> bool:
-        last = self._last.get(channel)
-        return last is not None and time.monotonic() < last[3]
-
-    def take_back(self, channel: str, publisher: str, number: int) -> None:
-        """Make a number free again, if it was the last."""
-        last = self._last.get(channel)
-        if last is not None and last[:2] == (publisher, number):
-            self._last[channel] = publisher, number - 1, -math.inf, last[3]  # nothing was published: still quiet
-
-    def _forget(self, before: float) -> None:
-        # The order of the dict is that of the last use, so the idlest key is the first.
-        if self._is_first_before(before):
-            self.publisher = secrets.token_hex(6)  # first: a key that comes back must not get the id it had
-        while len(self._last) > _KEPT and self._is_first_before(before):
-            self._last.popitem(last=False)
-
-    def _is_first_before(self, moment: float) -> bool:
-        try:
-            return self._last[next(iter(self._last))][2] < moment
-        except (KeyError, RuntimeError):  # another thread has published it now
-            return False
-
-
-class PublisherIdentity:
-    """A publisher as subscribers know it: its id, and the number of its last update of each top-level key."""
-
-    def __init__(self, transport: Transport) -> None:
-        self.transport = transport
-        self._numbers = _Numbers()
-
-    def stamp(self, keys: Keys) -> tuple[str, int]:
-        """Return the publisher's id, and the number of its next update of a top-level key."""
-        return self._numbers.next(keys.channel)
-
     def take_back(self, keys: Keys, stamp: tuple[str, int]) -> None:
-        """Make the number of a stamp free again.
+        """Make the number of a stamp free again, if it was the last.
 
         The caller holds the turn of the key, see `Transport.ordered`. If a call out of a `__del__` has published in
         between, the number is never used.
         """
-        self._numbers.take_back(keys.channel, *stamp)
+        last = self._last.get(keys.channel)
+        if last is not None and last[:2] == stamp:
+            self._last[keys.channel] = stamp[0], stamp[1] - 1, -math.inf, last[3]  # nothing was published: still quiet
 
     def is_fresh(self, keys: Keys) -> bool:
         """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know.
@@ -138,11 +90,18 @@ class PublisherIdentity:
         Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet, or not
         any more.
         """
-        return self.transport.sharded and self._numbers.is_fresh(keys.channel)
+        last = self._last.get(keys.channel) if self.transport.sharded else None
+        return last is not None and time.monotonic() < last[3]
 
     def recent(self, seconds: float) -> list[str]:
         """Return the channels of the keys that it has published in the last seconds, the newest first."""
-        return self._numbers.recent(seconds)
+        since = time.monotonic() - seconds
+        if self._pid != os.getpid():  # what is there was published by the parent
+            return []
+        for _ in range(3):
+            with contextlib.suppress(RuntimeError):  # another thread publishes meanwhile
+                return [channel for channel, last in reversed(self._last.items()) if last[2] >= since]
+        return []
 
 
 class Activities:

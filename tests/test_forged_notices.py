@@ -264,7 +264,7 @@ class Crowd:
 
     @property
     def id(self):
-        return self.publisher.session._numbers.publisher
+        return self.publisher.session.publisher
 
     def forge(self, payload, name=b"foo"):
         """Publish as one who is not REEM: on a cluster to all nodes, and at the key's own."""

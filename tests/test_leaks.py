@@ -6,6 +6,7 @@ import logging
 import os
 import random
 import time
+from types import SimpleNamespace
 
 import pytest
 from conftest import PATIENCE, aeventually, eventually
@@ -14,11 +15,12 @@ import reem
 import reem_async
 from reem_async import session as sessions
 from reem_async.concurrency.locks import Locks
+from reem_async.plan.keys import keys_of
 from reem_async.plan.placeholders import Placeholder
 from reem_async.plan.reads import RawRead
 from reem_async.plan.shapes import ShapeCache
 from reem_async.pubsub.manager import manager_of
-from reem_async.session import _Numbers
+from reem_async.session import PublisherIdentity
 
 
 def listeners(interface):
@@ -162,26 +164,29 @@ def test_a_lock_in_use_is_never_replaced():
     assert len(locks.all()) <= 1020
 
 
-def test_numbers_of_a_publisher_never_go_back_when_idle_keys_are_forgotten(monkeypatch):
+def new_identity():
+    return PublisherIdentity(SimpleNamespace(sharded=False))
+
+
+def test_numbers_of_a_publisher_never_go_back_when_keys_are_forgotten(monkeypatch):
     """A key that comes back is published under another id, from 1 on."""
-    monkeypatch.setattr(sessions, "_IDLE", 0.0)
-    monkeypatch.setattr(sessions, "_LOOKS", 0.0)
-    numbers, last, ids = _Numbers(), {}, {}
+    monkeypatch.setattr(sessions, "_KEPT", 1000)
+    identity, last, ids = new_identity(), {}, set()
     for _ in range(20_000):
-        channel = str(int(random.paretovariate(0.3)) % 4000)
-        publisher, number = numbers.next(channel)
-        assert number == last.get((publisher, channel), 0) + 1
-        last[publisher, channel] = number
-        ids.setdefault(channel, []).append(publisher)
-    assert len(numbers._last) <= 1001
-    assert len({each for those in ids.values() for each in those}) > 2
+        keys = keys_of(str(int(random.paretovariate(0.3)) % 4000))
+        publisher, number = identity.stamp(keys)
+        assert number == last.get((publisher, keys.channel), 0) + 1
+        last[publisher, keys.channel] = number
+        ids.add(publisher)
+    assert len(identity._last) <= 1000
+    assert len(ids) > 2
 
 
 def test_keys_that_are_published_now_and_then_keep_their_numbers():
-    numbers = _Numbers()
+    identity = new_identity()
     for turn in range(1, 4):
-        for channel in range(5000):
-            assert numbers.next(str(channel)) == (numbers.publisher, turn)
+        for number in range(5000):
+            assert identity.stamp(keys_of(str(number))) == (identity.publisher, turn)
 
 
 def test_what_is_remembered_of_documents_is_bounded():
@@ -202,13 +207,12 @@ def test_what_is_remembered_of_documents_is_bounded():
 
 def test_a_number_is_taken_back_only_if_it_was_the_last():
     """A handler of signals may have published in between, on the thread that keeps all others away."""
-    numbers = _Numbers()
-    publisher, number = numbers.next("a")
-    numbers.take_back("a", publisher, number)
-    assert numbers.next("a") == (publisher, 1)
-    assert numbers.next("a") == (publisher, 2)
-    numbers.take_back("a", publisher, 1)
-    assert numbers.next("a") == (publisher, 3)
+    identity, keys = new_identity(), keys_of("a")
+    stamp = identity.stamp(keys)
+    identity.take_back(keys, stamp)
+    assert [identity.stamp(keys), identity.stamp(keys)] == [stamp, (stamp[0], 2)]
+    identity.take_back(keys, stamp)
+    assert identity.stamp(keys) == (stamp[0], 3)
 
 
 async def test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks(ainterface, key):

@@ -194,10 +194,10 @@ async def test_plans_change_nothing_while_they_are_built(known, kind):
     cache = full_cache() if known else ShapeCache()
     turn = PublishTurn(session, KEYS)
     for telling in (turn.reserve(b"1", IMAGE), turn.reserve(), turn.reserve(deleted=True)):
-        before = copy.deepcopy((cache.of("a"), session._numbers._last))
+        before = copy.deepcopy((cache.of("a"), session._last))
         plan = WRITES[kind](telling, cache)
         assert plan is None or plan.commands
-        assert (cache.of("a"), session._numbers._last) == before
+        assert (cache.of("a"), session._last) == before
 
 
 @pytest.mark.parametrize(
