@@ -19,6 +19,7 @@ START, STEP = 1_700_000_000_000_000_000, 250_000_000
 def file(tmp_path_factory):
     file = tmp_path_factory.mktemp("long") / "run.mcap"
     sink = Sink(file, "zstd", {}, overwrite=False)
+    sink.output.appear()
     for chunk in range(CHUNKS):
         now = START + chunk * STEP
         for key in [*range(KEYS), 0]:
@@ -26,7 +27,8 @@ def file(tmp_path_factory):
             sink.json((f"k{key}",), Role.UPDATE, Kind.PUBLISHED, to_json({"n": chunk}), (now, now, chunk + 1))
         if chunk == 100:
             sink.json(("rare",), Role.UPDATE, Kind.PUBLISHED, to_json({"n": chunk}), (now + 1, now, 1))
-        sink.tick(now=True)
+        sink._closed_at -= 1
+        sink.tick()
     sink.finish({})
     return file
 

@@ -22,7 +22,9 @@ class Writing:
     def __init__(self, file):
         self._file = file
         ships = reem_async.RedisInterface("redis://127.0.0.1:1").session.ships  # of one that never connects
-        self.thread = WriterThread(Sink(file, "none", {}, overwrite=False), ships, 1 << 20, [parse_pattern("*")])
+        sink = Sink(file, "none", {}, overwrite=False)
+        sink.output.appear()
+        self.thread = WriterThread(sink, ships, 1 << 20, [parse_pattern("*")])
         self._time = 0
 
     def put(self, role, value, *path, kind=Kind.PUBLISHED, room=True):

@@ -342,6 +342,7 @@ def test_a_file_that_somebody_makes_while_it_is_exported_stays(log, tmp_path, mo
 @pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
 def test_what_cannot_be_read_is_counted_once_though_it_is_read_several_times(kind, file, tmp_path):
     sink = Sink(file, "none", {}, overwrite=False)
+    sink.output.appear()
     for number in range(1, 4):
         sink.json(("a", "n"), Role.UPDATE, Kind.PUBLISHED, to_json(number), (number, number, number))
         blob = encode("no ship of this name", b"x", "", 0)

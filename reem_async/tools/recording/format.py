@@ -45,10 +45,6 @@ class Role(StrEnum):
     """What was read at a path in turn; in the file an update or a deletion."""
     FOUND = "found"
     """What a read found at the place of a skipped update; in the file an update or a deletion."""
-    STATISTICS = "statistics"
-    """Figures on the recording itself, which have a channel without a role."""
-    FLUSH = "flush"
-    """Nothing is written, but what was handed over before."""
 
 
 NEWS = (Role.UPDATE, Role.DELETE, Role.STATE)

@@ -40,8 +40,6 @@ _LET_PASS = 0.004
 that: reading it in the same moment would make them wait twice as long. A recorder has time."""
 _FAST = 20_000_000
 """Nanoseconds between large updates that come so fast that the next one might not find this one fetched."""
-_MOST_SILENT_READS = 500
-"""Keys that are read again at one keyframe, if the server does not tell which were changed."""
 
 
 class Collector(Protocol):
@@ -76,7 +74,6 @@ class KeyRecorder:
         self._last_large = 0  # the log time of the last update that was fetched
         self._whole = any(not pattern.rest and pattern.concerns((name,)) for pattern in collector.patterns)
         self.busy: asyncio.Task[None] | None = None  # the task that fetches
-        self.news = False  # the whole was published since the last keyframe
         self.absent = False  # the key is not on the server, as far as is known here
         self.looks = RefreshTimer(self, KeyRecorder._look, BACKGROUND)
 
@@ -88,7 +85,6 @@ class KeyRecorder:
     def on_event(self, event: Event) -> None:
         arrived = self._collector.arrivals.of(event.publisher, event.time, event.received)
         stamp = self._collector.clock.stamp(arrived), published(event.time), event.sequence
-        self.news = self.news or len(event.path) == 1
         self.looks.heard += 1
         if event.missed:  # a broken connection is noticed by the recorder, for all keys
             self.lost(event.missed)
@@ -137,7 +133,6 @@ class KeyRecorder:
     def keyframe(self, number: int) -> None:
         """Write the whole key as the recording has it."""
         self._add(self._item(Role.KEYFRAME, None, number))
-        self.news = False
 
     def sampled(self, path: Path, value: Any, size: int) -> None:
         """Take what was read at a path: MISSING if there was nothing."""
@@ -273,9 +268,9 @@ class RecordedKeys:
                 self.of(name).follow()
 
     def be_due(self) -> None:
-        """Let the next look read every key, whatever was published or read of it of late."""
+        """Let the next look read every key, whatever was read of it of late."""
         for recorder in self._recorders.values():
-            recorder.news, recorder.looks.earliest = False, 0.0
+            recorder.looks.earliest = 0.0
 
     def look_at_once(self) -> None:
         for recorder in self._recorders.values():
@@ -301,15 +296,10 @@ class RecordedKeys:
                 recorder.busy.cancel()
 
     def read_silent(self, present: set[str]) -> None:
-        """Read keys that were not published as a whole since the last keyframe: they may have been stored."""
-        now, reads = asyncio.get_running_loop().time(), 0
-        for name in sorted(present | self._recorders.keys(), key=lambda name: self.of(name).looks.earliest):
-            recorder = self.of(name)
-            if recorder.news or not self.concerns(name) or (name not in present and recorder.absent):
-                continue
-            if recorder.looks.earliest <= now and reads < _MOST_SILENT_READS:
-                reads += 1
-                recorder.read()
+        """Read the keys that are there, and those that were: no server reports what was stored."""
+        for name in present | {name for name, recorder in self._recorders.items() if not recorder.absent}:
+            if self.concerns(name):
+                self.of(name).read()
 
     def keyframe(self, number: int) -> None:
         self._let_go()

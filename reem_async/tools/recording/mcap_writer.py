@@ -110,7 +110,7 @@ class McapWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         # It grows with chunks times channels, 40 KB a second for a thousand keys: never in memory as a whole.
-        self._index: IO[bytes] = tempfile.SpooledTemporaryFile(_INDEX_BYTES, dir=output.spare)  # noqa: SIM115 - closed by close()
+        self._index: IO[bytes] = tempfile.SpooledTemporaryFile(_INDEX_BYTES, dir=str(output.directory))  # noqa: SIM115 - closed by close()
         self._chunks = 0
         self._first, self._last = _NEVER, 0
         self._metadata: list[MetadataIndex] = []

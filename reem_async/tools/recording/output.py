@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
-import stat
 from pathlib import Path as FilePath
 from typing import Any
 
 from ...errors import BadValue
-from ..partfile import Lock, PartFile, is_locked, lock, there_already
+from ..partfile import PartFile, is_locked, there_already
 from .contents import slices
 
 
@@ -23,71 +22,46 @@ class Output:
 
     What is written has been handed to the operating system: it survives the end of the program, however
     it ends, but not a power cut in the next half minute. As long as it is open it is locked, so that no other
-    recorder takes it. A file that it is to replace stays until `appear`.
+    recorder takes it. It is hidden until `appear`, so a file that it replaces stays until then.
 
     Raises BadValue if the file is there already, is being recorded, or cannot be made.
     """
 
     def __init__(self, path: FilePath, *, overwrite: bool) -> None:
-        if path.is_dir():
-            raise BadValue(f"{path} is a directory; name a file in it")
         self._path = path
-        self._part: PartFile | None = None
+        self._overwrite = overwrite
+        self._refuse_taken()
         try:
-            if overwrite and path.is_file():
-                self._refuse_recorded()
-                # Beside the old file, which is complete and stays until the new one has something in it.
-                self._part = PartFile(path, replace=True)
-                self._file = self._part.descriptor
-            else:
-                # O_EXCL gives the name to one of two recorders that begin at once; the lock is for those that
-                # come later.
-                flags = os.O_WRONLY | os.O_CREAT | (0 if overwrite else os.O_EXCL)
-                self._file = os.open(path, flags | os.O_CLOEXEC, 0o666)
-                regular = stat.S_ISREG(os.fstat(self._file).st_mode)
-                if regular and lock(self._file) is Lock.TAKEN:  # both have just begun
-                    os.close(self._file)
-                    raise self._taken()
-        except FileExistsError:
-            raise BadValue(str(there_already(path))) from None
+            self._part = PartFile(path, replace=overwrite)
         except OSError as error:
             raise BadValue(f"{path} cannot be written: {error.strerror}") from None
-        status = os.fstat(self._file)
-        self._is_regular, self._identity = stat.S_ISREG(status.st_mode), (status.st_dev, status.st_ino)
-        self._directory = path.absolute().parent
         self._pieces: list[Any] = []
         # Bytes in the file, and bytes that wait for `flush`.
         self._written = 0
         self._waiting = 0
 
-    def _refuse_recorded(self) -> None:
+    def _refuse_taken(self) -> None:
+        if self._path.exists() and not self._overwrite:
+            raise BadValue(str(there_already(self._path)))
         if is_locked(self._path):
-            raise self._taken()
-
-    def _taken(self) -> BadValue:
-        return BadValue(f"{self._path} is being recorded by another recorder; end that one, or choose another name")
-
-    @property
-    def replaces(self) -> bool:
-        """Whether there is a file whose place it is to take."""
-        return self._part is not None
+            raise BadValue(f"{self._path} is being recorded by another recorder; end that one, or choose another name")
 
     def appear(self) -> None:
-        """Take the place of the file that is to be replaced. Programs that read that one go on with it.
+        """Give the file its name. Programs that read the file that it replaces go on with that.
 
-        Raises BadValue if it is being recorded by now, or the directory cannot be written.
+        Raises BadValue if another program has taken the name by now, or the directory cannot be written.
         """
-        if self._part is not None:
-            self._refuse_recorded()
-            try:
-                self._part.appear()
-            except OSError as error:
-                raise BadValue(f"{self._path} cannot be replaced: {error.strerror}") from None
+        self._refuse_taken()
+        try:
+            self._part.appear()
+        except FileExistsError as error:
+            raise BadValue(str(error)) from None
+        except OSError as error:
+            raise BadValue(f"{self._path} cannot be replaced: {error.strerror}") from None
 
     @property
-    def spare(self) -> str | None:
-        """Where a file for a while can be put: beside this one, None for the system's place for such files."""
-        return str(self._directory) if os.access(self._directory, os.W_OK) else None
+    def directory(self) -> FilePath:
+        return self._part.path.parent
 
     def write(self, data: Any) -> None:
         """Take a piece; it is written by `flush`."""
@@ -100,6 +74,7 @@ class Output:
     def flush(self) -> None:
         """Write all pieces; if that fails, the file ends where it did before, and OSError is raised."""
         self._check()
+        file = self._part.descriptor
         pieces, self._pieces, self._waiting = self._pieces, [], 0
         done = 0
         try:
@@ -107,18 +82,16 @@ class Output:
                 left = memoryview(part)
                 # A disk that is full takes a part.
                 while left:
-                    count = os.write(self._file, left)
+                    count = os.write(file, left)
                     done, left = done + count, left[count:]
         except OSError:
-            with contextlib.suppress(OSError):  # a device has no length
-                os.ftruncate(self._file, self._written)
+            with contextlib.suppress(OSError):
+                os.ftruncate(file, self._written)
             raise
         self._written += done
 
     def _check(self) -> None:
-        if not self._is_regular:
-            return
-        status = os.fstat(self._file)
+        status = os.fstat(self._part.descriptor)
         # The system does not report that an open file was deleted, so each flush checks.
         if not status.st_nlink:
             raise FileGone(errno.ENOENT, "it was deleted or replaced by another program while it was recorded")
@@ -130,16 +103,4 @@ class Output:
 
     def close(self) -> None:
         """Close the file; if it has not appeared yet, it is removed. Idempotent."""
-        if self._part is not None:
-            self._part.close()
-        elif self._file >= 0:
-            os.close(self._file)
-        self._file = -1
-
-    def discard(self) -> None:
-        """Close the file and remove it; one that it was to replace stays."""
-        self.close()
-        with contextlib.suppress(OSError):
-            status = self._path.stat()
-            if (status.st_dev, status.st_ino) == self._identity and self._is_regular:
-                self._path.unlink()
+        self._part.close()

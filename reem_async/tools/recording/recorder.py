@@ -28,13 +28,13 @@ from ...pubsub.finder import find_regularly
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
 from ...session import Session
-from .format import RecordingFailed, Role
+from .format import RecordingFailed
 from .key_recorder import RecordedKeys
 from .output import FileGone
 from .sample import Sample, Sampler, samples_of
 from .sink import Sink
 from .times import PATIENCE, Arrivals, Clock
-from .writer_thread import Operation, WriterThread
+from .writer_thread import WriterThread
 
 # Seconds between looks at keyframes that are due, the disk, and keys that must be read again.
 _TICK = 0.1
@@ -181,15 +181,10 @@ class Recorder:
                 self._begin(lambda: find_regularly(self._search))
             self._sampler.start()
             self._begin(self._tick)
-            if self._sink.output.replaces:  # as soon as this recording is worth more than nothing
-                await asyncio.to_thread(self.writer_thread.flush)
-                failure = self.writer_thread.failure
-                if failure is not None:
-                    raise RecordingFailed(f"{self.path} cannot be replaced: {failure}; it is as it was") from failure
-                self._sink.output.appear()
+            self._check()
+            self._sink.output.appear()
         except BaseException:
             await self._end()
-            self._sink.output.discard()
             raise
 
     def _begin(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
@@ -391,12 +386,6 @@ class Recorder:
     def _keyframe_of_all(self) -> None:
         self._keyframes += 1
         self._keys.keyframe(self._keyframes)
-        status = self.status
-        figures = {name: getattr(status, name) for name in ("messages", "bytes", "dropped", "skipped", "gaps", "lost")}
-        stamp = self.clock.stamp(), self.clock.stamp(), self._keyframes
-        self.writer_thread.put(
-            Operation(Role.STATISTICS, ("",), figures | {"waiting": self.writer_thread.waiting}, stamp), 0
-        )
 
 
 def description(

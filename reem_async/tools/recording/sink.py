@@ -38,7 +38,6 @@ _MOST_SCHEMAS = 8
 
 KEYFRAMES = "/_reem/keyframe"
 OPERATIONS = "/_reem/ops"
-STATISTICS = "/_reem/stats"
 CHANNELS = "reem.channels"
 """The name of the metadata records that list channels."""
 _SHARED_TOPICS = {
@@ -66,11 +65,7 @@ class Sink:
             self._writer.add_metadata("reem", dict(metadata))
             self.output.flush()
         except OSError as error:
-            self.output.discard()
             raise RecordingFailed(f"{path} cannot be written: {error.strerror}") from error
-        except BaseException:
-            self.output.discard()
-            raise
         self._schemas: dict[Any, int] = {}
         self._channels: dict[Any, int] = {}
         self._known: dict[Any, list[tuple[Signature, int]]] = {}
@@ -115,13 +110,6 @@ class Sink:
             channel = self._channels[key] = self._channel(path, role, kind, "protobuf", schema, **extra)
         return self._message(channel, encoded.pieces, stamp)
 
-    def statistics(self, figures: dict[str, float], stamp: tuple[int, int, int]) -> None:
-        document = JsonMessage(dict(figures), wrapped=False)
-        if "statistics" not in self._channels:
-            schema = self._schema("reem.stats", "jsonschema", signature(document.tree))
-            self._channels["statistics"] = self._register(STATISTICS, "json", schema, {})
-        self._message(self._channels["statistics"], [document.text], stamp)
-
     def _schema(self, name: str, encoding: str, known: Signature) -> tuple[int, str]:
         key = name, encoding, known
         if key not in self._schemas:
@@ -137,10 +125,8 @@ class Sink:
     def _channel(self, path: Path, role: Role, kind: Kind, encoding: str, schema: tuple[int, str], **extra: str) -> int:
         self._count += 1
         metadata = {"reem.path": orjson.dumps(path).decode(), "reem.role": role.value, "reem.kind": kind.value, **extra}
-        return self._register(_SHARED_TOPICS.get(role) or topic_of(path), encoding, schema, metadata)
-
-    def _register(self, topic: str, encoding: str, schema: tuple[int, str], metadata: dict[str, str]) -> int:
         metadata["reem.version"] = FORMAT
+        topic = _SHARED_TOPICS.get(role) or topic_of(path)
         number = self._writer.register_channel(topic, encoding, schema[0], metadata)
         self._new.append([number, topic, encoding, schema[1], metadata])
         return number
@@ -150,10 +136,9 @@ class Sink:
         self._open += 1
         return self._writer.add_message(channel, log_time, pieces, max(publish_time, 0), number)
 
-    def tick(self, *, now: bool = False) -> None:
+    def tick(self) -> None:
         """Close the chunk if it is time, so that it can be read whatever happens."""
-        late = time.monotonic() - self._closed_at >= FLUSH_SECONDS
-        if now or late:
+        if time.monotonic() - self._closed_at >= FLUSH_SECONDS:
             self._closed_at = time.monotonic()
             if self._open:
                 self._open = 0

@@ -100,7 +100,6 @@ class WriterThread:
         self._dropped: set[str] = set()
         self._lacking: set[str] = set()
         self._ending = False
-        self._flushed = threading.Event()
         # What each key held after the last operation: keyframes are made of it, and reads are compared with it. Keys
         # that are gone are not in it.
         self._trees: dict[str, Any] = {}
@@ -142,11 +141,6 @@ class WriterThread:
                 self._changed.notify()
         return True
 
-    def flush(self) -> None:
-        """Have what was handed over before now in the file, whatever happens from now on. Blocks; once only."""
-        self.put(Operation(Role.FLUSH, ("",), None, (0, 0, 0)), 0)
-        self._flushed.wait()
-
     def stop(self, metadata: Mapping[str, str]) -> None:
         """Write what waits and the index, and end the thread. Blocks; idempotent."""
         with self._changed:
@@ -175,7 +169,6 @@ class WriterThread:
                 self._size = 0
         finally:
             self._sink.close()
-            self._flushed.set()
 
     def _summary(self) -> dict[str, str]:
         counts = self.counts
@@ -220,11 +213,6 @@ class WriterThread:
                 case Role.GAP:
                     self.counts.gaps += 1
                     self._event(it, missed=it.value)
-                case Role.STATISTICS:
-                    self._sink.statistics(it.value, it.stamp)
-                case Role.FLUSH:
-                    self._sink.tick(now=True)
-                    self._flushed.set()
         except FullError:  # reading it again would not help
             self._lose_for_good(it.path)
         except NotWritten:
