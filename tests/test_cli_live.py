@@ -409,7 +409,7 @@ def test_top_shows_keys_and_points_out_two_publishers(cli, robot):
 
 
 def test_doctor_points_out_two_publishers(cli, robot):
-    run = cli("doctor", "--no-write", "--json")
+    run = cli("doctor", "--json")
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "publishers"]
     assert row["status"] == "warn"
     assert "arm is published by 2" in row["message"]

@@ -100,7 +100,7 @@ def own():
 
 
 def doctor(url, *words):
-    run = CommandLine(url, "")("doctor", "--no-write", "--json", *words)
+    run = CommandLine(url, "")("doctor", "--json", *words)
     return next(row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "arrays")
 
 

@@ -1,15 +1,12 @@
 """What users see of the local path: `reem doctor`, `reem top`, the page. Looking on costs publishers nothing."""
 
 import asyncio
-import contextlib
 import json
 import os
 import sys
-import urllib.parse
 
 import numpy as np
 import pytest
-import redis
 from clikit import CommandLine
 from conftest import PATIENCE
 
@@ -17,9 +14,8 @@ import reem
 import reem_async
 from reem_async.local.host import reason_against
 from reem_async.pubsub.monitor import Event, Monitor
-from reem_async.server import EmbeddedServer
 from reem_async.tools.cli import doctor
-from reem_async.tools.cli.checks import OK, UNKNOWN, WARN
+from reem_async.tools.cli.checks import OK, WARN
 from reem_async.tools.cli.following import follow
 from reem_async.tools.cli.top import ALL, Window
 
@@ -37,7 +33,7 @@ def beside(server_url, key):
 
 
 def local_finding(url, *words, namespace=""):
-    run = CommandLine(url, namespace)("doctor", "--no-write", "--json", *words)
+    run = CommandLine(url, namespace)("doctor", "--json", *words)
     assert run.returncode == 0, run.stdout + run.stderr
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "local"]
     return row
@@ -68,25 +64,6 @@ def test_doctor_says_why_there_is_none(monkeypatch):
     assert "not permitted; large values go through the server" in found.message
     monkeypatch.setattr(sys, "platform", "darwin")
     assert doctor.shared_memory("only Linux has what it takes").status == OK
-
-
-@pytest.mark.long
-@only_where_there_is
-@pytest.mark.parametrize(
-    ("channels", "status"),
-    [(["&{robot:*}:notices", "&{robot:*}:notices@*"], OK), (["&{robot:*}:notices"], WARN), ([], UNKNOWN)],
-)
-def test_doctor_notices_that_a_user_may_not_use_the_channels(channels, status):
-    with (
-        EmbeddedServer() as server,
-        contextlib.closing(redis.Redis.from_url(server.url)) as admin,
-    ):
-        rules = ["reset", "on", ">secret", "~*", "resetchannels", *channels, "+@all"]
-        admin.execute_command("ACL", "SETUSER", "guest", *rules)
-        port = urllib.parse.urlsplit(server.url).port
-        row = local_finding(f"redis://guest:secret@127.0.0.1:{port}", namespace="robot:")
-    assert row["status"] == status, row
-    assert ("deploy/users.acl" in row["remedy"]) == (status == WARN)
 
 
 def test_top_says_of_late_and_not_for_ever():

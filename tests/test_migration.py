@@ -479,7 +479,7 @@ def test_the_doctor_counts_old_keys(own, raw):
     cli = CommandLine(own.url, "")
 
     def finding():
-        run = cli("doctor", "--json", "--no-write")
+        run = cli("doctor", "--json")
         return run.returncode, next(
             row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "old data"
         )

@@ -22,9 +22,7 @@ class CheckStatus(StrEnum):
 OK, WARN, FAIL, UNKNOWN = CheckStatus
 
 # Seconds, of the median. A wired network takes well under a millisecond, a good wireless one 2 to 4.
-_SLOW_READ = 0.005
-# Seconds, for 1 MB: a network of 100 Mbit/s takes 80 ms.
-_SLOW_ARRAY = 0.1
+_SLOW = 0.005
 # Seconds: less does not show in time stamps of a camera at 30 Hz.
 _CLOCK_APART = 0.01
 # Part of the memory.
@@ -115,14 +113,16 @@ def is_loopback(host: str) -> bool:
     return all(ipaddress.ip_address(str(address).partition("%")[0]).is_loopback for address in found)
 
 
-def latency(check: str, what: str, seconds: Sequence[float], *, large: bool) -> Finding:
+def latency(seconds: Sequence[float]) -> Finding:
     ranked = sorted(seconds)
     # With fewer than a hundred readings the 99th percentile is the slowest one.
     middle, late = median(ranked), ranked[min(len(ranked) * 99 // 100, len(ranked) - 1)]
-    text = f"{what}: median {middle * 1000:.2f} ms, p99 {late * 1000:.2f} ms, of {len(ranked)}"
-    if middle > (_SLOW_ARRAY if large else _SLOW_READ):
-        return Finding(check, WARN, text, "use a cable, or run the server on the machine that moves the large values")
-    return Finding(check, OK, text)
+    text = f"a round trip: median {middle * 1000:.2f} ms, p99 {late * 1000:.2f} ms, of {len(ranked)}"
+    if middle > _SLOW:
+        return Finding(
+            "latency", WARN, text, "use a cable, or run the server on the machine that moves the large values"
+        )
+    return Finding("latency", OK, text)
 
 
 def clock(ahead: float, within: float) -> Finding:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-import secrets
 import sys
 import textwrap
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterator, Mapping
 from importlib import metadata
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
@@ -22,7 +21,6 @@ from reem_async.legacy.finding import find
 from reem_async.local.host import reason_against
 from reem_async.local.segment import Segment
 from reem_async.plan.attachments import orphans, remove_orphans
-from reem_async.plan.keys import Keys
 from reem_async.plan.paths import check_top_key, parse_suffix
 from reem_async.plan.sizes import STAGED
 from reem_async.session import Session
@@ -34,23 +32,13 @@ from reem_async.tools.cli.output import clean, emit, emit_json, is_terminal, sty
 from reem_async.tools.cli.running import FAILED, for_users, interface_to, run_local
 from reem_async.tools.cli.top import ALL, Board
 from reem_async.transport import Transport, scanned
-from reem_async.transport.aio import AsyncTransport
 
-# Enough for a 99th percentile that is not the slowest one alone.
-_ROUND_TRIPS = 200
-_MOST_SECONDS = 2.0  # for one kind of round trip: over a slow network there are fewer
+_ROUND_TRIPS = 200  # enough for a 99th percentile that is not the slowest one alone
+_MOST_SECONDS = 2.0  # over a slow network there are fewer
 # Readings, of which that with the shortest round trip counts.
 _CLOCK_READINGS = 20
-_NAMES = 10_000  # that are tried to find one in the slots of a node, of a thousand at most
-# Large enough for the time that its bytes take to stand out from that of a round trip.
-_ARRAY_BYTES = 1_000_000
 _LISTENS = 1.0  # seconds: two that publish a key at 2 Hz or more show
-_EXTRAS = {
-    "server": "a server of its own for `reem up`",
-    "fast": "a faster event loop",
-    "tools": "recording, replay and the browser",
-    "demo": "the picture of `make demo`",
-}
+_LIBRARIES = ("reem-async", "redis", "hiredis", "numpy", "orjson", "anyio")
 _STYLES = {OK: ("✓", "green"), WARN: ("!", "yellow"), FAIL: ("✗", "red"), UNKNOWN: ("?", "cyan")}
 
 _FIRST_NAMESPACE = 0xEFFFFFFC
@@ -72,9 +60,6 @@ _REGISTRY = ":ships"
 
 
 def doctor(
-    no_write: Annotated[
-        bool, typer.Option("--no-write", help="Store nothing: leaves out how long an array of 1 MB takes.")
-    ] = False,
     clean: Annotated[
         bool, typer.Option("--clean", help="Remove arrays that no document refers to, of expired keys for example.")
     ] = False,
@@ -84,9 +69,8 @@ def doctor(
 ) -> None:
     """Check server, connection and installation, and say what to do.
 
-    Each line is ok, warn, fail, or unknown where this user may not look. An array of 1 MB is stored
-    for a moment, under a name of its own, to see how long it takes. Of a cluster, all primaries are
-    examined, one after the other, and each line names its node, the worst first.
+    Each line is ok, warn, fail, or unknown where this user may not look. Of a cluster, all primaries are
+    examined, one after the other, and each line names its node.
 
     `--clean` removes the arrays that documents which have expired, or were deleted or renamed by a program without
     REEM, have left behind. What a document refers to is never removed.
@@ -102,7 +86,7 @@ def doctor(
 
     async def examine() -> int:
         code = 0
-        async for node, finding in _findings(url, namespace, write=not no_write, clean=clean):
+        async for node, finding in _findings(url, namespace, clean=clean):
             _show(node, finding, as_json)
             code = FAILED if finding.status == FAIL else code
         return code
@@ -130,7 +114,7 @@ def _show(node: str, finding: Finding, as_json: bool) -> None:
     sys.stdout.flush()
 
 
-async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> AsyncIterator[tuple[str, Finding]]:
+async def _findings(url: str, namespace: str, *, clean: bool) -> AsyncIterator[tuple[str, Finding]]:
     """Yield what is found at the servers, with the node of a cluster that it is about, and of the installation."""
     interface = interface_to(url, namespace)
     transport = interface.session.transport
@@ -138,17 +122,17 @@ async def _findings(url: str, namespace: str, *, write: bool, clean: bool) -> As
         # A cluster's transport connects node by node, below, so that one dead node does not hide the others.
         if not transport.sharded:
             await interface.initialize()
-        nodes = await transport.nodes()
-        if transport.sharded:
-            for found in _worst_first([await _of_node(interface, node, write=write) for node in nodes]):
-                yield found
-        else:
-            async for finding in _of_server(interface, nodes[0], write=write):
-                yield "", finding
+        for node in await transport.nodes():
+            name = node.options.address if transport.sharded else ""
+            try:
+                async for finding in _of_server(interface, node):
+                    yield name, finding
+            except RedisError as error:
+                yield name, Finding("server", FAIL, for_users(error))
         yield "", await _old_data(interface)
         yield "", await _orphans(interface, clean=clean)
         yield "", await _publishers(interface)
-        yield "", await _sharing(interface)
+        yield "", await _sharing()
     except RedisError as error:
         yield "", Finding("server", FAIL, for_users(error))
     finally:
@@ -173,31 +157,8 @@ async def _publishers(interface: RedisInterface) -> Finding:
     return Finding("publishers", OK, what)
 
 
-async def _of_node(interface: RedisInterface, node: Transport, *, write: bool) -> list[tuple[str, Finding]]:
-    """Return what is found at one node of a cluster; that it does not answer is a finding as well."""
-    address, found = node.options.address, list[tuple[str, Finding]]()
-    try:
-        async for finding in _of_server(interface, node, write=write):
-            found.append((address, finding))
-    except RedisError as error:
-        found.append((address, Finding("server", FAIL, for_users(error))))
-    return found
-
-
-def _worst_first(reports: Sequence[Sequence[tuple[str, Finding]]]) -> list[tuple[str, Finding]]:
-    """Return the findings of all nodes check by check, and of each check the worst first."""
-    rows = [row for report in reports for row in report]
-    checks_in_order = list(dict.fromkeys(finding.check for _, finding in max(reports, key=len, default=())))
-    order = {check: place for place, check in enumerate(checks_in_order)}
-    # What could not be looked at stands behind what is known to be wrong.
-    ranks = {FAIL: 0, WARN: 1, UNKNOWN: 2, OK: 3}
-    return sorted(rows, key=lambda row: (order.get(row[1].check, -1), ranks[row[1].status]))
-
-
-async def _of_server(interface: RedisInterface, server: Transport, *, write: bool) -> AsyncIterator[Finding]:
+async def _of_server(interface: RedisInterface, server: Transport) -> AsyncIterator[Finding]:
     session, options = interface.session, server.options
-    # Each node of a cluster is timed with a key of its own slots; else it would only say MOVED.
-    keys = await _keys_at(session, server)
     # One round trip for all that is asked of the server itself; what the user may not ask is an error in its place.
     info, config, user, kind = await server.roundtrip(
         [
@@ -221,9 +182,7 @@ async def _of_server(interface: RedisInterface, server: Transport, *, write: boo
         password=bool(options.settings.get("password")),
     ):
         yield finding
-    seconds = await _timed(server, ("JSON.GET", keys.document, "$"))
-    yield checks.latency("small read", "a value", seconds, large=False)
-    yield await _array_reads(server, keys) if write else Finding("1 MB array", UNKNOWN, "left out by --no-write")
+    yield await _latency(server)
     yield await _clock(server)
     for check in (checks.memory, checks.eviction, checks.subscribers, checks.persistence):
         yield check(facts)
@@ -261,15 +220,6 @@ async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
     return checks.orphans(counts, unknown, removed=clean)
 
 
-async def _keys_at(session: Session, server: Transport) -> Keys:
-    """Return the names of an unused key whose slot this server has."""
-    for _ in range(_NAMES):
-        keys = session.keys(f"reem-doctor-{secrets.token_hex(4)}")
-        if await session.transport.owner(keys.document.encode()) is server:
-            break
-    return keys
-
-
 def _info(reply: Any) -> Mapping[str, str] | None:
     """Return the fields of INFO; those that come several times (modules) joined by line ends."""
     if not isinstance(reply, bytes | bytearray | str):
@@ -289,122 +239,52 @@ def _config(reply: Any) -> Mapping[str, str] | None:
     return {key.decode(): value.decode(errors="replace") for key, value in reply.items()}
 
 
-async def _array_reads(server: Transport, keys: Keys) -> Finding:
-    """Time reading 1 MB, which expires by itself should this program be killed."""
-    key = keys.tag + ".array"
-    (stored,) = await server.roundtrip([("SET", key, bytes(_ARRAY_BYTES), "EX", "60")])
-    if isinstance(stored, Exception):
-        return Finding("1 MB array", UNKNOWN, f"it cannot be stored: {stored}", "run it as a user that can write")
-    try:
-        seconds = await _timed(server, ("GET", key), bulk=True)
-    finally:
-        await server.roundtrip([("UNLINK", key)])
-    return checks.latency("1 MB array", "an array of 1 MB", seconds, large=True)
-
-
-async def _timed(server: Transport, command: tuple[Any, ...], *, bulk: bool = False) -> list[float]:
-    """Return how long each round trip took; raises what the server answers in error."""
+async def _latency(server: Transport) -> Finding:
     seconds: list[float] = []
     end = time.perf_counter() + _MOST_SECONDS
     while len(seconds) < _ROUND_TRIPS and (not seconds or time.perf_counter() < end):
         start = time.perf_counter()
-        (reply,) = await server.roundtrip([command], bulk=bulk)
+        (reply,) = await server.roundtrip([("PING",)])
         seconds.append(time.perf_counter() - start)
         if isinstance(reply, Exception):
-            raise reply
-    return seconds
+            return checks.not_allowed("latency", "PING")
+    return checks.latency(seconds)
 
 
 async def _clock(server: Transport) -> Finding:
     """Compare clocks: the server read its own in the middle of the shortest round trip, more or less."""
-    best: tuple[float, float] | None = None
+    readings: list[tuple[float, float]] = []
     for _ in range(_CLOCK_READINGS):
         start = time.time()
         (reply,) = await server.roundtrip([("TIME",)])
         end = time.time()
         if isinstance(reply, Exception):
             return checks.not_allowed("clock", "TIME")
-        there = int(reply[0]) + int(reply[1]) / 1e6
-        within = (end - start) / 2
-        if best is None or within < best[0]:
-            # The shorter the round trip, the less the reading can be off: half of it at most.
-            best = within, there - (start + end) / 2
-    assert best is not None
-    return checks.clock(best[1], best[0])
+        # The shorter the round trip, the less the reading can be off: half of it at most.
+        readings.append(((end - start) / 2, int(reply[0]) + int(reply[1]) / 1e6 - (start + end) / 2))
+    within, ahead = min(readings)
+    return checks.clock(ahead, within)
 
 
 def _of_installation() -> Iterator[Finding]:
-    names = ("reem-async", "redis", "hiredis", "numpy", "orjson", "anyio")
-    versions = {name: _version(name) for name in names}
-    text = ", ".join([f"{name} {number}" for name, number in versions.items() if number])
     python = ".".join(map(str, sys.version_info[:3]))
-    missing = [name for name, number in versions.items() if not number]
-    if missing:
-        yield Finding(
-            "libraries", WARN, f"no version is known of {', '.join(missing)}; {text}", "pip install reem-async"
-        )
-    else:
-        yield Finding("libraries", OK, f"Python {python}, {text}")
+    versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
+    yield Finding("libraries", OK, f"Python {python}, {', '.join(versions)}")
     if clash := original_reem():
         yield Finding("installation", FAIL, clash, CURE)
-    for extra, what in _EXTRAS.items():
-        needed = _needed(extra)
-        absent = [name for name in needed if not _version(name)]
-        if needed and not absent:
-            yield Finding(f"[{extra}]", OK, ", ".join([f"{name} {_version(name)}" for name in needed]))
-        elif needed:
-            yield Finding(
-                f"[{extra}]",
-                OK,
-                f"not installed: {', '.join(absent)}",
-                f"for {what}: pip install 'reem-async[{extra}]'",
-            )
 
 
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return ""
-
-
-def _needed(extra: str) -> list[str]:
-    """Return the packages that one of REEM's extras brings."""
-    try:
-        lines = metadata.requires("reem-async") or []
-    except metadata.PackageNotFoundError:
-        return []
-    # A requirement of an extra reads: pillow>=10; extra == 'tools'.
-    marked = re.compile(rf"""extra\s*==\s*["']{extra}["']""")
-    names = [re.split(r"[^A-Za-z0-9._-]", line, maxsplit=1)[0] for line in lines if marked.search(line)]
-    return sorted(name for name in names if name != "reem-async")
-
-
-async def _sharing(interface: RedisInterface) -> Finding:
+async def _sharing() -> Finding:
     """Find out how large values get from one program of this machine to another; starts one, for a moment."""
-    reason = reason_against() or await unseen_by_another()
-    if reason:
-        return shared_memory(reason)
-    try:
-        usual, near = await _subscribed(interface)
-    except RedisError as error:
-        return Finding("local", UNKNOWN, f"the server cannot be asked: {for_users(error)}")
-    if isinstance(usual, Exception):
-        return Finding("local", UNKNOWN, "this user may not follow updates, through memory or otherwise")
-    refusal = for_users(near) if isinstance(near, Exception) else ""
-    return shared_memory("", refusal, contained=is_contained())
+    return shared_memory(reason_against() or await unseen_by_another(), contained=is_contained())
 
 
-def shared_memory(reason: str, refusal: str = "", *, contained: bool = False) -> Finding:
-    otherwise = "large values go through the server"
+def shared_memory(reason: str, *, contained: bool = False) -> Finding:
     if reason:
         # Elsewhere than on Linux there is nothing that anybody could mend.
         status = WARN if sys.platform == "linux" else OK
         remedy = "allow memfd_create, and /proc of the user's own processes" if status == WARN else ""
-        return Finding("local", status, f"no shared memory: {reason}; {otherwise}", remedy)
-    if refusal:
-        remedy = "allow the channels &{...}:notices@* beside &{...}:notices, as deploy/users.acl does"
-        return Finding("local", WARN, f"no shared memory: {refusal}; {otherwise}", remedy)
+        return Finding("local", status, f"no shared memory: {reason}; large values go through the server", remedy)
     where = "in this container (start them with one PID namespace to join them)" if contained else "on this machine"
     text = f"large values go through shared memory between programs of user {os.geteuid()} {where}"
     return Finding("local", OK, f"{text}, to all others through the server")
@@ -436,20 +316,6 @@ async def unseen_by_another() -> str:
     if code == _UNSEEN:
         return "another process of this user cannot open the memory of this one (hidepid, or a security module?)"
     return f"a process that was to try it ended with {code}" if code else ""
-
-
-async def _subscribed(interface: RedisInterface) -> tuple[Any, Any]:
-    """Return what the server replies to a subscription to a key's usual channel, and to that of this machine."""
-    session = interface.session
-    keys = session.keys(f"reem-doctor-{secrets.token_hex(4)}")
-    node = cast("AsyncTransport", await session.transport.owner(keys.channel.encode()))
-    subscribe = "SSUBSCRIBE" if session.transport.sharded else "SUBSCRIBE"
-    wire = await node.listen(lambda _: None, lambda *_: None)
-    try:
-        usual, near = await wire.roundtrip([(subscribe, keys.channel), (subscribe, session.local.channel(keys))])
-    finally:
-        await wire.discard()
-    return usual, near
 
 
 async def _tagged(session: Session) -> dict[str, list[bytes]]:
