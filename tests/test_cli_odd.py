@@ -31,7 +31,6 @@ from reem_async.tools.snapshots import described
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import prune
 from reem_async.tools.snapshots.plans import KeyContent, Value
-from reem_async.tools.snapshots.rdb import describe_rdb
 
 
 @pytest.fixture
@@ -108,7 +107,7 @@ def made(path, entries=(), index=None, **head):
     if index is not None:
         put = writer._put
         writer._put = lambda name, _, *rest: put(name, index, *rest)
-    writer.finish([])
+    writer.finish({})
     return path
 
 
@@ -211,14 +210,6 @@ def test_values_of_the_wrong_number_of_pieces_are_damaged(tmp_path, kind, pieces
     entry = KeyContent("foo", b'{"a":1}', (".z",), (Value(".z", kind, pieces),))
     with Archive(made(tmp_path / "a.zip", [entry])) as archive, pytest.raises(BadData, match="pieces"):
         archive.read("foo")
-
-
-@pytest.mark.parametrize("moment", ["9" * 20, "\u00b2"])
-def test_an_rdb_file_of_an_odd_time(tmp_path, moment):
-    file = tmp_path / "a.rdb"
-    text = moment.encode()
-    file.write_bytes(b"REDIS0011\xfa\x05ctime" + bytes([len(text)]) + text + b"\xff")
-    assert describe_rdb(file).time == pytest.approx(time.time(), abs=10)
 
 
 def test_what_files_say_does_not_command_the_terminal(capsys):

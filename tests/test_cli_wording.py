@@ -75,7 +75,7 @@ def test_options_are_named_as_they_are_typed(cli, tmp_path, monkeypatch):
     for words, code, advice in [
         (("save", "a.zip"), 0, ""),
         (("save", "a.zip"), 2, "replace it with overwrite=True or --force"),
-        (("restore", "a.zip"), 1, "(--replace) replaces them, into= (--into) gives"),
+        (("restore", "a.zip"), 1, "(--replace) replaces them, another namespace= (--namespace)"),
     ]:
         words = ["snapshot", *words, "--namespace", cli.namespace]
         run = invoked(*words, REEM_URL=cli.url)

@@ -18,7 +18,7 @@ import reem
 import reem.snapshots
 import reem_async
 import reem_async.snapshots
-from reem_async.errors import BadData, BadKey, Conflict, WrongKind
+from reem_async.errors import BadData, Conflict, WrongKind
 from reem_async.server import EmbeddedServer
 from reem_async.tools.snapshots import RdbUnavailable, describe, rdb, restore, save, save_rdb
 
@@ -49,18 +49,6 @@ async def test_keys_that_are_there_are_not_replaced_unasked(here, there, raws, t
     assert everything(raws[1], "{b}*") == {}, "the interface knows what the registry holds"
 
 
-async def test_under_other_names(here, there, raws, tmp_path):
-    await reem_async.KeyValueStore(here)["a"].write({"x": np.arange(3)})
-    await save(here, tmp_path / "a.zip")
-    assert (await restore(here, tmp_path / "a.zip", into="old ")).names == ("old a",)
-    assert_same(await reem_async.KeyValueStore(here)["old a"].read(), {"x": np.arange(3)})
-    with pytest.raises(BadKey, match="brace"):
-        await restore(here, tmp_path / "a.zip", into="{")
-    with pytest.raises(BadKey):
-        await restore(here, tmp_path / "a.zip", into="x" * 600)
-    assert set(everything(raws[0], "*old*")) == {b"old a", b"{old a}.x", b"{old a}:ships"}
-
-
 async def test_a_foreign_key_in_the_way_is_never_replaced(here, there, raws, tmp_path):
     for name in ("a", "b"):
         await reem_async.KeyValueStore(here)[name].write(np.arange(3))
@@ -71,7 +59,7 @@ async def test_a_foreign_key_in_the_way_is_never_replaced(here, there, raws, tmp
     assert set(everything(raws[1])) == {b"b"}
     raws[1].delete("b")
     raws[1].lpush("{a}:ships", "precious")
-    with pytest.raises(BadData, match=r"\{a\}:ships"):
+    with pytest.raises(WrongKind, match=r"\{a\}:ships"):
         await restore(there, tmp_path / "a.zip", replace=True)
     assert set(everything(raws[1])) == {b"{a}:ships"}
 
@@ -105,7 +93,7 @@ async def test_progress_of_the_blocking_front(servers, raws, tmp_path):
         told = []
         saved = reem.snapshots.save(here, tmp_path / "a.zip", progress=told.append)
         done = reem.snapshots.restore(there, str(tmp_path / "a.zip"), progress=told.append)
-        assert reem.snapshots.describe(tmp_path / "a.zip", check=True) == saved
+        assert reem.snapshots.describe(tmp_path / "a.zip") == saved
         assert_same(reem.KeyValueStore(there)["foo"].read(), {"x": np.arange(3)})
         assert (saved.count, done.names) == (1, ("foo",))
         assert [(each.doing, each.done, each.total) for each in told if each.doing != "verify"] == [
@@ -161,14 +149,12 @@ async def test_an_rdb_file_is_of_now(here, raws, tmp_path):
     await fill(here)
     raws[0].set("foreign", "x")
     first = await save_rdb(here, tmp_path / "a.rdb")
-    assert (first.kind, first.count) == ("rdb", raws[0].dbsize())
+    assert (first.kind, first.count) == ("rdb", None)
     assert abs(first.time - time.time()) < 60
-    assert "valkey" in first.server or "7" in first.server or "8" in first.server
     await reem_async.KeyValueStore(here)["later"].write(np.arange(3))
     with pytest.raises(FileExistsError):
         await save_rdb(here, tmp_path / "a.rdb")
-    again = await save_rdb(here, tmp_path / "a.rdb", overwrite=True)
-    assert again.count == raws[0].dbsize() == first.count + 3
+    assert await save_rdb(here, tmp_path / "a.rdb", overwrite=True) == await describe(tmp_path / "a.rdb") != first
     with pytest.raises(BadData, match="reem up --from"):
         await restore(here, tmp_path / "a.rdb")
     # RedisJSON keeps documents as text there, and reads it as it reads any text: the tree's floats have changed.
@@ -182,17 +168,19 @@ async def test_an_rdb_file_is_of_now(here, raws, tmp_path):
     assert left_in(tmp_path) == ["a.rdb"]
 
 
-async def test_the_rdb_file_of_a_server_elsewhere(tmp_path):
+async def test_the_rdb_file_of_a_server_elsewhere(here, tmp_path, monkeypatch):
     """Of another machine or container: there is none here, or one that is another server's."""
-    with pytest.raises(RdbUnavailable, match=r"/no/such/dump\.rdb"):
-        rdb._check_readable(Path("/no/such/dump.rdb"))
     source = tmp_path / "dump.rdb"
-    rdb._check_readable(source)  # the server will make it
-    with pytest.raises(RdbUnavailable, match="another server's"):
-        await rdb._copy(source, None, tmp_path / "b.rdb", overwrite=False)
     source.write_bytes(b"REDIS0011 of another server")
-    with pytest.raises(RdbUnavailable, match="another server's"):
-        await rdb._copy(source, rdb._identity(source), tmp_path / "b.rdb", overwrite=False)
+    monkeypatch.setattr(rdb, "_START_SECONDS", 0.5)
+    for place, message in ((Path("/no/such/dump.rdb"), r"/no/such/dump\.rdb"), (source, "another server's")):
+
+        async def elsewhere(interface, place=place):
+            return place
+
+        monkeypatch.setattr(rdb, "_place", elsewhere)
+        with pytest.raises(RdbUnavailable, match=message):
+            await save_rdb(here, tmp_path / "b.rdb")
     assert left_in(tmp_path) == ["dump.rdb"]
 
 
@@ -204,34 +192,6 @@ async def test_a_server_that_cannot_save_says_so(tmp_path):
             with pytest.raises(RdbUnavailable):
                 await save_rdb(interface, tmp_path / "a.rdb")
     assert "a.rdb" not in left_in(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("head", "count"),
-    [
-        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfa\x05ctime\xc2\x00\x00\x00\x60\xfe\x00\xfb\x07\x00", 7),
-        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfe\x00\xfb\x41\x00\x00", 256),
-        (b"REDIS0011\xfa\x09redis-ver\x057.4.0\xfe\x00\xfb\x80\x00\x01\x00\x00\x00", 65536),
-        (
-            b"REDIS0011\xf7\x81\x01\x02\x03\x04\x05\x06\x07\x08\x02\x02\x05\x03abc\x01\x41\x02\x04"
-            + bytes(8)
-            + b"\x00\xff"
-            + bytes(8),
-            0,
-        ),
-        (b"REDIS0011\xff" + bytes(8), 0),
-        (b"REDIS0011\xf5\x03abc\xff" + bytes(8), 0),
-        (b"REDIS0011\xfa\xc3\x01", None),
-        (b"VALKEY080\xfe", None),
-    ],
-)
-async def test_what_the_beginning_of_an_rdb_file_says(tmp_path, head, count):
-    path = tmp_path / "x.rdb"
-    path.write_bytes(head)
-    it = await describe(path)
-    assert it.count == count
-    assert it.server == ("redis 7.4.0" if b"redis-ver" in head else "")
-    assert it.time == (0x60000000 if b"ctime" in head else path.stat().st_mtime)
 
 
 def test_the_modules_that_know_the_format_know_no_server():

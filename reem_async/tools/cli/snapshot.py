@@ -33,14 +33,12 @@ from reem_async.tools.cli.output import (
 )
 from reem_async.tools.cli.running import FAILED, for_users, run, run_local
 from reem_async.tools.snapshots import Progress, RdbUnavailable, Snapshot, described
-from reem_async.tools.snapshots.files import SUFFIXES, Pruned, dated, new_name, prune, sniff
+from reem_async.tools.snapshots.files import SUFFIXES, Pruned, is_dated, new_name, prune, sniff
 
 app = typer.Typer(rich_markup_mode="rich", help="Save what a server holds to files, list them, restore them.")
 
 # Seconds of each unit.
 _UNITS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
-_NAMED = 3
-"""How many names a line of text has."""
 
 Match = Annotated[
     str,
@@ -97,8 +95,7 @@ def save(
     """Save the keys of REEM to a file, or all of the server with --rdb.
 
     A portable snapshot is a zip file of documents and arrays. Each key in it is of one instant. It only needs the
-    right to read. Redis keys that are not REEM's are counted and left alone. Keys and arrays that cannot be read are
-    left out and named, and the exit code is 1.
+    right to read. Keys and arrays that cannot be read are left out and named, and the exit code is 1.
 
     Examples:
       reem snapshot save before.zip
@@ -153,9 +150,6 @@ class _Saver:
         deleted = f", deleted {', '.join(path.name for path in gone)}" if gone else ""
         emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, {seconds:.2f} s{clean(deleted)}")
         sys.stdout.flush()
-        if it.foreign:
-            more = f" and {it.foreign - _NAMED} more" if it.foreign > _NAMED else ""
-            self._note_once(f"Left out, not REEM's: {', '.join(it.foreign_names[:_NAMED])}{more}")
         for place, why in it.unsaved.items():
             self._note_once(f"Not saved: {place}: {why}")
         if it.doubt:
@@ -233,26 +227,23 @@ def list_(
             metavar="PATH", callback=existing, show_default="here", help="A directory, or one snapshot to look into."
         ),
     ] = Path(),
-    check: Annotated[
-        bool, typer.Option("--check", help="Read portable snapshots to their end to find damage; exit code 1 if any.")
-    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """List the snapshots in a directory, oldest first, or the keys in one.
 
+    Exit code 1 if the index of one is damaged. Restoring checks the rest.
+
     Examples:
       reem snapshot list
-      reem snapshot list --check /var/backups
       reem snapshot list before.zip
     """
-    run_local("snapshot list", lambda: listed(path, check, as_json))
+    run_local("snapshot list", lambda: listed(path, as_json))
 
 
 def restore(
     file: Annotated[Path, typer.Argument(metavar="FILE", callback=existing, help="A portable snapshot.")],
     match: Match = "*",
     replace: Annotated[bool, typer.Option("--replace", help="Keys that are there may be replaced.")] = False,
-    into: Annotated[str, typer.Option("--into", metavar="PREFIX", help="Goes before the name of each key.")] = "",
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
     as_json: AsJson = False,
@@ -266,12 +257,12 @@ def restore(
     Examples:
       reem snapshot restore before.zip
       reem snapshot restore --replace --match 'arm*' before.zip
-      reem snapshot restore --into old_ before.zip
+      reem snapshot restore --namespace old: before.zip
     """
 
     async def work(interface: RedisInterface) -> None:
         with _progress(shown=not as_json) as progress:
-            done = await snapshots.restore(interface, file, match, replace=replace, into=into, progress=progress)
+            done = await snapshots.restore(interface, file, match, replace=replace, progress=progress)
         if as_json:
             emit_json({"path": str(file), "restored": list(done.names), "size": done.size})
             return
@@ -293,15 +284,15 @@ for _name, _command in (("save", save), ("list", list_), ("restore", restore)):
     app.command(_name, help=help_text(_command.__doc__ or ""))(_command)
 
 
-def listed(path: Path, check: bool, as_json: bool) -> int:
+def listed(path: Path, as_json: bool) -> int:
     if path.is_file():
-        _show_keys(described(path, check=check), as_json)
+        _show_keys(described(path), as_json)
         return 0
     found: list[Snapshot] = []
     damaged: dict[str, str] = {}
     for file in _candidates(path):
         try:
-            found.append(described(file, check=check))
+            found.append(described(file))
         except (BadData, OSError) as error:
             damaged[str(file)] = for_users(error)
     found.sort(key=lambda it: (it.time, it.path.name))
@@ -317,7 +308,7 @@ def _candidates(directory: Path) -> Iterator[Path]:
         try:
             sniff(file)
         except (BadData, OSError):
-            if dated(file) is None:  # a zip file of another program
+            if not is_dated(file):  # a zip file of another program
                 continue
         yield file
 
@@ -329,7 +320,10 @@ def _show_files(found: list[Snapshot], damaged: dict[str, str], directory: Path,
         for name, error in damaged.items():
             emit_json({"path": name, "damaged": error})
         return
-    rows = [[clean(it.path.name), it.kind, _when(it), size_text(it.size), _count(it)] for it in found]
+    rows = [
+        [clean(it.path.name), it.kind, _when(it), size_text(it.size), "" if it.count is None else str(it.count)]
+        for it in found
+    ]
     if rows and is_terminal():
         rows.insert(0, ["name", "kind", "taken", "size", "keys"])
     columns(rows, ["cyan", "", "", "", ""], frozenset({3, 4}))
@@ -349,18 +343,15 @@ def _show_keys(it: Snapshot, as_json: bool) -> None:
         emit_json({**facts(it), "keys": keys})
         return
     emit(f"{styled(clean(str(it.path)), 'cyan')}: {content(it)}, taken {_when(it)} at {clean(it.server) or 'unknown'}")
-    rows = [[clean(key.name), size_text(key.size), _arrays(len(key.values))] for key in it.keys]
+    arrays = [f"{counted(len(key.values), 'array')} or other values of ships" if key.values else "" for key in it.keys]
+    rows = [[clean(key.name), size_text(key.size), more] for key, more in zip(it.keys, arrays, strict=True)]
     columns(rows, ["cyan", "", "dim"], frozenset({1}))
     for place, why in it.unsaved.items():
         note(clean(f"not saved: {place}: {why}"))
 
 
-def _arrays(count: int) -> str:
-    return f"{counted(count, 'array')} or other values of ships" if count else ""
-
-
 def facts(it: Snapshot) -> dict[str, Any]:
-    names = ("kind", "time", "size", "count", "server", "namespace", "foreign", "foreign_names")
+    names = ("kind", "time", "size", "count", "server", "namespace")
     return {"path": str(it.path), **{name: getattr(it, name) for name in names}, "unsaved": dict(it.unsaved)}
 
 
@@ -368,10 +359,5 @@ def _when(it: Snapshot) -> str:
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
 
 
-def _count(it: Snapshot) -> str:
-    return "" if it.count is None else f"{it.count} of Redis" if it.kind == "rdb" else str(it.count)
-
-
 def content(it: Snapshot) -> str:
-    keys = "" if it.count is None else f"{counted(it.count, 'key' if it.kind == 'portable' else 'Redis key')}, "
-    return f"{keys}{size_text(it.size)}"
+    return ("" if it.count is None else f"{counted(it.count, 'key')}, ") + size_text(it.size)

@@ -236,7 +236,7 @@ def _summary(path: Path) -> str:
 
     it = described(path)
     taken = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
-    count = "" if it.count is None else f", {it.count} {'keys' if it.kind == 'portable' else 'Redis keys'}"
+    count = "" if it.count is None else f", {it.count} keys"
     under = f", under the namespace {it.namespace}" if it.namespace else ""
     return f"{path}, taken {taken}{count}{under}"
 

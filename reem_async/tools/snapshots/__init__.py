@@ -14,7 +14,7 @@ from pathlib import Path
 
 import anyio.to_thread
 
-from .archive import Archive, verify
+from .archive import Archive
 from .files import SavedKey, Snapshot, sniff
 from .portable import Progress, Restored, restore, save
 from .rdb import RdbUnavailable, describe_rdb, save_rdb
@@ -33,28 +33,20 @@ __all__ = [
 ]
 
 
-async def describe(path: str | os.PathLike[str], *, check: bool = False) -> Snapshot:
-    """Return a summary of a snapshot of either kind, without a server.
-
-    Reads the index of a portable snapshot, or the first bytes of an RDB file.
-
-    Args:
-        path: The file.
-        check: Read all of a portable snapshot and compare its digest.
+async def describe(path: str | os.PathLike[str]) -> Snapshot:
+    """Return a summary of a snapshot of either kind, without a server. Reads the index of a portable one.
 
     Raises:
-        BadData: Neither kind, or damaged in the part that was read.
+        BadData: Neither kind, or its index is damaged; `restore` checks the rest.
         OSError: It cannot be read.
     """
-    return await anyio.to_thread.run_sync(lambda: described(path, check=check))
+    return await anyio.to_thread.run_sync(described, path)
 
 
-def described(path: str | os.PathLike[str], *, check: bool = False) -> Snapshot:
+def described(path: str | os.PathLike[str]) -> Snapshot:
     """Return what `describe` returns, on this thread."""
     file = Path(path)
     if sniff(file) == "rdb":
         return describe_rdb(file)
-    if check:
-        verify(file)
     with Archive(file) as archive:
         return archive.summary

@@ -41,8 +41,6 @@ _ZEROS = b"0" * 64
 # Bytes read at a time.
 _BLOCK = 1 << 20
 _NUMPY = b"\x93NUMPY"
-_SHOWN = 20
-"""Foreign keys that are named."""
 
 
 class _Hashed:
@@ -106,14 +104,10 @@ class ArchiveWriter:
         row |= {} if content.expires is None else {"expires": content.expires}
         self._keys.append({**row, "registry": content.registry, "values": values})
 
-    def finish(self, foreign: list[str], unsaved: Mapping[str, str] | None = None) -> None:
+    def finish(self, unsaved: Mapping[str, str]) -> None:
         """Write the index and the digest, sync the file to the disk, and give it its name."""
-        index = {
-            "keys": self._keys,
-            "foreign": len(foreign),
-            "foreign_names": foreign[:_SHOWN],
-            "unsaved": dict(unsaved or {}),
-        }
+        # Earlier versions of REEM demand the number and the names of the keys that are not REEM's.
+        index = {"keys": self._keys, "foreign": 0, "foreign_names": [], "unsaved": dict(unsaved)}
         self._put(_INDEX, orjson.dumps(index), zipfile.ZIP_DEFLATED)
         # The comment is the end of the file. It is written with zeros, which the digest covers, and then the digest
         # takes their place, so a reader can compute the same digest from the file alone.
@@ -202,8 +196,6 @@ class Archive:
             keys=keys,
             server=str(header["server"]),
             namespace=str(header["namespace"]),
-            foreign=int(index["foreign"]),
-            foreign_names=tuple(map(str, index["foreign_names"])),
             unsaved={str(place): str(why) for place, why in index.get("unsaved", {}).items()},
         )
 

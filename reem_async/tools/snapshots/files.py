@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 import os
 import re
 import time
@@ -57,15 +56,12 @@ class Snapshot:
     Attributes:
         path: The file.
         kind: "portable" or "rdb".
-        time: Seconds since 1970 when it was taken.
+        time: Seconds since 1970 when it was taken; for an RDB file, when it was written.
         size: Bytes of the file.
-        count: Top-level keys in a portable one; Redis keys of the first database in an RDB file, and None
-            where it does not say.
+        count: Top-level keys in a portable one; None for an RDB file.
         keys: The top-level keys of a portable one, in order of their names.
-        server: Where it was taken, or which program wrote the RDB file.
+        server: Where it was taken; empty for an RDB file.
         namespace: The namespace it was taken of.
-        foreign: The number of Redis keys that were left out since they are not REEM's.
-        foreign_names: The first of them, with their types.
         unsaved: The top-level keys and arrays that could not be saved, and why.
         doubt: Of one that was just saved, why keys may be missing; empty if as many were found as the server counts.
     """
@@ -78,8 +74,6 @@ class Snapshot:
     keys: tuple[SavedKey, ...] = field(default=(), repr=False)
     server: str = ""
     namespace: str = ""
-    foreign: int = 0
-    foreign_names: tuple[str, ...] = ()
     unsaved: Mapping[str, str] = field(default_factory=dict)
     doubt: str = ""
 
@@ -106,14 +100,9 @@ def new_name(directory: Path, kind: str, moment: float, *, auto: bool) -> Path:
     return path
 
 
-def dated(path: Path) -> float | None:
-    """Return the time in a name that `new_name` made, None for any other name."""
-    found = _NAME.fullmatch(path.name)
-    if found is None:
-        return None
-    with suppress(ValueError):
-        return datetime.datetime.strptime(found["time"], _TIME).replace(tzinfo=datetime.UTC).timestamp()
-    return None
+def is_dated(path: Path) -> bool:
+    """Return whether `new_name` made the name."""
+    return _NAME.fullmatch(path.name) is not None
 
 
 class Pruned(NamedTuple):
@@ -152,30 +141,25 @@ def _too_old(made: Sequence[Path], keep: int) -> list[Path]:
         if path.suffix == newest.suffix and path != newest and _is_automatic(path) and _origin(path) == origin
     ]
     # -1 for files of earlier runs: they are older than all of this run.
-    own.sort(key=lambda path: (order.get(path, -1), dated(path), path.name))
+    own.sort(key=lambda path: (order.get(path, -1), path.name))
     # The newest one, which is not in `own`, counts among those that are kept.
     return own[: max(0, len(own) + 1 - keep)]
 
 
 def _is_automatic(path: Path) -> bool:
     found = _NAME.fullmatch(path.name)
-    if found is None or found["auto"] is None or path.is_symlink() or not path.is_file():
-        return False
-    try:
-        return SUFFIXES[sniff(path)] == path.suffix
-    except (BadData, OSError):
-        return False
+    return found is not None and found["auto"] is not None and not path.is_symlink() and path.is_file()
 
 
 def _origin(path: Path) -> tuple[object, ...]:
     """Return what of which server a snapshot holds, as far as it says that; an RDB file does not."""
-    if path.suffix != SUFFIXES["portable"]:
-        return ()
     try:
+        if sniff(path) == "rdb":
+            return ("rdb",)
         with zipfile.ZipFile(path) as archive:
             said = orjson.loads(archive.open(FIRST_MEMBER.decode()).read(_LONGEST_HEADER))
         return said["server"], said["namespace"], said["match"]
-    except (OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, zlib.error, RuntimeError):
+    except (BadData, OSError, ValueError, LookupError, TypeError, zipfile.BadZipFile, zlib.error, RuntimeError):
         # Not readable: equal to no other file, so it is not deleted.
         return (path,)
 

@@ -1,22 +1,20 @@
-"""What belongs to one top-level key, and the plans that fetch it at one instant and store it again. Pure."""
+"""What belongs to one top-level key, the plan that fetches it at one instant, and what stores it again. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import orjson
 
-from ...errors import BadData, Conflict, NotAllowed, PartialWrite, Refused, WrongKind
+from ...errors import BadData, Conflict, Refused
 from ...plan import Command, Plan, Reply
-from ...plan.attachments import permitted
+from ...plan.changes import EncodedAttachment
 from ...plan.floats import exact_text, may_lose
 from ...plan.keys import DOCUMENT, Keys
 from ...plan.placeholders import find, inline_float, marked
 from ...plan.reads import get_command
 from ...plan.replies import checked, loads
-from ...plan.shapes import ShapeCache
 
 _WORDS = 1000
 """Words of one command at most, so that no single one keeps the server busy for long."""
@@ -173,45 +171,6 @@ def _type(reply: Reply) -> str:
 NOT_ALLOWED = "not allowed"
 
 
-def lifetimes(names: Sequence[str]) -> Plan:
-    """Plan to ask in how many milliseconds keys expire; the result has None for those that do not.
-
-    It is None as a whole if the user may not ask.
-    """
-
-    def decode(replies: Sequence[Reply]) -> list[int | None] | None:
-        if any(isinstance(reply, NotAllowed) for reply in replies):
-            return None
-        return [int(reply) if int(reply) > 0 else None for reply in replies]
-
-    # By itself: a user without the right to PTTL would have a whole transaction refused.
-    return Plan([("PTTL", name) for name in names], decode)
-
-
-def shown(key: bytes, kind: str) -> str:
-    return f"{key.decode(errors='backslashreplace')} ({kind})"
-
-
-def strangers(keys: Keys, suffixes: Sequence[bytes]) -> Plan:
-    """Plan to find which keys that carry the tag of a top-level key do not belong to it; the result names them.
-
-    What the registry of a document holds belongs to it, and so does its note of the last notice.
-    """
-    tag = keys.tag.encode()
-    commands: list[Command] = [("TYPE", keys.document), ("SMEMBERS", keys.registry)]
-
-    def decode(replies: Sequence[Reply]) -> list[str]:
-        # Without a document nothing belongs to the key, whatever a registry says that was left behind.
-        there = _type(replies[0]) == DOCUMENT
-        known = {b":last"} | (
-            {b":ships", *map(bytes, replies[1])} if there and isinstance(replies[1], list | set) else set()
-        )
-        kinds = zip(suffixes, map(_type, replies[2:]), strict=True)
-        return [shown(tag + suffix, kind) for suffix, kind in kinds if suffix not in known and kind != "none"]
-
-    return Plan([*commands, *(("TYPE", tag + suffix) for suffix in suffixes)], decode)
-
-
 def dump(keys: Keys) -> Plan:
     """Plan to fetch all that belongs to one top-level key, in one transaction; the result is a `KeyContent` or None.
 
@@ -228,7 +187,7 @@ def _dump(keys: Keys, asked: dict[str, str], tries: int) -> Plan:
     # for exactly what belongs to the key becomes a `KeyContent`.
     if not tries:
         raise Conflict(f"{keys.name} changed its shape {_TRIES} times while it was read; try again")
-    commands: list[Command] = [get_command(keys, ()), ("SMEMBERS", keys.registry)]
+    commands: list[Command] = [get_command(keys, ()), ("SMEMBERS", keys.registry), ("PTTL", keys.document)]
     for suffix, kind in asked.items():
         key, read = keys.tag + suffix, redis_type(kind, keys.name + suffix).read
         commands += [("TYPE", key), (read[0], key, *read[1:])]
@@ -242,8 +201,8 @@ def _dump(keys: Keys, asked: dict[str, str], tries: int) -> Plan:
         # A program without REEM has overwritten the registry: the document still says what belongs to it.
         overwritten = isinstance(replies[1], Exception) and not isinstance(replies[1], Refused)
         registry = tuple(sorted(placed)) if overwritten else _registry(replies[1], keys)
-        # Replies: document, registry, then type and content of each attachment that was asked for.
-        found = {suffix: kind for suffix, kind in zip(asked, map(_type, replies[2::2]), strict=True) if kind != "none"}
+        # Replies: document, registry, time to live, then type and content of each attachment that was asked for.
+        found = {suffix: kind for suffix, kind in zip(asked, map(_type, replies[3::2]), strict=True) if kind != "none"}
         # What the document refers to counts even if the registry has lost it.
         belongs = {*registry, *placed}
         if belongs - set(asked) or any(asked[suffix] != kind for suffix, kind in found.items()):
@@ -251,11 +210,14 @@ def _dump(keys: Keys, asked: dict[str, str], tries: int) -> Plan:
             return _dump(keys, {suffix: found.get(suffix, "string") for suffix in sorted(belongs)}, tries - 1)
         values = [
             _value(suffix, asked[suffix], reply, keys)
-            for suffix, reply in zip(asked, replies[3::2], strict=True)
+            for suffix, reply in zip(asked, replies[4::2], strict=True)
             if suffix in found and suffix in belongs
         ]
         missing = tuple(sorted(placed - set(found)))
-        return KeyContent(keys.name, bytes(text[1:-1]), registry, tuple(values), missing=missing)
+        left = int(checked(replies[2], keys, ()))
+        return KeyContent(
+            keys.name, bytes(text[1:-1]), registry, tuple(values), left if left > 0 else None, missing=missing
+        )
 
     return Plan(commands, decode, atomic=True, bulk=True)
 
@@ -284,86 +246,7 @@ def _value(suffix: str, kind: str, reply: Reply, keys: Keys) -> Value:
     return Value(suffix, kind, tuple(redis_type(kind, keys.name + suffix).pieces(reply)))
 
 
-def put(
-    keys: Keys, content: KeyContent, cache: ShapeCache, *, replace: bool, notices: Callable[[], Sequence[Command]]
-) -> Plan:
-    """Plan to store a top-level key, with all that belongs to it and the notice, in one transaction.
-
-    Two round trips; more if another client writes to the key between them. `notices` makes the commands that notify
-    subscribers; it is called once, when the write is certain.
-    """
-    return _Put(keys, content, cache, replace, notices).plan()
-
-
-class _Put:
-    """Watches the key, looks at it, and writes; starts again if another client has written in between.
-
-    Not nested functions: those would refer to each other in a circle, and large arrays would wait for the garbage
-    collector.
-    """
-
-    def __init__(
-        self,
-        keys: Keys,
-        content: KeyContent,
-        cache: ShapeCache,
-        replace: bool,
-        notices: Callable[[], Sequence[Command]],
-    ) -> None:
-        self._keys = keys
-        self._registry = content.registry
-        self._cache = cache
-        self._replace = replace
-        self._notices = notices
-        self._notice: Sequence[Command] = ()
-        self._suffixes = [value.suffix for value in content.values]
-        self._writes: list[Command] = []
-        for value in content.values:
-            kind = redis_type(value.kind, keys.name + value.suffix)
-            self._writes += kind.write(keys.tag + value.suffix, value.pieces)
-        self._writes.append(("JSON.SET", keys.document, "$", settable(content.text)))
-        if content.registry:
-            self._writes.append(("SADD", keys.registry, *content.registry))
-        if content.expires is not None:
-            names = [keys.document, keys.registry, *(keys.tag + suffix for suffix in self._suffixes)]
-            self._writes += [("PEXPIRE", name, str(content.expires)) for name in names]
-
-    def plan(self) -> Plan:
-        keys = self._keys
-        commands = [("WATCH", keys.document, keys.registry), ("TYPE", keys.document), ("SMEMBERS", keys.registry)]
-        return Plan(commands, self._look, held=True)
-
-    def _look(self, replies: Sequence[Reply]) -> Plan:
-        keys, kind, members = self._keys, _type(replies[1]), replies[2]
-        permitted(replies[0], keys.document, keys.registry)
-        if kind not in ("none", DOCUMENT):
-            raise WrongKind(keys.document, keys.name)
-        if kind == DOCUMENT and not self._replace:
-            raise Conflict(f"{keys.name!r} is there already; nothing of it was changed")
-        if isinstance(members, Exception):
-            raise BadData(f"{keys.name}: {keys.registry} is not the set of names it should be: {members}")
-        # JSON.SET keeps the expiry of what it replaces.
-        lasting = [("PERSIST", keys.document)] if kind == DOCUMENT else []
-        # Only now, since a number that is not used would look like a loss; and once for all attempts.
-        self._notice = self._notice or self._notices()
-        # First remove the old attachments and all that is in the way of the new ones. Then fill the attachments, set
-        # the document and the registry, and publish the notice.
-        tag = keys.tag.encode()
-        before = sorted(tag + bytes(member) for member in members)
-        unlink = ("UNLINK", keys.registry, *before, *(tag + suffix.encode() for suffix in self._suffixes))
-        commands = [unlink, *lasting, *self._writes, *self._notice]
-        return Plan(commands, partial(self._done, [command[:2] for command in commands]), atomic=True, held=True)
-
-    def _done(self, sent: Sequence[Command], replies: Sequence[Reply] | None) -> Plan | None:
-        if replies is None:  # another client wrote in between
-            return self.plan()
-        for (command, key), reply in zip(sent, replies, strict=True):
-            if isinstance(reply, Exception):
-                raise PartialWrite(
-                    f"{self._keys.name}: the server refused {command} {key!s:.60}: {reply}; the rest was written: "
-                    "restore this key again"
-                )
-        # What this interface remembers of the key no longer holds.
-        self._cache.of(self._keys.document).saw_members(frozenset(suffix.encode() for suffix in self._registry))
-        self._cache.of(self._keys.document).forget_numbers()
-        return None
+def storing(keys: Keys, value: Value) -> EncodedAttachment:
+    """Return the value with the commands that store it again."""
+    commands = redis_type(value.kind, keys.name + value.suffix).write(keys.tag + value.suffix, value.pieces)
+    return EncodedAttachment(value.suffix, "", tuple(commands))
