@@ -120,6 +120,11 @@ async def test_large_values_go_through_shared_memory_on_one_host(akvs, binterfac
     await aeventually(lambda: keys_of(raw, key()) == set())
 
 
+class Untold(Exception):
+    def __str__(self):
+        raise SystemExit
+
+
 def test_what_a_function_raises_reaches_the_caller(front, key):
     """With type, text and traceback; so does a result that cannot be stored, with its path."""
     place = front.kvs[key()]
@@ -129,6 +134,8 @@ def test_what_a_function_raises_reaches_the_caller(front, key):
             raise KeyError("odd\ud800")
         if number == 3:
             raise SystemExit(5)
+        if number == 5:
+            raise Untold
         return {"a": [{1, 2}]} if number == 2 else number
 
     served(front, place, act)
@@ -136,6 +143,7 @@ def test_what_a_function_raises_reaches_the_caller(front, key):
         ({"number": 1}, "KeyError: 'odd"),
         ({"number": 2}, rf"BadType: {key()}\.a\[0\]: "),
         ({"number": 3}, "SystemExit: 5"),
+        ({"number": 5}, r"Untold: \(its text cannot be shown\)"),
         ({"nomber": 2}, "TypeError: .*nomber"),
     ):
         with pytest.raises(RemoteError, match=words) as caught:

@@ -13,7 +13,6 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 
-from ..errors import BadValue
 from ..plan.arguments import check_number
 
 LONGEST = 1e6  # seconds that a time limit may have: eleven days, which is as good as none
@@ -72,7 +71,7 @@ def timeout(seconds: float) -> Iterator[None]:
         seconds: The limit, above 0.
 
     Raises:
-        BadValue: Not a number above 0.
+        BadType, BadValue: Not a number above 0, up to a million.
     """
     token = _given.set(check_timeout(seconds))
     try:
@@ -89,7 +88,7 @@ def waiting_limit(seconds: float | None) -> float | None:
     if seconds is None:
         return _given.get()
     check_number("timeout", seconds, "use seconds, 0 or more, or None for no limit")
-    return float(seconds)
+    return float(min(seconds, LONGEST))
 
 
 def forget() -> None:
@@ -98,9 +97,8 @@ def forget() -> None:
 
 
 def check_timeout(seconds: float) -> float:
-    """Return `seconds` if it can be a time limit, else raise BadValue."""
-    if isinstance(seconds, bool) or not isinstance(seconds, int | float) or not 0 < seconds <= LONGEST:
-        raise BadValue(f"timeout={seconds!r} is not a number of seconds above 0 (at most a million)")
+    """Return `seconds` if it can be a time limit, else raise BadType or BadValue."""
+    check_number("timeout", seconds, "use seconds above 0, up to a million", above=0, most=LONGEST)
     return float(seconds)
 
 

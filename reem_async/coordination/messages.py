@@ -182,7 +182,7 @@ def failure(message: Message, error: BaseException, trace: str) -> bytes:
     """Return the message that a function raised."""
     try:
         text = str(error)
-    except Exception:  # its __str__ is the user's
+    except BaseException:  # its __str__ is the user's
         text = "(its text cannot be shown)"
     words = [(type(error).__qualname__, 200), (text, 4096), (trace, LONGEST_TEXT)]
     return bare(message._replace(kind=FAILED, words=[_shortened(*each) for each in words]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -11,11 +12,13 @@ from ..errors import BadType, BadValue
 from .paths import Path, shorten, show
 
 
-def check_number(name: str, value: Any, cure: str, *, least: float = 0.0, above: float | None = None) -> None:
-    """Raise BadType unless it is a number, and BadValue for NaN and numbers below `least` or not `above`."""
+def check_number(
+    name: str, value: Any, cure: str, *, least: float = 0.0, above: float = -math.inf, most: float = math.inf
+) -> None:
+    """Raise BadType unless it is a number, and BadValue unless `above` < value and `least` <= value <= `most`."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise BadType(f"{name}={shorten(value)} is not a number; {cure}")
-    if not (value >= least if above is None else value > above):
+    if not (least <= value <= most and above < value):
         raise BadValue(f"{name}={shorten(value)} is out of range; {cure}")
 
 

@@ -75,9 +75,7 @@ def check_name(name: Any) -> str:
 def check_ttl(ttl: Any) -> int:
     """Return a lease's duration in milliseconds; raises BadType or BadValue."""
     cure = f"a lease lasts {_SHORTEST:g} to {LONGEST:g} seconds after each write"
-    check_number("ttl", ttl, cure, least=_SHORTEST)
-    if ttl > LONGEST:
-        raise BadValue(f"ttl={shorten(ttl)} is out of range; {cure}")
+    check_number("ttl", ttl, cure, least=_SHORTEST, most=LONGEST)
     return round(float(ttl) * 1000)
 
 

@@ -22,7 +22,7 @@ from ..plan.arguments import check_number
 from ..plan.paths import Path, counts_from_end, show
 from .events import Origin, Update
 
-_CURE = "use seconds above 0, such as 0.2, or None for no limit"
+_CURE = "use seconds above 0, such as 0.2, up to a million, or None for no limit"
 
 _LOOK = 0.001
 """Seconds from the end of the time to the report. In between, the event loop reads from its sockets what has arrived
@@ -36,9 +36,7 @@ def checked_ttl(ttl: float, path: Path) -> float:
         ttl: Seconds.
         path: What is followed, top-level key first.
     """
-    check_number("ttl", ttl, _CURE, above=0)
-    if not ttl <= LONGEST:
-        raise BadValue(f"ttl={ttl} is out of range; {_CURE} (at most a million)")
+    check_number("ttl", ttl, _CURE, above=0, most=LONGEST)
     if counts_from_end(path):
         raise BadValue(
             f"ttl={ttl:g} at {show(path)}: an index from the end names another item after each change; follow the list"
