@@ -18,7 +18,7 @@ import reem
 import reem_async
 from reem._portal import finish
 from reem_async.concurrency.timeouts import moved_last
-from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.errors import BadInput, ConnectionLost, NotConnected
 from reem_async.plan import Plan
 from reem_async.plan.notices import note_of
 from reem_async.pubsub import subscription_commands
@@ -104,7 +104,7 @@ def test_the_limit_of_one_blocking_call_is_its_own(server):
 
 @pytest.mark.parametrize("seconds", [0, -1, float("nan"), float("inf"), True, "1", None])
 def test_what_is_no_time_limit_is_refused(seconds):
-    with pytest.raises(BadValue, match="timeout"), reem.timeout(seconds):
+    with pytest.raises(BadInput, match="timeout"), reem.timeout(seconds):
         pass
 
 

@@ -235,7 +235,7 @@ def test_socket_timeout_is_the_time_limit(package):
     assert limit("redis://localhost?socket_timeout=3") == 3
     assert limit("localhost", socket_timeout=None) == 1e6
     for wrong in (0, -1, "5", True):
-        with pytest.raises(reem.BadValue, match="timeout"):
+        with pytest.raises(reem.BadInput, match="timeout"):
             limit("localhost", socket_timeout=wrong)
 
 
