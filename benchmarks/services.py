@@ -64,7 +64,7 @@ def serve(way: str, url: str, place: str, ready: Any) -> None:
         queryable.undeclare()
     elif way == "gRPC, arrays as bytes":
         serve_grpc(place, ready)
-    elif way == "REEM, asyncio":
+    elif way.startswith("REEM, asyncio"):
         asyncio.run(serve_async(url, ready))
     else:
         service = reem.KeyValueStore(url)["policy"].serve(act)
@@ -128,9 +128,9 @@ def caller(way: str, url: str, place: str, arguments: dict[str, Any]) -> Iterato
         with grpc.insecure_channel(place, options=[("grpc.max_send_message_length", -1)]) as channel:
             ask = channel.unary_unary("/q/call")
             yield lambda: ask(b"".join([each.tobytes() for each in arguments.values()]) or body)
-    elif way == "REEM, asyncio":
+    elif way.startswith("REEM, asyncio"):
         with asyncio.Runner() as runner:
-            interface = reem_async.RedisInterface(url)
+            interface = reem_async.RedisInterface(url, local="early" if way.endswith("direct") else "auto")
             service = reem_async.KeyValueStore(interface)["policy"]
 
             async def call() -> Any:
@@ -139,7 +139,8 @@ def caller(way: str, url: str, place: str, arguments: dict[str, Any]) -> Iterato
             yield lambda: runner.run(call())
             runner.run(interface.close())
     else:
-        with reem.RedisInterface(url, local="off" if way == "REEM, through the server" else "auto") as interface:
+        mode = {"REEM, through the server": "off", "REEM, blocking, direct": "early"}.get(way, "auto")
+        with reem.RedisInterface(url, local=mode) as interface:
             service = reem.KeyValueStore(interface)["policy"]
             yield lambda: service.call(**arguments)
 
@@ -183,7 +184,8 @@ def table(title: str, ways: list[str], url: str, arguments: dict[str, Any]) -> N
 
 def main() -> None:
     with EmbeddedServer() as server:
-        small = ["redis-py lists", "REEM, blocking", "REEM, asyncio", "zenoh queryable", "pyzmq REQ/REP"]
+        small = ["redis-py lists", "REEM, blocking", "REEM, asyncio"]
+        small += ["REEM, blocking, direct", "REEM, asyncio, direct", "zenoh queryable", "pyzmq REQ/REP"]
         table("small call", small, server.url, {"state": [0.5] * 6, "step": 7})
         large = ["gRPC, arrays as bytes", "REEM, blocking", "REEM, asyncio", "REEM, through the server"]
         table("policy call, two images of 0.92 MB", large, server.url, IMAGES)

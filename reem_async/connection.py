@@ -41,7 +41,8 @@ class RedisInterface:
             more through shared memory, if available; the server stores every update too, and a subscriber that cannot
             read the memory fetches it there. "off": always from the server. "early": updates of this interface reach
             subscribers on this host directly, before the server has stored them (`update.early`); if the server never
-            gets an update, they get the server's value, with `gap`. See docs/guarantees.md.
+            gets an update, they get the server's value, with `gap`. See docs/guarantees.md. Its calls of services reach
+            programs on this host directly, too.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         wait: Seconds for which the first connection is tried again if the server is not up yet, for programs that start

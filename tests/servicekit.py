@@ -1,7 +1,7 @@
 """Programs that serve and call in the tests of services, to be stopped and killed.
 
 python -m servicekit serve URL KEY        serves KEY until it is killed, and prints "serving"
-python -m servicekit call URL KEY COUNT [TIMEOUT]   makes so many calls and prints a line for each: number, outcome
+python -m servicekit call URL KEY COUNT [TIMEOUT [LOCAL]]   makes so many calls, and prints number and outcome of each
 """
 
 import contextlib
@@ -37,9 +37,9 @@ def serve(url, key):
     service.wait()
 
 
-def call(url, key, count, timeout="5"):
+def call(url, key, count, timeout="5", local="auto"):
     """Call from four threads; each outcome is a right answer, or the name of an error."""
-    place = reem.KeyValueStore(url)[key]
+    place = reem.KeyValueStore(reem.RedisInterface(url, local=local))[key]
     numbers = iter(range(int(count)))
     lock = threading.Lock()
 

@@ -45,6 +45,7 @@ from reem_async.errors import (
     ServiceLost,
     WrongLoop,
 )
+from reem_async.local.mailbox import Mailbox
 from reem_async.server import EmbeddedServer
 
 VALUES = {
@@ -251,6 +252,70 @@ async def test_a_call_that_is_left_cancels_its_function(akvs, raw, key):
     await aeventually(lambda: keys_of(raw, key()) == set())
 
 
+@pytest.fixture
+async def early(server_url):
+    async with reem_async.RedisInterface(server_url, local="early") as interface:
+        yield reem_async.KeyValueStore(interface)
+
+
+async def test_on_one_host_calls_need_no_server_in_between(akvs, early, raw, key):
+    """From the second call on: requests, answers, what is refused, and the word that a caller has left."""
+    cancelled = []
+
+    async def act(number, array=None):
+        try:
+            await asyncio.sleep(PATIENCE if number < 0 else 0)
+        except asyncio.CancelledError:
+            cancelled.append(number)
+            raise
+        return {"number": 1 / number, "array": array}
+
+    place, array = early[key()], np.arange(LARGE)
+    service = akvs[key()].serve(act, concurrency=2, queue=1)
+    await service.listen()
+    await place.call(number=1)
+    before = commands_run(raw)
+    for number in range(1, 50):
+        answer = await place.call(number=number, array=array if number % 5 == 0 else None)
+        assert answer["number"] == 1 / number
+    with pytest.raises(RemoteError, match="ZeroDivisionError"):
+        await place.call(number=0)
+    calls = [asyncio.create_task(place.call(number=-n)) for n in (1, 2, 3)]
+    await asyncio.sleep(0.05)
+    for call in calls:
+        call.cancel()
+    await aeventually(lambda: {*cancelled} >= {-1, -2})
+    assert (await place.call(number=4))["number"] == 0.25
+    after = commands_run(raw)
+    sent = sum(after.get(name, 0) - before.get(name, 0) for name in ("publish", "spublish", "set"))
+    assert sent <= 6  # pings
+    await service.close()
+    with pytest.raises(NoService):
+        await place.call(number=5)
+
+
+@pytest.mark.parametrize("fails", ["sends", "opens"])
+async def test_calls_go_through_the_server_where_the_direct_path_fails(akvs, early, key, monkeypatch, fails):
+    """Each is answered, and none twice."""
+    chance, got = random.Random(1), []
+    sends = Mailbox.try_send
+
+    def send(self, *words):
+        if chance.random() < 0.5:
+            raise BlockingIOError
+        sends(self, *words)
+
+    def refuse(self, role):
+        raise OSError
+
+    monkeypatch.setattr(Mailbox, *("try_send", send) if fails == "sends" else ("__init__", refuse))
+    async with akvs[key()].serve(lambda number: got.append(number), concurrency=4):
+        await asyncio.gather(*(early[key()].call(number=n) for n in range(50)))
+        for number in range(50, 100):
+            await early[key()].call(number=number)
+    assert sorted(got) == list(range(100))
+
+
 async def test_a_full_queue_is_busy_and_another_server_helps(akvs, binterface, key):
     running, most, go_on = 0, 0, asyncio.Event()
 
@@ -306,34 +371,41 @@ async def test_closing_sends_waiting_calls_elsewhere(akvs, binterface, key):
     assert outcomes.count("here") == 2
 
 
-def test_a_killed_server_is_noticed(kvs, raw, server_url, key):
+@pytest.fixture(params=["auto", "early"])
+def caller(request, server_url):
+    """What calls through the server, or directly."""
+    with reem.RedisInterface(server_url, local=request.param) as interface:
+        yield reem.KeyValueStore(interface)
+
+
+def test_a_killed_server_is_noticed(caller, raw, server_url, key):
     """Within 0.3 s and a look, the call is not repeated, and the next one goes to another server."""
     with program("serve", server_url, key()) as process:
-        assert kvs[key()].call(number=3)["pid"] == process.pid
+        assert caller[key()].call(number=3)["pid"] == process.pid
         began = time.monotonic()
         threading.Timer(0.2, process.kill).start()
         with pytest.raises(ServiceLost, match="may or may not"):
-            kvs[key()].call(number=4, nap=20, array=np.zeros(LARGE))
+            caller[key()].call(number=4, nap=20, array=np.zeros(LARGE))
         assert time.monotonic() - began < 1.2
     with pytest.raises(NoService):
-        kvs[key()].call(number=5)
-    with kvs[key()].serve(act):
-        assert kvs[key()].call(number=6)["pid"] == os.getpid()
+        caller[key()].call(number=5)
+    with caller[key()].serve(act):
+        assert caller[key()].call(number=6)["pid"] == os.getpid()
     eventually(lambda: keys_of(raw, key()) == set())
 
 
-def test_a_stopped_server_is_noticed_and_begins_nothing_later(kvs, server_url, key, tmp_path):
+def test_a_stopped_server_is_noticed_and_begins_nothing_later(caller, server_url, key, tmp_path):
     with program("serve", server_url, key()) as process:
-        kvs[key()].call(number=3)
+        caller[key()].call(number=3)
         process.send_signal(signal.SIGSTOP)
         with pytest.raises(CallTimeout):
-            kvs[key()].call(number=4, timeout=0.3, done=str(tmp_path / "done"))
+            caller[key()].call(number=4, timeout=0.3, done=str(tmp_path / "done"))
         began = time.monotonic()
         with pytest.raises(ServiceLost, match=r"0\.9 s"):
-            kvs[key()].call(number=5, done=str(tmp_path / "done"))
+            caller[key()].call(number=5, done=str(tmp_path / "done"))
         assert time.monotonic() - began < sized(4, 2)
         process.send_signal(signal.SIGCONT)
-        eventually(lambda: answers(kvs[key()]))
+        eventually(lambda: answers(caller[key()]))
         assert not (tmp_path / "done").exists()
 
 
@@ -496,7 +568,10 @@ def test_each_call_is_answered_once_or_fails_truly(server_url, raw, key):
     chance, over = random.Random(1), threading.Event()
     with contextlib.ExitStack() as stack:
         servers = [stack.enter_context(program("serve", server_url, key())) for _ in range(3)]
-        callers = [stack.enter_context(program("call", server_url, key(), calls // 8)) for _ in range(8)]
+        callers = [
+            stack.enter_context(program("call", server_url, key(), calls // 8, 5, local))
+            for local in ["auto", "early"] * 4
+        ]
 
         def kill_now_and_then():
             while not over.wait(chance.uniform(0.2, 0.6)):

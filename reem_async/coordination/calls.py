@@ -10,7 +10,7 @@ import contextlib
 import inspect
 import random
 import secrets
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from enum import Enum
 from functools import partial
 from typing import Any
@@ -40,6 +40,7 @@ from ..pubsub.manager import SubscriptionManager, manager_of
 from ..session import Session
 from ..store.encoding import Encoder
 from . import messages
+from .direct import Post
 from .messages import ID, Content, Encoded, Message, Names
 
 DEFAULT_TIMEOUT = 10.0  # seconds for which a call waits if neither it nor `reem.timeout` says
@@ -75,8 +76,8 @@ def _caller_of(session: Session, keys: Keys) -> Caller:
 async def statistics(session: Session) -> list[dict[str, Any]]:
     """Return a dict for each server of each service in the namespace, sorted; waits up to a second for what they say.
 
-    It has "service" (the path as text), "host", "pid", "calls" since it began, "rate" (calls per second), "median" of
-    the last 200 in seconds, "errors", and "waiting"; None in the place of what a server did not say.
+    It has "service" (the path as text), "host", "pid", "calls" and "errors" since it began, "rate" (calls per second)
+    and "median" (seconds) of the last 200, and "waiting"; None in the place of what a server did not say.
 
     Raises:
         NotAllowed: The user lacks a right; says which.
@@ -164,6 +165,7 @@ class Instance:
         self.channel = channel
         self.calls = 0  # calls from here that wait for its answer
         self.host = ""  # what names its host, for shared memory; empty if not known, or if it cannot read ours
+        self.address = ""  # its mailbox on this host; empty if not known, or if it has none for us
         self.misses = 0  # pings since its last message
         self._waiting, self._until = 0.0, 0.0  # requests that it said are waiting there, and when that is too old
 
@@ -244,6 +246,7 @@ class Caller(Listener):
         self._directories: dict[Path, Directory] = {}
         self._pending: dict[str, PendingCall] = {}
         self._called: set[Directory] = set()  # since the last look at them
+        self._post = Post(session, self.on_message)
         self._following = asyncio.Lock()
         self._follows = False  # the channel of answers is subscribed
         self._watching: asyncio.Task[None] | None = None
@@ -264,6 +267,8 @@ class Caller(Listener):
                 "the request may or may not have been handled"
             )
             call.end(reason if isinstance(reason, InterfaceClosed) else broken)
+        if isinstance(reason, InterfaceClosed):
+            self._post.close()
 
     def on_message(self, payload: bytes) -> None:
         message = messages.decode(payload, self._session.local.view)
@@ -281,8 +286,9 @@ class Caller(Listener):
             return
         call.instance.answered(message.number, now)
         if message.content is not None:
-            call.instance.host = "" if message.content.is_missing else message.words[0]
+            call.instance.host, call.instance.address = message.words
             if message.content.is_missing:
+                call.instance.host = ""
                 self._manager.tasks.start(self._tell(messages.UNREAD, call), "reem answer unread")
                 return
         call.end(message)
@@ -291,8 +297,13 @@ class Caller(Listener):
         """Send the server of a call a word about it."""
         if call.instance is not None:
             with contextlib.suppress(ReemError, RedisError, OSError):  # the call notices what is the matter
-                payload = messages.bare(Message(kind, call.id, self.id))
-                await publish(self._session, self._keys, call.instance.channel, payload)
+                await self._deliver(call.instance, messages.bare(Message(kind, call.id, self.id)))
+
+    async def _deliver(self, instance: Instance, payload: bytes, commands: Sequence[Command] = ()) -> int:
+        """Send a message to a server, directly where that can be; return how many have received it."""
+        if not commands and self._post.send(instance.address, payload):
+            return 1
+        return await publish(self._session, self._keys, instance.channel, payload, commands)
 
     # One call.
 
@@ -374,7 +385,8 @@ class Caller(Listener):
     async def _send(self, call: PendingCall, instance: Instance, value: Encoded, prefix: str) -> int:
         left = max(call.deadline - asyncio.get_running_loop().time(), 0.0)
         local = self._session.local
-        message = Message(messages.CALL, call.id, self.id, left, [local.host if instance.calls <= _SHARED else ""])
+        words = [local.host if instance.calls <= _SHARED else "", self._post.address if local.early else ""]
+        message = Message(messages.CALL, call.id, self.id, left, words)
         slots = self._keys._replace(channel=call.directory.names.channel(""))
         put = partial(local.put, slots) if local.host and instance.host == local.host else None
         payload, commands, _ = messages.packed(message, value, prefix, left, put)
@@ -382,7 +394,7 @@ class Caller(Listener):
             commands = []
         elif commands:
             call.stored = messages.keys_of(prefix, value)
-        return await publish(self._session, self._keys, instance.channel, payload, commands)
+        return await self._deliver(instance, payload, commands)
 
     async def _give_up(self, call: PendingCall) -> None:
         """Have the server give up a call that was left, and remove what it has not fetched."""

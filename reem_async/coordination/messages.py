@@ -44,7 +44,7 @@ PONG: Final = "pong"  # how the server is doing
 
 _KINDS = {CALL, CANCEL, PING, UNREAD, ANSWER, FAILED, BUSY, CLOSED, PONG}
 _WITH_VALUE = {CALL, ANSWER}
-_WORDS = {CALL: 1, ANSWER: 1, FAILED: 3, PONG: 6}  # how many texts a message has
+_WORDS = {CALL: 2, ANSWER: 2, FAILED: 3, PONG: 6}  # how many texts a message has
 _HERE, _STORED = "here", "stored"
 
 Encoded = tuple[bytes, Sequence[EncodedAttachment]]  # a value: the text of the document, and the attachments
@@ -72,7 +72,8 @@ class Message(NamedTuple):
     call: str  # the id of the call or of the ping
     sender: str  # the id of the caller or of the server
     number: float = 0.0  # of a caller: seconds that are left; of a server: requests that wait or are handled there
-    words: Sequence[str] = ()  # CALL, ANSWER: the sender's host, for shared memory; FAILED: type, message, traceback
+    # CALL, ANSWER: the sender's host, for shared memory, and its mailbox, if any; FAILED: type, message, traceback
+    words: Sequence[str] = ()
     content: Content | None = None
 
 

@@ -46,6 +46,7 @@ from ..session import Session
 from ..store.encoding import Encoder
 from . import messages
 from .calls import explained, new_id, opened, publish
+from .direct import Post
 from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")
@@ -147,12 +148,14 @@ class Served(Listener):
         self._handled: dict[str, Request] = {}
         self._left: collections.OrderedDict[str, str] = collections.OrderedDict()  # calls and their callers
         self._shared: collections.deque[tuple[Request, bytes]] = collections.deque(maxlen=_REMEMBERED)
+        self._post = Post(session, self.on_message)
         self.closed = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         # All that was sent before this had arrived by now; see `_handle`.
-        self._proved = self._began = self._loop.time()
+        self._proved = self._loop.time()
         self._calls = self._errors = 0  # how many were answered, and with an exception
-        self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)  # seconds that calls took
+        # When the last calls ended, and how many seconds they took
+        self._times: collections.deque[tuple[float, float]] = collections.deque(maxlen=_RECENT)
 
     async def follow(self) -> None:
         """Begin to serve: when this returns, callers find this server."""
@@ -179,6 +182,7 @@ class Served(Listener):
         for request in [*self._waiting.values(), *self._handled.values()]:
             self._leave(request)
         self._workers.close()
+        self._post.close()
 
     # What the subscription manager calls.
 
@@ -261,7 +265,7 @@ class Served(Listener):
                     return
             if not request.is_left:
                 await self._answer(request)
-                self._times.append(self._loop.time() - began)
+                self._times.append((self._loop.time(), self._loop.time() - began))
         except (ReemError, RedisError) as error:
             logger.warning("an answer of %s could not be sent: %s", self.where, error)
         except asyncio.CancelledError:
@@ -331,16 +335,24 @@ class Served(Listener):
     async def _reply(self, message: Message, kind: str) -> None:
         words: list[str] = []
         if kind == messages.PONG:
-            rate = self._calls / max(self._loop.time() - self._began, 1.0)
-            median = statistics.median(self._times) if self._times else ""
+            took = [seconds for _, seconds in self._times]
+            rate = len(took) / max(self._loop.time() - self._times[0][0], 1.0) if took else 0.0
+            median = statistics.median(took) if took else ""
             words = [str(each) for each in (socket.gethostname(), os.getpid(), self._calls, rate, median, self._errors)]
-        channel = messages.answers(self._names.keys, message.sender)
         with contextlib.suppress(ReemError, RedisError, OSError):  # the caller's pings find out
-            payload = messages.bare(self._message(kind, message.call, words))
-            await publish(self._session, self._names.keys, channel, payload)
+            await self._deliver(message, messages.bare(self._message(kind, message.call, words)))
+
+    async def _deliver(self, request: Message, payload: bytes, commands: Sequence[Command] = ()) -> int:
+        """Send a message to a caller, directly where that can be; return how many have received it."""
+        is_direct = request.kind == messages.CALL and not commands and not self.closed.is_set()
+        if is_direct and self._post.send(request.words[1], payload):
+            return 1
+        channel = messages.answers(self._names.keys, request.sender)
+        return await publish(self._session, self._names.keys, channel, payload, commands)
 
     async def _send_value(self, request: Request, value: Encoded, prefix: str, put: Put | None) -> None:
-        answer = self._message(messages.ANSWER, request.message.call, [self._session.local.host])
+        words = [self._session.local.host, self._post.address if request.message.words[1] else ""]
+        answer = self._message(messages.ANSWER, request.message.call, words)
         left = max(request.deadline - self._loop.time(), 0.0)
         payload, commands, is_shared = messages.packed(answer, value, prefix, left, put)
         if is_shared:
@@ -365,10 +377,9 @@ class Served(Listener):
 
     async def _send(self, request: Request, payload: bytes, commands: Sequence[Command] = ()) -> int:
         """Publish an answer; while the connection is down, try again until nothing waits for it any more."""
-        channel = messages.answers(self._names.keys, request.message.sender)
         while not request.is_left and self._loop.time() < request.deadline:
             try:
-                return await publish(self._session, self._names.keys, channel, payload, commands)
+                return await self._deliver(request.message, payload, commands)
             except (ReemError, RedisError, OSError) as error:
                 if isinstance(error, InterfaceClosed | Refused) and not isinstance(error, ServerNotReady):
                     raise
