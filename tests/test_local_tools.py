@@ -67,7 +67,7 @@ def test_doctor_says_why_there_is_none(monkeypatch):
 
 
 def test_top_says_of_late_and_not_for_ever():
-    window = Window(100)
+    window = Window()
     for moment, local, expected in [(100, False, "-"), (101, True, "yes"), (105, False, "yes"), (112, False, "-")]:
         window.add(Event(("cam",), 1, False, 1, moment, moment, "a", 1, local=local))
         assert ALL.cells(window)[-1] == expected

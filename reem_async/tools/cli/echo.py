@@ -7,19 +7,17 @@ import sys
 from collections.abc import Sequence
 from contextlib import aclosing, suppress
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import typer
 
 from reem_async.connection import RedisInterface
-from reem_async.errors import BadData, MissingKey, NotAllowed, PathRefused, RedisError, ReemError, WrongKind
+from reem_async.errors import MissingKey, RedisError, ReemError
 from reem_async.plan.paths import Path, Pattern, parse_pattern, spelled_out
 from reem_async.plan.placeholders import Unfetched
 from reem_async.plan.trees import MISSING, get, mapped
 from reem_async.pubsub.monitor import ANNOUNCED, Event
 from reem_async.store.catalog import outline
-from reem_async.store.reader import DocumentReader
 from reem_async.tools.cli.following import Ending, follow
 from reem_async.tools.cli.listing import as_data, describe, found
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
@@ -36,16 +34,11 @@ from reem_async.tools.cli.output import (
     typed,
     width,
 )
-from reem_async.tools.cli.running import for_users, run
+from reem_async.tools.cli.running import run
 
 
 def echo(
     patterns: Patterns = None,
-    fetch: Annotated[
-        bool,
-        typer.Option("--fetch", help="Fetch values too large for the notice: what is there now, which may be newer."),
-    ] = False,
-    full: Annotated[bool, typer.Option("--full", help="Do not cut lines to the width of the terminal.")] = False,
     count: Count = None,
     timeout: Timeout = None,
     as_json: AsJson = False,
@@ -57,14 +50,14 @@ def echo(
     A published update has one line, with the time of the publisher's clock. Plain writes are marked as stored, with
     the time at which they were found; several in a moment may share one line. Of an update of a whole dict, the part
     at the given path is printed. Values over 16 KB do not travel with the notice: size, type and shape are printed.
-    Lines that begin with # report lost and skipped updates; in JSON they are "missed", "gap" and "skipped". With
-    --fetch, a value that cannot be read has the reason in its place, in JSON as "error".
+    Lines that begin with # report lost and skipped updates; in JSON they are "missed", "gap" and "skipped". A terminal
+    cuts long lines, a pipe does not.
 
     Examples:
         reem echo
         reem echo processed_info 'robot.*.battery'
         reem echo set_point --count 1 --timeout 5 --json | jq .value
-        reem echo raw_image --fetch
+        reem echo raw_image | cat
     """
 
     async def work(interface: RedisInterface) -> int:
@@ -75,22 +68,13 @@ def echo(
         async def take(event: Event, ending: Ending) -> None:
             nonlocal skipped
             event = _narrowed(event, asked)
-            value, known, problem = event.value, event.value is not ANNOUNCED, ""
-            # Large values are announced without their bytes: what is read here may be newer than the update.
-            if fetch and not known:
-                try:
-                    value, known = await DocumentReader(interface.session, event.name).read(event.path[1:]), True
-                except MissingKey:
-                    value, known = "gone already", True
-                except (BadData, NotAllowed, PathRefused, WrongKind) as error:  # this one's: others can be read
-                    problem = for_users(error)
             # How many were skipped since the last line, of a counter that only grows.
             new, skipped = ending.skipped - skipped, ending.skipped
             if as_json:
-                emit_json(_for_programs(event, value if known else None, known, problem, new))
+                emit_json(_for_programs(event, new))
                 return
-            kind = "" if known or not event.size else await _kind(interface, event.path)
-            for line in _for_people(event, value, known, problem, new, kind, cut_lines=is_terminal() and not full):
+            kind = await _kind(interface, event.path) if event.value is ANNOUNCED and event.size else ""
+            for line in _for_people(event, new, kind):
                 emit(line)
             sys.stdout.flush()
 
@@ -138,7 +122,7 @@ def _narrowed(event: Event, asked: Sequence[Pattern]) -> Event:
     return dataclasses.replace(event, path=place, value=None if gone else value, deleted=gone)
 
 
-def _for_programs(event: Event, value: Any, known: bool, problem: str, skipped: int) -> dict[str, Any]:
+def _for_programs(event: Event, skipped: int) -> dict[str, Any]:
     entry = {
         "path": typed(event.path),
         "time": event.time,
@@ -149,18 +133,14 @@ def _for_programs(event: Event, value: Any, known: bool, problem: str, skipped: 
     }
     if event.deleted:
         entry["deleted"] = True
-    elif known:
-        entry["value"] = mapped(value, _unfetched_as_text) if event.stored else value
-    elif problem:
-        entry["error"] = problem
+    elif event.value is not ANNOUNCED:
+        entry["value"] = mapped(event.value, _unfetched_as_text) if event.stored else event.value
     if event.stored:
         entry["stored"] = True
     return entry | {"missed": event.missed, "gap": event.gap, "skipped": skipped}
 
 
-def _for_people(
-    event: Event, value: Any, known: bool, problem: str, skipped: int, kind: str, *, cut_lines: bool
-) -> list[str]:
+def _for_people(event: Event, skipped: int, kind: str) -> list[str]:
     lines = []
     if event.missed:
         # In the place where they were lost, so that the order of what is printed is the order of what happened.
@@ -172,18 +152,16 @@ def _for_people(
     moment, path = _moment(event.time), typed(event.path)
     if event.deleted:
         what = "deleted"
-    elif known:
-        what = _one_line(value)
-    elif problem:
-        what = f"<{clean(problem)}>"
+    elif event.value is not ANNOUNCED:
+        what = _one_line(event.value)
     else:
         what = f"<{kind}{size_text(event.size)}, not fetched>" if event.size else "<changed, not fetched>"
     # The path has at most half of the line, the value the rest.
-    if cut_lines:
+    if is_terminal():
         room = width() - len(moment) - 4 - 10 * event.stored
         path = cut(path, max(room // 2, 8))
         what = cut(what, max(room - len(path), 16))
-    colour = "red" if event.deleted else "" if known else "cyan"
+    colour = "red" if event.deleted else "cyan" if event.value is ANNOUNCED else ""
     mark = f"  {styled('(stored)', 'dim')}" if event.stored else ""
     lines.append(f"{styled(moment, 'dim')}  {styled(path, 'bold')}  {styled(what, colour) if colour else what}{mark}")
     return lines

@@ -7,7 +7,7 @@ import contextlib
 import sys
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from reem_async.concurrency.queues import Last
@@ -23,9 +23,6 @@ from reem_async.tools.cli.running import TIMED_OUT
 _WAITING = 100_000
 """Updates that wait for a slow terminal before the oldest are skipped."""
 
-_MOST_PATHS = 10_000
-"""Paths that are counted for the last line: a program may publish under ever new names."""
-
 _NEVER = float("inf")
 
 
@@ -38,15 +35,12 @@ class Ending:
     skipped: int = 0  # came faster than they were taken, and were dropped here
     gaps: int = 0  # the connection broke or a message was unreadable
     seconds: float = 0.0
-    paths: set[str] = field(default_factory=set)
     timed_out: bool = False
     stored: bool = False  # plain writes are followed, too
 
     def tell(self) -> int:
         """Say in one line how it went; return the exit code."""
-        more = " or more" * (len(self.paths) >= _MOST_PATHS)
-        where = f"{len(self.paths)}{more} path{'' if len(self.paths) == 1 else 's'}"
-        words = [f"{counted(self.taken, 'update')} of {where} in {self.seconds:.1f} s", f"{self.lost} lost"]
+        words = [f"{counted(self.taken, 'update')} in {self.seconds:.1f} s", f"{self.lost} lost"]
         if self.gaps:
             words.append(f"{self.gaps} gaps of unknown length")
         if self.skipped:
@@ -87,7 +81,10 @@ async def follow(
                 event = await _next(monitor, min(end, next_tick))
                 ending.seconds, ending.skipped = time.monotonic() - start, monitor.dropped
                 if event is not None:
-                    _enter(event, ending)
+                    ending.taken += 1
+                    ending.lost += event.missed
+                    # A loss whose number is known is counted as lost, not as a gap as well.
+                    ending.gaps += event.gap and not event.missed
                     result = take(event, ending)
                     if result is not None:
                         await result
@@ -149,15 +146,6 @@ async def progress(
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
         write_over("")
-
-
-def _enter(event: Event, ending: Ending) -> None:
-    ending.taken += 1
-    ending.lost += event.missed
-    # A loss whose number is known is counted as lost, not as a gap as well.
-    ending.gaps += event.gap and not event.missed
-    if len(ending.paths) < _MOST_PATHS:
-        ending.paths.add(event.shown)
 
 
 async def _next(monitor: Monitor, when: float) -> Event | None:

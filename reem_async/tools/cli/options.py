@@ -145,9 +145,6 @@ Timeout = Annotated[
         help="End after so long; exit code 4 if there were fewer than --count updates by then, or none.",
     ),
 ]
-WindowLength = Annotated[
-    int, typer.Option("--window", "-w", min=2, max=1_000_000, metavar="N", help="Of how many updates of a path.")
-]
 
 
 def named_ships(names: list[str] | None) -> list[Any]:

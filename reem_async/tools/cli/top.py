@@ -14,9 +14,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from statistics import fmean, pstdev
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
-import typer
 from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
@@ -25,8 +24,8 @@ from rich.text import Text
 from reem_async.connection import RedisInterface
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.cli.following import Ending, follow
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url, WindowLength
-from reem_async.tools.cli.output import cut, emit, emit_json, is_terminal, note, size_text, typed
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
+from reem_async.tools.cli.output import emit, emit_json, is_terminal, note, size_text, typed
 from reem_async.tools.cli.running import run
 
 _WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
@@ -35,19 +34,17 @@ _MOST_PATHS = 10_000  # that are kept: a program may publish under ever new name
 _MOST_PUBLISHERS = 16  # of one path that are remembered; the one that was silent longest goes first
 _PUBLISHER_SECONDS = 10.0  # of silence, while others publish, after which a publisher has ended
 _STALE_SECONDS = 2.0  # of silence after which a row is dimmed
-_SHORTEST_PATH = 12  # characters of a path that are kept before columns are left out for it
-_BETWEEN = 2  # blanks between two columns
 
 
 class Window:
-    """The last `length` updates of one path, and how many there were and were lost in all."""
+    """The last updates of one path, and how many there were and were lost in all."""
 
-    def __init__(self, length: int) -> None:
+    def __init__(self) -> None:
         self.total = 0
         self.lost = 0
-        self.received: deque[float] = deque(maxlen=length)
-        self.delays: deque[float] = deque(maxlen=length)
-        self.sizes: deque[int] = deque(maxlen=length)
+        self.received: deque[float] = deque(maxlen=_WINDOW)
+        self.delays: deque[float] = deque(maxlen=_WINDOW)
+        self.sizes: deque[int] = deque(maxlen=_WINDOW)
         self._publishers: dict[str, list[float]] = {}  # the times of the first and the last update of each
         self._last_local = 0.0
 
@@ -100,21 +97,16 @@ class Window:
         return [later - earlier for earlier, later in pairwise(self.received)]
 
 
-class Spread(NamedTuple):
-    mean: float
-    min: float
-    max: float
-    std: float
-
-
-def spread(values: Sequence[float]) -> Spread | None:
-    return Spread(fmean(values), min(values), max(values), pstdev(values)) if values else None
+def spread(values: Sequence[float]) -> dict[str, float] | None:
+    if not values:
+        return None
+    return {"mean": fmean(values), "min": min(values), "max": max(values), "std": pstdev(values)}
 
 
 class View(NamedTuple):
     """What one of the commands shows of a window: columns after the path, the same for programs, and a remark."""
 
-    headers: tuple[str, ...]  # the last ones may be left out on a narrow terminal
+    headers: tuple[str, ...]
     cells: Callable[[Window], tuple[str, ...]]
     data: Callable[[Window], dict[str, Any]]
     remark: str = ""
@@ -136,12 +128,7 @@ def _bandwidth(window: Window) -> str:
 
 def _spread_cells(values: Sequence[float], text: Callable[[float], str]) -> tuple[str, ...]:
     it = spread(values)
-    return tuple(map(text, it)) if it else ("-",) * 4
-
-
-def _spread_data(values: Sequence[float]) -> dict[str, float] | None:
-    it = spread(values)
-    return it._asdict() if it else None
+    return tuple(map(text, it.values())) if it else ("-",) * 4
 
 
 def _mean_delay(window: Window) -> float:
@@ -151,18 +138,18 @@ def _mean_delay(window: Window) -> float:
 RATE = View(
     ("Hz", "mean ms", "min ms", "max ms", "std ms"),
     lambda window: (_hertz(window), *_spread_cells(window.intervals(), _ms)),
-    lambda window: {"hz": window.rate(), "interval_s": _spread_data(window.intervals())},
+    lambda window: {"hz": window.rate(), "interval_s": spread(window.intervals())},
 )
 BANDWIDTH = View(
     ("bytes/s", "mean", "min", "max", "std"),
     lambda window: (_bandwidth(window), *_spread_cells(window.sizes, size_text)),
-    lambda window: {"bytes_per_s": window.bandwidth(), "bytes": _spread_data(window.sizes)},
+    lambda window: {"bytes_per_s": window.bandwidth(), "bytes": spread(window.sizes)},
     "of values as they are published; += and append() do not say their size and count as 0 bytes",
 )
 DELAY = View(
     ("mean ms", "min ms", "max ms", "std ms"),
     lambda window: _spread_cells(window.delays, _ms),
-    lambda window: {"delay_s": _spread_data(window.delays)},
+    lambda window: {"delay_s": spread(window.delays)},
     "received here minus published there: if these are two machines, the difference of their clocks is in it",
 )
 ALL = View(
@@ -191,17 +178,16 @@ ALL = View(
 class Board:
     """The windows of all paths that were updated; in the view of `reem top`, of all top-level keys."""
 
-    def __init__(self, view: View, length: int = _WINDOW) -> None:
+    def __init__(self, view: View) -> None:
         self.view = view
         self.windows: dict[str, Window] = {}
-        self._length = length
         self._reported: dict[str, int] = {}
 
     def take(self, event: Event, _: Ending | None = None) -> None:
         path = event.path[:1] if self.view is ALL else event.path
         shown = typed(path) + " (stored)" * event.stored
         if shown in self.windows or len(self.windows) < _MOST_PATHS:
-            self.windows.setdefault(shown, Window(self._length)).add(event)
+            self.windows.setdefault(shown, Window()).add(event)
 
     def rows(self) -> list[tuple[str, Window]]:
         return sorted(self.windows.items(), key=lambda row: row[0])
@@ -213,11 +199,12 @@ class Board:
                 continue
             self._reported[path] = window.total
             if as_json:
-                numbers = {"updates": window.total, "window": len(window.received), "lost": window.lost}
+                numbers = {"updates": window.total, "lost": window.lost}
                 emit_json({"path": path, **self.view.data(window), **numbers, "time": time.time(), "final": final})
             else:
-                cells = zip(_titles(self.view), _cells(self.view, window), strict=True)
-                emit(f"{path}: " + ", ".join([f"{title} {cell}" for title, cell in cells]))
+                cells = zip(self.view.headers, self.view.cells(window), strict=True)
+                texts = [f"{title} {cell}" for title, cell in cells]
+                emit(f"{path}: {', '.join(texts)}, updates {window.total}, lost {window.lost}")
         sys.stdout.flush()
 
     def doubled(self) -> dict[str, int]:
@@ -231,20 +218,12 @@ class Board:
         ]
 
 
-def _titles(view: View) -> tuple[str, ...]:
-    return (*view.headers, "updates", "lost")
-
-
-def _cells(view: View, window: Window) -> tuple[str, ...]:
-    return (*view.cells(window), str(window.total), str(window.lost))
-
-
 def table(board: Board, waiting: str, width: int, height: int) -> Group:
     """Return the board as a table that fits into a terminal of this size; without updates, the line `waiting`."""
     if not board.windows:
         return Group(Text(f"{waiting} (q or Ctrl-C ends)", style="dim"))
     rows = board.rows()
-    notes = [_line(line, "dim") for line in _wrapped(board.view.remark, width, height // 4)]
+    notes = [_line(line, "dim") for line in textwrap.wrap(board.view.remark, width)]
     if board.view is ALL and (doubled := board.doubled()):
         notes.insert(0, _line(f"! several publishers, each overwrites the others: {', '.join(doubled)}", "yellow"))
     # One line is the table's head, and one is left for the cursor. What lies lower is cut off.
@@ -253,41 +232,20 @@ def table(board: Board, waiting: str, width: int, height: int) -> Group:
         shown = max(room - 1, 1)
         notes.insert(0, _line(f"… {len(rows) - shown} more paths; give a pattern to see them", "dim"))
         rows = rows[:shown]
-    titles = ("path", *_titles(board.view))
-    cells = [(path, *_cells(board.view, window)) for path, window in rows]
-    kept, room = _fitting([titles, *cells], width)
-    drawn = Table(box=None, pad_edge=False, header_style="bold", padding=(0, _BETWEEN, 0, 0))
-    drawn.add_column(titles[0], no_wrap=True, style="bold")
-    for place in kept:
-        drawn.add_column(titles[place], justify="right", no_wrap=True)
-    for (_, window), row in zip(rows, cells, strict=True):
-        texts = [Text(cut(row[0], room)), *(Text(row[place]) for place in kept)]
-        if window.lost:
-            texts[-1].stylize("red")
-        if board.view is ALL and window.publishers > 1:
-            texts[0].stylize("yellow")
-        drawn.add_row(*texts, style="dim" if window.age > _STALE_SECONDS else "")
+    drawn = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    drawn.add_column("path", style="bold")  # the one column that a narrow terminal makes shorter
+    for title in (*board.view.headers, "lost"):
+        drawn.add_column(title, justify="right", no_wrap=True)
+    for path, window in rows:
+        doubled = board.view is ALL and window.publishers > 1
+        name = Text(path, "yellow" if doubled else "", no_wrap=True, overflow="ellipsis")
+        lost = Text(str(window.lost), "red" if window.lost else "")
+        drawn.add_row(name, *board.view.cells(window), lost, style="dim" if window.age > _STALE_SECONDS else "")
     return Group(drawn, *notes)
-
-
-def _wrapped(remark: str, width: int, most: int) -> list[str]:
-    lines = textwrap.wrap(remark, max(width, 20))
-    return lines if len(lines) <= most else [remark]  # cut: the rows come first
 
 
 def _line(text: str, style: str) -> Text:
     return Text(text, style=style, no_wrap=True, overflow="ellipsis")
-
-
-def _fitting(rows: list[tuple[str, ...]], width: int) -> tuple[list[int], int]:
-    """Return which columns there is room for beside the path, and the width of the path."""
-    longest, *widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    kept = list(range(1, len(widths) + 1))
-    while True:
-        room = width - sum([widths[place - 1] + _BETWEEN for place in kept])
-        if room >= min(longest, _SHORTEST_PATH) or len(kept) <= 2:
-            return kept, max(room, 1)
-        del kept[-2]  # the last one, how many were lost, stays
 
 
 @contextmanager
@@ -325,34 +283,20 @@ def _ended_by_q() -> Iterator[None]:
         termios.tcsetattr(fd, termios.TCSADRAIN, before)
 
 
-Every = Annotated[
-    float | None,
-    typer.Option(
-        "--every",
-        min=0.1,
-        metavar="SECONDS",
-        show_default="1; with --timeout or --count one report, at the end",
-        help="Time between reports where the output is no terminal.",
-    ),
-]
-
-
 def _command(name: str, view: View, text: str, *, stored: bool = False) -> Callable[..., None]:
     """Return the command that shows a view of updates, also of `stored` changes; `text` is its help."""
 
     def command(
         patterns: Patterns = None,
-        window: WindowLength = _WINDOW,
         count: Count = None,
         timeout: Timeout = None,
-        every: Every = None,
         as_json: AsJson = False,
         url: Url = DEFAULT_URL,
         namespace: Namespace = "",
     ) -> None:
-        board, wanted = Board(view, window), patterns or ()
+        board, wanted = Board(view), patterns or ()
         # With an end (--timeout, --count) a script wants one report; without one, a report each second.
-        period = 1.0 if every is None and timeout is None and count is None else every
+        period = 1.0 if timeout is None and count is None else None
 
         async def followed(interface: RedisInterface, period: float | None, tick: Callable[[Ending], None]) -> Ending:
             return await follow(
@@ -408,7 +352,7 @@ counts updates that did not arrive here. Plain writes have "(stored)" behind the
 
 Examples:
     reem hz
-    reem hz raw_image --window 100
+    reem hz raw_image set_point
     reem hz set_point --timeout 5 --json
 """,
     stored=True,
