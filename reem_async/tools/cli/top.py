@@ -237,8 +237,8 @@ def table(board: Board, waiting: str, width: int, height: int) -> Group:
     for title in (*board.view.headers, "lost"):
         drawn.add_column(title, justify="right", no_wrap=True)
     for path, window in rows:
-        doubled = board.view is ALL and window.publishers > 1
-        name = Text(path, "yellow" if doubled else "", no_wrap=True, overflow="ellipsis")
+        is_doubled = board.view is ALL and window.publishers > 1
+        name = Text(path, "yellow" if is_doubled else "", no_wrap=True, overflow="ellipsis")
         lost = Text(str(window.lost), "red" if window.lost else "")
         drawn.add_row(name, *board.view.cells(window), lost, style="dim" if window.age > _STALE_SECONDS else "")
     return Group(drawn, *notes)
