@@ -308,6 +308,8 @@ def test_an_outage_leaves_the_value_and_a_server_without_data_gets_the_default(k
         it, seen = Declared(front), []
         kp, other = it.kp(on_change=seen.append), it(["deep", "er"], "n", 3)
         it.front.wait(kp.write(7.0))
+        if keep:  # as if another program had stored the value again, after a restart without data
+            it.front.wait(it.front.at((SPECIFICATIONS,)).delete())
         server.kill()
         it.front.until(lambda: it.front.interface.state != "connected")
         assert (kp.value, other.value) == (7.0, 3)

@@ -195,6 +195,7 @@ class ParameterGroup:
         self._link.on_state = self._take
         self._lock = asyncio.Lock()  # one declaration at a time
         self._restoring: asyncio.Task[Any] | None = None
+        self._may_be_lost = False  # there was an outage: the server may have forgotten what was declared
 
     async def declare(self, declaration: Declaration) -> LiveParameter:
         """Return the parameter, followed, and stored if it was not; raises BadValue if it was declared differently."""
@@ -238,9 +239,13 @@ class ParameterGroup:
 
     def _take(self, tree: Any) -> None:
         follower = self._link.follower
-        if follower is not None and not follower.down:  # in an outage the values stay
-            for live in tuple(self._parameters.values()):
-                live.take(get(tree, live.path[1:]))
+        if follower is None or follower.down:  # in an outage the values stay
+            self._may_be_lost = any(live.begun for live in self._parameters.values())
+            return
+        for live in tuple(self._parameters.values()):
+            live.take(get(tree, live.path[1:]))
+        if self._may_be_lost:
+            self._restore_soon()
 
     @property
     def is_followed(self) -> bool:
@@ -279,14 +284,16 @@ class ParameterGroup:
             else:
                 return
 
-    async def _describe(self, live: LiveParameter) -> None:
-        """Store the specification for tools."""
+    async def _describe(self, live: LiveParameter, *, again: bool = False) -> None:
+        """Store the specification for tools; `again`, only if there is none."""
         place, session = (live.name,), self.session
         try:
             found = await DocumentReader(session, SPECIFICATIONS).read(place)
         except MissingKey:
             await session.run(make_parents(session.keys(SPECIFICATIONS), place))
         else:
+            if again:
+                return
             with contextlib.suppress(BadData):
                 if from_stored(live.name, found) == live.specification:
                     return
@@ -305,16 +312,21 @@ class ParameterGroup:
             live.name,
             default,
         )
+        self._restore_soon()
+
+    def _restore_soon(self) -> None:
         if self._restoring is None or self._restoring.done():
             self._restoring = manager_of(self.session).tasks.start(self._restore(), f"reem restore {self._keys.name}")
 
     async def _restore(self) -> None:
-        """Store defaults until none is gone, at most once a second: another program may delete them again and again."""
-        while gone := [live for live in self._parameters.values() if live.gone and live.begun]:
-            for live in gone:
+        """Store what is gone until nothing is, at most once a second: another program may delete it again and again."""
+        while self._may_be_lost or any(live.gone and live.begun for live in self._parameters.values()):
+            self._may_be_lost = False
+            for live in [each for each in self._parameters.values() if each.begun]:
                 try:
-                    await self._store_default(live)
-                    await self._describe(live)
+                    if live.gone:
+                        await self._store_default(live)
+                    await self._describe(live, again=True)
                 except (ReemError, RedisError, OSError) as error:
                     live.report(f"{live.name}: its default cannot be stored: {error}")
             await asyncio.sleep(_PAUSE)
