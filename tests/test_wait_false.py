@@ -96,9 +96,11 @@ def test_all_values_arrive_in_order_as_they_were_in_the_call(publisher, kvs, key
         front.update([key()], {"x": 1, "y": b"2"})
         front.wait(front.at([key(), "l"]).append(4))  # depends on what is stored, so it waits for what is queued
         assert_same(kvs[key()].read(), {"n": 4, "l": [2, 3, 4], "image": np.full((300, 400), 4.0), "x": 1, "y": b"2"})
-        numbers, images = [], []
+        numbers, images, lateness = [], [], set()
         while (update := next(watch)).path != f"{key()}.l":
             assert not update.gap
+            if update.origin == "published":
+                lateness.add(update.late)
             if update.path.endswith(".n"):
                 numbers.append(update.value)
             elif update.path.endswith(".image"):
@@ -106,6 +108,7 @@ def test_all_values_arrive_in_order_as_they_were_in_the_call(publisher, kvs, key
                 assert update.value.min() == update.value.max() >= 0
         assert numbers == [*range(5)] * 10
         assert images
+        assert 0 in lateness  # without an outage nothing is late
     assert (front.kvs.dropped, front.kvs.waiting) == (0, 0)
 
 

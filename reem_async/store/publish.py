@@ -34,7 +34,7 @@ _ANSWERS, _ANSWER = 5, 0.001
 """How often an early publisher looks for the answers of new subscribers on this host, and seconds between two looks."""
 
 _PROMPT = 0.01
-"""Seconds after the call up to which a notice says what the early one said: after that, how late it is matters."""
+"""Seconds between a call and its sending from which a notice says that it is late; `wait=False` takes less."""
 
 _Stamp = tuple[str, int]  # publisher and number of an update
 
@@ -164,7 +164,7 @@ class UpdateAnnouncement(Announcement):
         if self.lease is not None:
             return self._time or time.time(), self.lease.extras
         late = 0.0 if self._began is None else time.monotonic() - self._began
-        return self._time or time.time(), Extras(late=late) if late else NO_EXTRAS
+        return self._time or time.time(), Extras(late=late) if late >= _PROMPT else NO_EXTRAS
 
 
 class ValueAnnouncement(UpdateAnnouncement):
@@ -264,7 +264,7 @@ class ValueAnnouncement(UpdateAnnouncement):
 
     def _payload(self, stamp: _Stamp, path: Path) -> bytes:
         moment, extras = self._when()
-        if self._early is not None and self._early[0] == stamp and extras.late < _PROMPT:
+        if self._early is not None and self._early[0] == stamp and not extras.late:
             return self._early[1]
         if self._slot is not None:
             return in_slot(*stamp, moment, path, self._slot, self._text, self._attachments, extras)
