@@ -273,12 +273,14 @@ async def test_without_a_descriptor_updates_arrive_through_the_server(server_url
         assert await pair.go_round()
 
 
-async def test_programs_that_cannot_meet_get_updates_through_the_server(server_url, key, folder, monkeypatch):
+async def test_programs_that_cannot_meet_get_updates_through_the_server(server_url, key, folder, monkeypatch, caplog):
     """As on both sides of a container's boundary, or if another user can enter the folder."""
     os.mkdir(folder)
     async with Pair(server_url, key("cam")) as pair:
         os.chmod(folder, 0o755)
         assert not await pair.go_round()
+        assert not await pair.go_round()
+        assert caplog.text.count(f"run: chmod 700 {folder}") == 1
         os.chmod(folder, 0o700)
     pair = Pair(server_url, key("arm"))
     await pair.publish()

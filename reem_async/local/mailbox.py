@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import logging
 import os
 import re
 import secrets
@@ -28,6 +29,8 @@ from typing import NamedTuple
 from ..concurrency.locks import Inherited
 from ..concurrency.wakeup import Descriptor
 from .host import host
+
+logger = logging.getLogger("reem.publish")
 
 JOINED, FOLLOWS, UPDATE = b"J", b"F", b"U"
 PUBLISHER, SUBSCRIBER = "p", "s"
@@ -140,7 +143,7 @@ def _folder() -> str:
         os.mkdir(folder, 0o700)
     found = os.lstat(folder)
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
-        raise OSError(f"{folder} can be entered by other users")
+        raise OSError(f"{folder} is not a folder of this user alone; run: chmod 700 {folder}")
     return folder
 
 
@@ -177,6 +180,7 @@ class Subscribers:
 
     def __init__(self) -> None:
         self._mailbox: Mailbox | None = None
+        self._reported = ""  # the last warning
         # Until when the answer of each address holds; of the channels that were asked for, the latest last
         self._known: collections.OrderedDict[bytes, dict[str, float]] = collections.OrderedDict()
 
@@ -185,7 +189,10 @@ class Subscribers:
         if self._mailbox is None or not self._mailbox.is_there:  # a forked child needs its own
             try:
                 self._mailbox = Mailbox(PUBLISHER)
-            except OSError:
+            except OSError as error:
+                if str(error) != self._reported:
+                    self._reported = str(error)
+                    logger.warning("local='early': updates go through the server: %s", error)
                 return b""
         self._known.setdefault(channel, {})
         while len(self._known) > _CHANNELS:
