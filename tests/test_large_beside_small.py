@@ -1,50 +1,22 @@
 """What a large array does for small calls beside it, and what is too large for the server."""
 
 import asyncio
-import contextlib
 import itertools
 import socket
 import sys
-import threading
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 import redis
-from conftest import assert_same, eventually, url_of_user
+from conftest import assert_same, url_of_user
 
-import reem
 import reem_async
 from reem_async.errors import BadValue
 from reem_async.plan.sizes import USUAL, Limits, check_sizes, limits
 from reem_async.server import EmbeddedServer
-from reem_async.transport import blocking
 from reem_async.transport.wire import BUFFER
-
-
-@pytest.fixture
-def by_tcp(server):
-    """An interface of the blocking front."""
-    with contextlib.closing(reem.RedisInterface("127.0.0.1", port=server.port)) as interface:
-        yield interface
-
-
-@pytest.fixture
-def naps(monkeypatch):
-    """The naps that were taken, in seconds."""
-    taken, sleep = [], blocking.time.sleep
-
-    class Clock:
-        monotonic = staticmethod(blocking.time.monotonic)
-
-        @staticmethod
-        def sleep(seconds):
-            taken.append(seconds)
-            sleep(seconds)
-
-    monkeypatch.setattr(blocking, "time", Clock)
-    return taken
 
 
 async def test_a_large_array_waits_for_small_calls_that_are_under_way(ainterface, akvs, key, monkeypatch):
@@ -95,49 +67,6 @@ async def test_what_is_stored_is_of_one_instant_though_another_task_comes_first(
     stored = await akvs[name].read()
     assert set(stored["image"].tolist()) == {stored["stamp"]}
     assert stored["stamp"] > 0  # the write has waited
-
-
-def test_a_large_array_of_one_thread_waits_for_small_calls_of_others(server, by_tcp, naps):
-    """Only while one is under way, and not for ever."""
-    kvs, image = reem.KeyValueStore(by_tcp), np.arange(1_000_000.0)
-    kvs["camera"] = {"image": image}
-    assert not naps
-    with contextlib.closing(redis.Redis(port=server.port)) as client:
-        client.client_pause(60_000, all=False)
-        small = threading.Thread(target=kvs["setpoint"].write, args=(1.0,))
-        small.start()
-        eventually(lambda: client.info("clients")["paused_actions"] == "write" and len(_under_way(by_tcp)) == 1)
-        large = threading.Thread(target=kvs["camera"].write, args=({"image": image + 1},))
-        large.start()
-        eventually(lambda: len(naps) == 16)
-        client.client_unpause()
-    for thread in (small, large):
-        thread.join(10)
-        assert not thread.is_alive()
-    assert kvs["setpoint"].read() == 1.0
-    assert_same(kvs["camera"]["image"].read(), image + 1)
-    assert len(naps) == 16
-    assert not _under_way(by_tcp)
-
-
-def test_calls_that_failed_are_not_under_way(server, by_tcp, naps):
-    """Refused by the server, broken, or with a section that raised."""
-    kvs, image = reem.KeyValueStore(by_tcp), np.arange(100_000.0)
-    kvs["camera"] = {"image": image}
-    with pytest.raises(reem.errors.MissingKey):
-        kvs["camera"]["missing"].read()
-    with pytest.raises(ZeroDivisionError), kvs["camera"].edit() as draft:
-        draft["n"] = 1 / 0
-    with contextlib.closing(redis.Redis(port=server.port)) as client:
-        client.client_kill_filter(_type="normal", skipme=True)
-    assert not _under_way(by_tcp)
-    kvs["camera"] = {"image": image}
-    assert not naps
-
-
-def _under_way(interface):
-    lines = list(interface._direct.session.transport._lines)
-    return [line for line in lines if line is not None and line.waiting]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="each system has its own limits")

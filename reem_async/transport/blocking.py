@@ -33,17 +33,13 @@ from .text import PROBE, HeldText, Text, is_plain, lists_json
 
 _RECORD = 1 << 14  # bytes in one record of TLS, at most
 _SLICE = 1 << 19  # bytes of a large value that are sent before giving way
-_SMALL_SLICE = 1 << 18
-"""The same once another call was seen under way: the server reads on for as long as it finds something."""
-_NAP, _NAPS = 2e-5, 16
-"""Seconds for which a large value waits at a time for calls under way, and how often: there may always be some."""
 
 
 class _Line:
     """One blocking connection, used by one caller at a time."""
 
-    def __init__(self, options: Options, states: States, lines: WeakList[_Line]) -> None:
-        self._states, self._lines = states, lines
+    def __init__(self, options: Options, states: States) -> None:
+        self._states = states
         self._is_kept = False
         self._connection = options.blocking_connection()
         try:
@@ -72,7 +68,6 @@ class _Line:
         self._large: LargeReader | None = None
         self.broken = False  # it is not to be used again; so it is while a call is under way
         self.retired = False  # it is closed when it is given back
-        self.waiting = False  # a call is under way that has nothing large to send
         known = lists_json(self._connection.handshake_metadata)
         try:
             self.introduction, *probed = self.exchange([INFO_SERVER] if known else [INFO_SERVER, PROBE])
@@ -80,7 +75,6 @@ class _Line:
             raise options.unanswered(error) from error
         self.plain = bool(probed) and is_plain(probed[0])
         self._states.opened(options.address, server_run_id(self.introduction))
-        lines.add(self)
 
     def _set_limit(self, limit: float) -> None:
         """Have Python watch the time: the kernel's own limits restart after each signal."""
@@ -97,7 +91,6 @@ class _Line:
         try:
             receive = self._socket.recv_into
             if len(pieces) == 1 and len(piece := pieces[0]) < SLOW:
-                self.waiting = True
                 if limit != self._limit:
                     self._set_limit(limit)
                 try:
@@ -112,7 +105,7 @@ class _Line:
             if bulk and self._large is None:
                 self._large = LargeReader(self._largest)
             replies = self._replies((bulk and self._large) or self._small, len(commands), receive)
-            self.broken = self.waiting = False
+            self.broken = False
             return replies
         except (BlockingIOError, TimeoutError):
             raise self.lost(
@@ -148,11 +141,11 @@ class _Line:
                 return replies
 
     def _send_large(self, pieces: list[Piece], limit: float) -> None:
-        """Send large values, letting small calls of other threads pass; bytes that move restart the limit."""
+        """Send large values, giving way to other threads in between; bytes that move restart the limit."""
         if limit / LOOKS != self._limit:
             self._set_limit(limit / LOOKS)
         self._moved, self._left = time.monotonic(), 0
-        step, naps = _RECORD if self._tls else _SLICE, _NAPS  # over TLS, nothing is said of a part that was sent
+        step = _RECORD if self._tls else _SLICE  # over TLS, nothing is said of a part that was sent
         for piece in pieces:
             view, sent = memoryview(piece), 0
             while sent < len(view):
@@ -162,10 +155,6 @@ class _Line:
                 except (BlockingIOError, TimeoutError):
                     self._check_moved(limit)
                 give_way()
-                while naps and any(line.waiting for line in self._lines):  # small calls of other threads
-                    step = min(step, _SMALL_SLICE)
-                    naps -= 1
-                    time.sleep(_NAP)
 
     def _receive_patiently(self, limit: float, target: memoryview) -> int:
         """Receive after a large value was sent: it may go on arriving long after the first replies are here."""
@@ -199,7 +188,7 @@ class _Line:
         self.close()
 
     def close(self) -> None:
-        self.broken, self.waiting = True, False
+        self.broken = True
         self._connection.disconnect()
         self._out.close()
 
@@ -270,7 +259,9 @@ class BlockingTransport(OneServer):
         return await (self._connected(self._options) if nearby is None else nearby.connected(self._connected))
 
     async def _connected(self, options: Options) -> _Line:
-        return _Line(options, self.states, self._lines)
+        line = _Line(options, self.states)
+        self._lines.add(line)
+        return line
 
     def _give(self, line: _Line) -> None:
         if line.broken:
