@@ -288,12 +288,12 @@ class TestPort:
         with socket.create_server(("127.0.0.1", 0)) as other:
             taken = other.getsockname()[1]
             ports = [taken, taken]
-            look = server_module._bindable
-            monkeypatch.setattr(server_module, "_bindable", lambda port: ports.pop() if ports else look(port))
+            look = server_module.bindable
+            monkeypatch.setattr(server_module, "bindable", lambda port: ports.pop() if ports else look(port))
             with EmbeddedServer() as server:
                 assert server.port != taken
                 assert ports == []
-            monkeypatch.setattr(server_module, "_bindable", lambda port: port)
+            monkeypatch.setattr(server_module, "bindable", lambda port: port)
             with pytest.raises(ServerFailed, match=f"port {taken} .* taken"):
                 EmbeddedServer(port=taken).start()
 

@@ -53,7 +53,9 @@ class TextDocument:
         path = _text_of(words[0]) if words else "$"
         if name in _WRITES:
             return _WRITES[name](self, path, words[1:])
-        return _READS[name](self, path, not words)
+        if name in _MEASURES:
+            return self._measured(name, path)
+        return self.get(path, not words) if name == "JSON.GET" else self.type(path, not words)
 
     @property
     def exists(self) -> bool:
@@ -83,10 +85,11 @@ class TextDocument:
     def _at(self, path: str) -> list[Place]:
         return places(self._tree(), steps_of(path))
 
-    def _each(self, path: str, measure: Callable[[Any], Any], absent: str = _ABSENT) -> list[Any]:
+    def _measured(self, name: str, path: str) -> list[Any]:
         if not self.exists:
-            raise Refusal(absent)
-        return [measure(place.value) for place in self._at(path)]
+            raise Refusal(f"ERR Path '{path}' does not exist or not an object" if name == "JSON.OBJLEN" else _ABSENT)
+        kind, measure = _MEASURES[name]
+        return [measure(place.value) if type(place.value) is kind else None for place in self._at(path)]
 
     def get(self, path: str, bare: bool) -> bytes | None:
         """Return the JSON text of the values at a path, in a list; of the root alone if `bare`."""
@@ -103,19 +106,6 @@ class TextDocument:
             return [None]
         names = [_type(place.value) for place in self._at(path)]
         return names if bare else [names]
-
-    def keys(self, path: str, bare: bool) -> Any:
-        return self._each(path, lambda value: [key.encode() for key in value] if type(value) is dict else None)
-
-    def entries(self, path: str, bare: bool) -> Any:
-        absent = f"ERR Path '{path}' does not exist or not an object"
-        return self._each(path, lambda value: len(value) if type(value) is dict else None, absent)
-
-    def items(self, path: str, bare: bool) -> Any:
-        return self._each(path, lambda value: len(value) if type(value) is list else None)
-
-    def length(self, path: str, bare: bool) -> Any:
-        return self._each(path, lambda value: len(value.encode()) if type(value) is str else None)
 
     # Writing.
 
@@ -261,13 +251,11 @@ _TYPES: dict[type, bytes] = {
     type(None): b"null",
 }
 
-_READS: dict[str, Callable[[TextDocument, str, bool], Any]] = {
-    "JSON.GET": TextDocument.get,
-    "JSON.TYPE": TextDocument.type,
-    "JSON.OBJKEYS": TextDocument.keys,
-    "JSON.OBJLEN": TextDocument.entries,
-    "JSON.ARRLEN": TextDocument.items,
-    "JSON.STRLEN": TextDocument.length,
+_MEASURES: dict[str, tuple[type, Callable[[Any], Any]]] = {
+    "JSON.OBJKEYS": (dict, lambda value: [key.encode() for key in value]),
+    "JSON.OBJLEN": (dict, len),
+    "JSON.ARRLEN": (list, len),
+    "JSON.STRLEN": (str, lambda value: len(value.encode())),
 }
 _WRITES: dict[str, Callable[[TextDocument, str, Sequence[Any]], Any]] = {
     "JSON.SET": TextDocument.set,
@@ -276,5 +264,5 @@ _WRITES: dict[str, Callable[[TextDocument, str, Sequence[Any]], Any]] = {
     "JSON.NUMINCRBY": TextDocument.add,
     "JSON.NUMMULTBY": TextDocument.multiply,
 }
-READS, WRITES = frozenset(_READS), frozenset(_WRITES)
+READS, WRITES = frozenset(["JSON.GET", "JSON.TYPE", *_MEASURES]), frozenset(_WRITES)
 """The names of the commands that read a document, and of those that change it."""

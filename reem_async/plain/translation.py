@@ -43,7 +43,7 @@ from .documents import MARK, READS, WRITES, TextDocument, is_document, stored
 def shortcut(commands: Sequence[Command], known: Known) -> list[Command] | None:
     """Return the commands for the most frequent batches, a small read or a whole small document; None for others.
 
-    `translated` would send the same, but takes longer; `finished` converts the replies.
+    `translated` would send the same, but takes longer; `finished` makes the answers of the replies.
     """
     first = commands[0]
     if first[0] == "JSON.GET":

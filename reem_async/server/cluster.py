@@ -12,7 +12,7 @@ from contextlib import suppress
 from functools import partial
 
 from ..errors import BadValue, ServerFailed
-from .process import HOST, PortTaken, ServerProcess, ServerProgram, packed
+from .process import HOST, PortTaken, ServerProcess, ServerProgram, bindable, packed
 from .programs import find_program
 from .startable import Startable
 
@@ -154,9 +154,8 @@ class EmbeddedCluster(Startable):
 
     def _node(self, program: ServerProgram) -> NodeProcess:
         for attempt in range(ATTEMPTS):
-            port, bus = _free_ports(2)
             try:
-                return NodeProcess(program, port, bus, self._node_timeout)
+                return NodeProcess(program, bindable(0), bindable(0), self._node_timeout)
             except PortTaken:
                 if attempt == ATTEMPTS - 1:
                     raise
@@ -213,15 +212,3 @@ def _until(deadline: float, condition: Callable[[], bool]) -> None:
         if time.monotonic() > deadline:
             raise ServerFailed(f"the nodes of the cluster did not find each other within {JOIN_SECONDS:g} s")
         time.sleep(0.01)
-
-
-def _free_ports(count: int) -> list[int]:
-    """Return ports that are free now."""
-    with_sockets = [socket.socket() for _ in range(count)]
-    try:
-        for each in with_sockets:
-            each.bind((HOST, 0))
-        return [each.getsockname()[1] for each in with_sockets]
-    finally:
-        for each in with_sockets:
-            each.close()

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import shutil
-import socket
 import weakref
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from reem_async.errors import BadValue, Misuse, ServerFailed
-from reem_async.server.process import HOST, PortTaken, ServerProcess, has_data
+from reem_async.errors import BadValue, Misuse
+from reem_async.server.process import HOST, PortTaken, ServerProcess, bindable, has_data
 from reem_async.server.programs import find_program
 from reem_async.server.startable import Startable
 
@@ -209,7 +207,7 @@ class EmbeddedServer(Startable):
         attempts = 1 if self._wanted_port else ATTEMPTS
         while True:
             attempts -= 1
-            port = _bindable(self._wanted_port)
+            port = bindable(self._wanted_port)
             try:
                 return ServerProcess(
                     program,
@@ -231,16 +229,3 @@ class EmbeddedServer(Startable):
         if self._process is None:
             raise Misuse("the server is not running: use `with EmbeddedServer() as server:` or call start()")
         return self._process
-
-
-def _bindable(port: int) -> int:
-    """The port, or a free one for 0; PortTaken or ServerFailed if it cannot be had."""
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server does
-        try:
-            probe.bind((HOST, port))
-        except OSError as error:
-            if error.errno == errno.EADDRINUSE:
-                raise PortTaken(port) from None
-            raise ServerFailed(f"port {port} on {HOST} cannot be used: {error.strerror}") from error
-        return int(probe.getsockname()[1])

@@ -14,11 +14,13 @@ from typing import Any
 from ..concurrency.locks import Locks
 from ..concurrency.tasks import Tasks
 from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, WrongLoop
+from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
 from . import Guard, Held, document_of
 from .composite import OneServer
 from .options import Options, server_run_id
+from .parsing import error_of
 from .state import States
 from .text import HeldText, Text
 from .wire import BUFFER, Wire, close_all, open_wire
@@ -71,9 +73,9 @@ class AsyncTransport(OneServer):
         return await (self.upload(wire, commands) if has_large(commands) else wire.roundtrip(commands))
 
     async def _as_text(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
-        sent = self.text.shortcut(commands)
+        sent = shortcut(commands, self.text.known)
         if sent is not None:
-            return self.text.finished(commands, await self._as_it_is(sent, bulk=bulk))
+            return finished(commands, await self._as_it_is(sent, bulk=bulk), self.text.known, error_of)
         return await self.text.roundtrip(self._as_it_is, self, commands, bulk)
 
     async def _as_it_is(self, commands: Sequence[Command], *, bulk: bool = False) -> list[Reply]:

@@ -22,12 +22,13 @@ from ..concurrency.locks import Inherited, Locks, ThreadLock, WeakList
 from ..concurrency.scheduling import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
+from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
 from . import Guard, Held
 from .composite import OneServer
 from .options import INFO_SERVER, Options, server_run_id
 from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
+from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader, error_of
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 
@@ -282,9 +283,9 @@ class BlockingTransport(OneServer):
         try:
             if not line.plain:
                 return line.exchange(commands, bulk)
-            sent = self._text.shortcut(commands)
+            sent = shortcut(commands, self._text.known)
             if sent is not None:
-                return self._text.finished(commands, line.exchange(sent, bulk))
+                return finished(commands, line.exchange(sent, bulk), self._text.known, error_of)
         finally:
             self._give(line)
         return await self._text.roundtrip(self._as_it_is, self, commands, bulk)

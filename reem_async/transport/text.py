@@ -16,7 +16,7 @@ from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, NoJsonSupport, NotConnected
 from ..plain.batches import Known, Steps, Watched, concerns, is_json
 from ..plain.changes import after_look
-from ..plain.translation import directly, finished, looked_at, shortcut, translated
+from ..plain.translation import directly, looked_at, translated
 from ..plan import Command, Reply
 from ..plan.sizes import KEPT, Staged, as_given, stage
 from . import Contention, Held
@@ -57,13 +57,6 @@ class Text:
         self.known = Known()
         # By turn: the last one whose holder lost the server.
         self._lost: dict[str, _Lost] = {}
-
-    def shortcut(self, commands: Sequence[Command]) -> list[Command] | None:
-        """Return what to send for what programs do most, None for all else; `finished` makes the answers."""
-        return shortcut(commands, self.known)
-
-    def finished(self, commands: Sequence[Command], replies: list[Reply]) -> list[Reply]:
-        return finished(commands, replies, self.known, error_of)
 
     async def roundtrip(self, send: Send, lending: Any, commands: Sequence[Command], bulk: bool) -> list[Reply]:
         """Do as `Transport.roundtrip`: `send` sends, and `lending` has that transport's `hold` and `ordered`."""
