@@ -4,14 +4,13 @@ import asyncio
 import contextlib
 import os
 import signal
-import socket
 import threading
 import time
 
 import numpy as np
 import pytest
 import redis
-from chaos.proxy import Proxy
+from chaos.proxy import CHUNK, Proxy
 from conftest import PATIENCE, PLAIN, aeventually, eventually, subscribed
 
 import reem
@@ -127,46 +126,21 @@ def test_the_last_confirmation_of_an_upload_counts_from_when_its_bytes_may_have_
 
 async def test_a_slow_upload_is_not_cut_off(server):
     """More than twice the limit, but bytes move."""
-    total, rate = 12 << 20, 10 << 20
-    relays = []
-
-    async def relay(reader, writer):
-        relays.append(asyncio.current_task())
-        up_reader, up_writer = await asyncio.open_unix_connection(str(server.socket_path))
-
-        async def pump(source, sink, slow):
-            with contextlib.suppress(OSError):
-                while data := await source.read(1 << 16):
-                    sink.write(data)
-                    await sink.drain()
-                    if slow:
-                        await asyncio.sleep(len(data) / rate)
-            sink.close()
-            with contextlib.suppress(OSError):
-                await sink.wait_closed()
-
-        await asyncio.gather(pump(reader, up_writer, True), pump(up_reader, writer, False))
-
-    listening = socket.create_server(("127.0.0.1", 0))
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 16)  # what waits here looks delivered to the sender
-    slow = await asyncio.start_server(relay, sock=listening, limit=1 << 16)
-    port = slow.sockets[0].getsockname()[1]
-    value = np.zeros(total, np.uint8)
-    url = f"redis://127.0.0.1:{port}"
+    value = np.zeros(12 << 20, np.uint8)
 
     def blocking():
-        with reem.RedisInterface(url, timeout=0.5) as interface:
+        with reem.RedisInterface(slow.url, timeout=0.5) as interface:
             begin = time.monotonic()
             reem.KeyValueStore(interface)["big"] = value
             return time.monotonic() - begin
 
-    async with slow:
-        async with reem_async.RedisInterface(url, timeout=0.5) as interface:
+    with Proxy(server.port, buffer=1 << 16) as slow:  # what waits there looks delivered to the sender
+        slow.delay = CHUNK / (10 << 20)
+        async with reem_async.RedisInterface(slow.url, timeout=0.5) as interface:
             begin = time.monotonic()
             await reem_async.KeyValueStore(interface)["big"].write(value)
             assert time.monotonic() - begin > 1.0
         assert await asyncio.to_thread(blocking) > 1.0
-        await asyncio.gather(*relays)
 
 
 async def test_states_are_told_in_order_and_to_callbacks(server):

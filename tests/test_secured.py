@@ -5,13 +5,13 @@ import contextlib
 import datetime
 import socket
 import ssl
-import threading
 import time
 
 import numpy as np
 import pytest
 import redis
 import trustme
+from chaos.proxy import Proxy
 from conftest import FRONTS, PATIENCE, PLAIN, assert_same, eventually
 from own_servers import connect, own_server
 
@@ -69,68 +69,15 @@ def context_for(certificate, ca=None):
     return context
 
 
-class Relay:
-    """Ends TLS in front of a server that was built without.
-
-    Attributes:
-        port: Where it listens.
-        connections: How many there were.
-    """
-
-    def __init__(self, socket_path, context):
-        self.connections = 0
-        self._path = socket_path
-        self._loop = asyncio.new_event_loop()
-        self._tasks = {}
-        listener = socket.create_server((HOST, 0))
-        starting = asyncio.start_server(self._serve, sock=listener, ssl=context, limit=1 << 16)
-        self._server = self._loop.run_until_complete(starting)
-        self.port = self._server.sockets[0].getsockname()[1]
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._thread.start()
-
-    async def _serve(self, reader, writer):
-        self.connections += 1
-        self._tasks[asyncio.current_task()] = writer.transport
-        up_reader, up_writer = await asyncio.open_unix_connection(self._path)
-        pumps = [self._pump(reader, up_writer), self._pump(up_reader, writer)]
-        tasks = [asyncio.ensure_future(pump) for pump in pumps]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for each in (*tasks, writer.transport, up_writer.transport):
-                each.abort() if isinstance(each, asyncio.BaseTransport) else each.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
-
-    async def _pump(self, reader, writer):
-        with contextlib.suppress(OSError):
-            while data := await reader.read(1 << 17):
-                writer.write(data)
-                await writer.drain()
-
-    def close(self):
-        async def end():
-            self._server.close()
-            for transport in self._tasks.values():
-                transport.abort()  # which ends its task
-            await asyncio.gather(*self._tasks, return_exceptions=True)
-            await asyncio.sleep(0.01)  # for the transports to close their sockets
-
-        asyncio.run_coroutine_threadsafe(end(), self._loop).result(PATIENCE)
-        self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(PATIENCE)
-        self._loop.close()
-
-
 @pytest.fixture(scope="module")
 def behind_tls(certificates):
-    """Starts a real server behind a relay that speaks TLS; yields its port."""
+    """Starts a real server behind a proxy that speaks TLS; yields its port."""
 
     @contextlib.contextmanager
     def start(certificate=certificates.server, ask=False):
         context = context_for(certificate, certificates.ca if ask else None)
-        with own_server() as process, contextlib.closing(Relay(process.socket_path, context)) as relay:
-            yield relay.port
+        with own_server() as process, Proxy(process.port, ssl=context) as proxy:
+            yield proxy.port
 
     return start
 
@@ -203,16 +150,14 @@ def test_publishing_and_subscribing_over_tls_on_event_loops(guarded, certificate
 @both
 def test_one_tls_connection_serves_many_calls(certificates, name):
     """A handshake costs more than a call; also after a pause, in which the blocking front looks at the socket."""
-    with own_server() as process:
-        relay = Relay(process.socket_path, context_for(certificates.server))
-        with contextlib.closing(relay):
-            with contextlib.closing(FRONTS[name](url_of(relay.port), ssl_ca_certs=certificates.ca)) as front:
-                for number in range(5):
-                    front.write(["foo"], number)
-                time.sleep(1.1)
-                assert front.read(["foo"]) == 4
-            own = PLAIN and name == "asyncio"  # for the look that a document takes which is not known yet
-            assert relay.connections == 1 + own
+    with own_server() as process, Proxy(process.port, ssl=context_for(certificates.server)) as proxy:
+        with contextlib.closing(FRONTS[name](url_of(proxy.port), ssl_ca_certs=certificates.ca)) as front:
+            for number in range(5):
+                front.write(["foo"], number)
+            time.sleep(1.1)
+            assert front.read(["foo"]) == 4
+        own = PLAIN and name == "asyncio"  # for the look that a document takes which is not known yet
+        assert proxy.connections == 1 + own
 
 
 # --- what is refused ----------------------------------------------------------------------------------------
@@ -317,22 +262,21 @@ def test_options_that_would_only_fail_later_are_refused_at_once(certificates, tm
 def guarded_cluster(certificates):
     """Two primaries, each behind TLS that asks for certificates; yields the URL of the cluster."""
     with contextlib.ExitStack() as stack:
-        nodes, relays = [], []
+        nodes, proxies = [], []
         for _ in range(2):
             node = stack.enter_context(own_server("cluster-enabled yes", "cluster-announce-ip 127.0.0.1"))
             context = context_for(certificates.server, certificates.ca)
-            relay = stack.enter_context(contextlib.closing(Relay(node.socket_path, context)))
+            proxies.append(stack.enter_context(Proxy(node.port, ssl=context)))
             nodes.append(stack.enter_context(node.admin()))
-            nodes[-1].config_set("cluster-announce-port", relay.port)
+            nodes[-1].config_set("cluster-announce-port", proxies[-1].port)
             nodes[-1].config_set("cluster-announce-bus-port", node.port + 10000)
-            relays.append((relay.port, node.port))
         nodes[0].execute_command("CLUSTER", "ADDSLOTSRANGE", 0, 8191)
         nodes[1].execute_command("CLUSTER", "ADDSLOTSRANGE", 8192, 16383)
-        nodes[0].execute_command("CLUSTER", "MEET", HOST, relays[1][1], relays[1][1] + 10000)
+        nodes[0].execute_command("CLUSTER", "MEET", HOST, node.port, node.port + 10000)
         for node in nodes:
             eventually(lambda node=node: "cluster_state:ok" in str(node.execute_command("CLUSTER", "INFO")))
             eventually(lambda node=node: len(node.execute_command("CLUSTER", "SLOTS")) == 2)
-        yield f"rediss+cluster://localhost:{relays[0][0]}"
+        yield f"rediss+cluster://localhost:{proxies[0].port}"
 
 
 @both

@@ -1,4 +1,4 @@
-"""The command: runs rows one after the other, shows progress, and one table at the end."""
+"""The command: runs rows one after the other, and says what came of each."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _run_all(numbers: list[int], scale: str, seed: int) -> int:
     outcomes: list[Outcome] = []
     begun = time.monotonic()
     for number in numbers:
-        tell(f"{number:>3}  {ROWS[number].what} ...")
+        tell(f"{number:>3}  {ROWS[number].what}: {ROWS[number].target} ...")
         outcome = run(number, scale, seed)
         outcomes.append(outcome)
         tell(f"     {outcome.status} after {outcome.seconds:.1f} s: {'; '.join(outcome.figures)}")
@@ -44,33 +44,9 @@ def _run_all(numbers: list[int], scale: str, seed: int) -> int:
         if outcome.status == "FAIL":
             tell(f"     again: {outcome.replay}")
             tell("     | " + "\n     | ".join(outcome.output.splitlines()[-40:]))
-    _show(outcomes, time.monotonic() - begun)
-    return int(any(outcome.status == "FAIL" for outcome in outcomes))
-
-
-def _show(outcomes: list[Outcome], seconds: float) -> None:
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    console = Console(width=None if sys.stdout.isatty() else 180)
-    table = Table(box=box.SIMPLE_HEAD, show_lines=False)
-    for name in ("row", "what", "target", "figure", "", "s"):
-        table.add_column(name, justify="right" if name in ("row", "s") else "left")
-    colours = {"PASS": "green", "FAIL": "red"}
-    for it in outcomes:
-        status = f"[{colours.get(it.status, 'yellow')}]{it.status}[/]"
-        figures = "; ".join(it.figures or it.failures)
-        table.add_row(
-            str(it.row.number), _plain(it.row.what), _plain(it.row.target), _plain(figures), status, f"{it.seconds:.0f}"
-        )
-    console.print(table)
     counts = {word: sum(it.status == word for it in outcomes) for word in ("PASS", "FAIL", "NOT RUN")}
-    console.print(", ".join(f"{count} {word}" for word, count in counts.items()) + f" in {seconds:.0f} s")
-
-
-def _plain(text: str) -> str:
-    return text.replace("[", "\\[")
+    tell(", ".join(f"{count} {word}" for word, count in counts.items()) + f" in {time.monotonic() - begun:.0f} s")
+    return int(any(outcome.status == "FAIL" for outcome in outcomes))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import ssl
 import struct
 import threading
 import time
@@ -33,15 +34,22 @@ class _Link:
 class Proxy:
     """Stands between clients and the server at `target`; faults are set from any thread.
 
+    With `ssl`, clients have to speak TLS. With `buffer`, the kernel takes about so many bytes ahead of the proxy.
+
     Attributes:
         port: Where it listens, on 127.0.0.1; a free one if none is given.
+        connections: How many there were.
         delay: Seconds by which each chunk, either way, is held back.
         lost: How many replies were dropped.
     """
 
-    def __init__(self, target: int, port: int = 0) -> None:
+    def __init__(
+        self, target: int, port: int = 0, *, ssl: ssl.SSLContext | None = None, buffer: int | None = None
+    ) -> None:
         self._target = target
+        self._ssl, self._buffer = ssl, buffer
         self.port = port
+        self.connections = 0
         self.delay = 0.0
         self.lost = 0
         self._marker: bytes | None = None
@@ -125,13 +133,17 @@ class Proxy:
         tasks: set[asyncio.Task[None]] = set()
 
         def connected(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            self.connections += 1
             task = asyncio.get_running_loop().create_task(self._link(reader, writer))
             tasks.add(task)
             task.add_done_callback(tasks.discard)
             task.add_done_callback(lambda _: writer.transport.abort())  # even if it never began
 
-        server = await asyncio.start_server(connected, "127.0.0.1", self.port, backlog=1000)
-        self.port = server.sockets[0].getsockname()[1]
+        listening = socket.create_server(("127.0.0.1", self.port), backlog=1000)
+        if self._buffer is not None:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._buffer)
+        server = await asyncio.start_server(connected, sock=listening, ssl=self._ssl, backlog=1000)
+        self.port = listening.getsockname()[1]
         self._ready.set()
         await self._over.wait()
         server.close()

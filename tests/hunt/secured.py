@@ -7,20 +7,21 @@ import re
 import tempfile
 from pathlib import Path
 
+from chaos.proxy import Proxy
 from conftest import ROOT
-from test_secured import Certificates, Relay, context_for
+from test_secured import Certificates, context_for
 
 from .checks import Server
 from .clients import Address
 
 
 def secured(stack: contextlib.ExitStack, server: Server) -> Address:
-    """Return the address of a relay with TLS before a server, for a user with the commands of deploy/users.acl."""
+    """Return the address of a proxy with TLS before a server, for a user with the commands of deploy/users.acl."""
     line = re.search(r"^user robot .*", (ROOT / "deploy/users.acl").read_text(), re.MULTILINE)
     assert line is not None
     commands = [word for word in line[0].split() if word.startswith("+")]
     server.raw.execute_command("ACL", "SETUSER", "robot", "on", ">secret", "~*", "&*", "-@all", *commands)
-    path = server.raw.config_get("unixsocket")["unixsocket"]
     certificates = Certificates(Path(stack.enter_context(tempfile.TemporaryDirectory())))
-    relay = stack.enter_context(contextlib.closing(Relay(path, context_for(certificates.server))))
-    return f"rediss://robot:secret@127.0.0.1:{relay.port}", {"ssl_ca_certs": certificates.ca}
+    target = int(server.url.rpartition(":")[2])
+    proxy = stack.enter_context(Proxy(target, ssl=context_for(certificates.server)))
+    return f"rediss://robot:secret@127.0.0.1:{proxy.port}", {"ssl_ca_certs": certificates.ca}
