@@ -78,37 +78,28 @@ class Text:
         no more than a few at a time, since each has a connection. Cancelled, or broken off, it was applied once or not
         at all; the connection is closed.
         """
-        # Locks by a few numbers rather than by key, which bounds the connections as well. Sorted, so that two callers
-        # that need the same two locks never wait for each other.
-        turns = sorted({f"documents {crc32(key) % _AT_A_TIME}" for key in keys})
+        # Locks by a few numbers rather than by key, which bounds the connections as well. All keys of a plan are of one
+        # document; of another batch, the lock of the first has to do.
+        turn = f"documents {crc32(keys[0]) % _AT_A_TIME}"
         contention, attempt = Contention(time_limit(self.timeout)), _Attempt(keys, commands)
         while True:
             # Each attempt waits for its turn: a caller that keeps losing must not block writers of other keys.
-            came = attempt.begun = time.monotonic()
-            replies = await self._in_turn(turns, lending, attempt, bulk)
-            contention.waited(attempt.begun - came)
+            came = time.monotonic()
+            async with lending.ordered(turn):
+                self._check_reached(turn, came)
+                begun = time.monotonic()
+                try:
+                    async with lending.hold() as held:
+                        replies = await attempt.made(held, bulk)
+                except (ConnectionLost, NotConnected) as error:
+                    now = time.monotonic()
+                    self._lost[turn] = _Lost(now, now - begun, str(error))
+                    raise
+            contention.waited(begun - came)
             if replies is not None:
                 return replies
             contention.given_up(commands)
             attempt.send_ahead()
-
-    async def _in_turn(self, turns: Sequence[str], lending: Any, attempt: _Attempt, bulk: bool) -> list[Reply] | None:
-        if turns:
-            came = time.monotonic()
-            async with lending.ordered(turns[0]):
-                self._check_reached(turns[0], came)
-                try:
-                    return await self._in_turn(turns[1:], lending, attempt, bulk)
-                except (ConnectionLost, NotConnected) as error:
-                    now = time.monotonic()
-                    self._lost[turns[0]] = _Lost(now, now - attempt.begun, str(error))
-                    raise
-        attempt.begun = time.monotonic()
-        async with lending.hold() as held:
-            if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
-                replies: list[Reply] = await held.roundtrip(attempt.given, bulk=bulk)
-                return replies
-            return await attempt.made(held, bulk)
 
     def _check_reached(self, turn: str, came: float) -> None:
         """Raise NotConnected if the server was lost while a call waited for its turn, after as much time as it has.
@@ -166,7 +157,6 @@ class _Attempt:
     def __init__(self, keys: Sequence[bytes], commands: Sequence[Command]) -> None:
         self._keys = keys
         self.given = self._commands = commands  # the batch, which concerns the documents of `keys`
-        self.begun = 0.0  # when it had its turn last
         self._coming: list[Staged] = []
         self._sent = -float(KEPT)
 
@@ -176,8 +166,10 @@ class _Attempt:
             tag = f"{{{self._keys[0].decode(errors='surrogateescape')}}}"
             self._commands, self._coming = stage(self.given, tag, secrets.token_hex(5))
 
-    async def made(self, held: HeldText, bulk: bool) -> list[Reply] | None:
+    async def made(self, held: Held, bulk: bool) -> list[Reply] | None:
         """Try once; return None if another client was first."""
+        if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
+            return await held.roundtrip(self.given, bulk=bulk)
         # Sent again well before the server forgets it.
         if self._coming and time.monotonic() - self._sent > KEPT / 2:
             self._sent = time.monotonic()
