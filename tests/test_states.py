@@ -41,19 +41,6 @@ def test_a_callback_may_publish_to_the_key_whose_call_has_connected(server_url, 
     assert heard == ["connected", "closed"]
 
 
-def test_a_callback_on_the_main_thread_may_publish_too(server_url, key):
-    """There connecting is left to another thread, which does not call back."""
-    name, threads = key(), []
-    with reem.RedisInterface(server_url) as other:
-        reem.KeyValueStore(other)[name] = {}
-        interface = reem.RedisInterface(server_url)
-        pspace = reem.PublishSpace(interface)
-        interface.on_state(lambda change: threads.append(threading.current_thread()))
-        pspace[name]["n"].write(1)
-        assert threads == [threading.main_thread()]
-        interface.close()
-
-
 def test_changes_are_told_in_order_while_a_callback_waits_for_another_thread():
     """Who notes the next change does not wait for it."""
     states, told, go_on = States(), [], threading.Event()
