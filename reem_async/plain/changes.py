@@ -43,11 +43,12 @@ def after_look(
     # between, the transport starts again, unless the plan itself watches keys: then the plan does.
     look = _Look(commands, keys, watched or Watched(), known, error)
     replies = (yield look.commands) if look.commands else []
-    failed = look.failed(replies)
-    if failed is not None:
+    # A key of another type is an answer: `documents` makes it the module's error.
+    errors = [each for each in replies if isinstance(each, Exception) and not str(each).startswith(OTHER_TYPE)]
+    if errors:
         if watched is None:
             yield [UNWATCH]
-        return _not_looked(commands, failed)
+        return _not_looked(commands, errors[0])
     change = _Change(commands, look.documents(replies), error)
     sent = change.commands(watched is not None)
     outcome = (yield sent) if sent else []
@@ -82,13 +83,6 @@ class _Look:
             if key not in watched.texts:
                 looks += [("GET", key)] if key in self._read else [("TYPE", key), ("GETRANGE", key, "0", "0")]
         self.commands = [word for look in looks for word in (ASKING, look)] if asks(commands) else looks
-
-    def failed(self, replies: Sequence[Reply]) -> Exception | None:
-        """Return the error of a read, except that of a key of another type."""
-        for reply in replies:
-            if isinstance(reply, Exception) and not str(reply).startswith(OTHER_TYPE):
-                return reply
-        return None
 
     def documents(self, replies: Sequence[Reply]) -> dict[bytes, TextDocument | Exception]:
         found: dict[bytes, TextDocument | Exception] = {}

@@ -87,61 +87,41 @@ def translated(commands: Sequence[Command], known: Known, error: MakeError, watc
     return directly(commands, known, error, watched)
 
 
-class _Sending:
-    """The commands for a batch, and the position of each one's reply; `asking` if ASKING precedes each command."""
-
-    def __init__(self, *, asking: bool) -> None:
-        self.commands: list[Command] = []
-        self.places: list[int] = []
-        self._asking = asking
-        self._read: dict[bytes, int] = {}
-
-    def add(self, *commands: Command) -> None:
-        self.places.append(len(self.commands))
-        self.commands += commands
-
-    def read(self, key: bytes) -> None:
-        if key in self._read and not self._asking:
-            self.places.append(self._read[key])
-        else:
-            self._read[key] = len(self.commands)
-            self.add(("GET", key))
-
-    def write(self, command: Command) -> None:
-        # A later read must see the new text, so it cannot share an earlier GET.
-        self._read.pop(key_of(command), None)
-        self.add(_whole(command))
-
-    def look(self, command: Command) -> None:
-        between = [ASKING] if self._asking else []
-        self.add(command, *between, ("GETRANGE", key_of(command), "0", "0"))
-
-
 def directly(commands: Sequence[Command], known: Known, error: MakeError, watched: Watched | None = None) -> Steps:
     """Return the translation of a batch whose documents need not be `looked_at`."""
-    sending = _Sending(asking=asks(commands))
+    asking = [ASKING] if asks(commands) else []  # precedes each command
+    sent: list[Command] = []
+    places: list[int] = []  # where in it the reply to each command is
+    read: dict[bytes, int] = {}
     for command in commands:
-        if is_json(command):
-            if command[0] in READS:
-                sending.read(key_of(command))
-            else:
-                sending.write(command)
+        places.append(len(sent))
+        if command[0] in READS and is_json(command):
+            key = key_of(command)
+            if key in read and not asking:
+                places[-1] = read[key]
+                continue
+            read[key] = len(sent)
+            sent.append(("GET", key))
+        elif is_json(command):
+            # A later read must see the new text, so it cannot share an earlier GET.
+            read.pop(key_of(command), None)
+            sent.append(_whole(command))
         elif not is_look(command):
-            sending.add(command)
+            sent.append(command)
         elif command[0] == "TYPE":
-            sending.look(command)
+            sent += [command, *asking, ("GETRANGE", key_of(command), "0", "0")]
         else:
             # SCAN ... TYPE ReJSON-RL: the server finds strings, of which `_only_documents` keeps the documents.
-            sending.add((*command[:-1], "string"))
-    replies = yield sending.commands
+            sent.append((*command[:-1], "string"))
+    replies = yield sent
     if commands[-1][0] == "EXEC" and not isinstance(replies[-1], list):  # a watched key has changed, or refused
         if watched is not None:
             watched.clear()
-        return [replies[place] for place in sending.places]
-    answers = _Answers(sending.commands, replies, known, error)
-    found = [answers.of(command, place) for command, place in zip(commands, sending.places, strict=True)]
+        return [replies[place] for place in places]
+    answers = _Answers(sent, replies, known, error)
+    found = [answers.of(command, place) for command, place in zip(commands, places, strict=True)]
     if watched is not None:
-        _follow(watched, commands, sending.places, answers)
+        _follow(watched, commands, places, answers)
     yield from _only_documents(commands, found)
     return framed(commands, found)
 

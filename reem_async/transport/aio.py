@@ -259,13 +259,6 @@ class AsyncTransport(OneServer):
         else:
             await wire.discard()
 
-    async def open_kept(self) -> _Lent:
-        """Return a connection that its caller keeps for long."""
-        self.check()
-        wire = await self._opened()
-        self._kept.add(wire)
-        return _Lent(self, wire)
-
     async def take_broken(self, lent: _Lent) -> None:
         """Close a connection on which a call may be under way."""
         self._kept.discard(lent.wire)
@@ -388,9 +381,12 @@ class _KeptConnection:
         self._lent: _Lent | None = None
 
     async def __aenter__(self) -> Held:
-        self._lent = await self._transport.open_kept()
+        self._transport.check()
+        wire = await self._transport._opened()
+        self._transport._kept.add(wire)
+        self._lent = _Lent(self._transport, wire)
         held = self._guard(self._lent)
-        return HeldText(held, self._transport.text) if self._lent.wire.plain else held
+        return HeldText(held, self._transport.text) if wire.plain else held
 
     async def __aexit__(self, *_: object) -> None:
         if self._lent is not None:

@@ -124,21 +124,6 @@ class SentinelOptions(Options):
         for address in sorted(self._sentinels, key=lambda each: self._silent.get(each, 0.0)):
             yield NodeOptions(self, address, self._asking)
 
-    def _in_turn(self) -> Iterator[tuple[Options, Address, float]]:
-        """Yield the sentinels to ask within the limit for connecting, with their addresses and time limits.
-
-        The first one has half of that limit, since it may only be slow, and each of the others a share of the rest, so
-        that there is time for the last one, and for the primary.
-        """
-        deadline, parts = time.monotonic() + self.handshake_timeout, len(self._sentinels)
-        for place, sentinel in enumerate(self.sentinels()):
-            address: Address = (sentinel.settings["host"], sentinel.settings["port"])
-            now = time.monotonic()
-            if now >= deadline:
-                return
-            self._silent[address] = now  # until it has answered, however the asking ends
-            yield sentinel, address, (deadline - now) / (parts - place + 1 if place else 2)
-
     def primary(self) -> Address:
         """Ask the sentinels where the primary is, on this thread; raises what `find_primary` raises."""
         try:
@@ -149,14 +134,24 @@ class SentinelOptions(Options):
         raise AssertionError("a blocking question cannot wait")
 
     async def find_primary(self, ask: Callable[[Options, float], Awaitable[Any]]) -> Address:
-        """Ask the sentinels, one after the other by `ask`, where the primary is.
+        """Ask the sentinels, one after the other by `ask`, where the primary is, within the limit for connecting.
+
+        The first one has half of that limit, since it may only be slow, and each of the others a share of the rest, so
+        that there is time for the last one, and for the primary.
 
         Raises:
             TlsRefused, LoginRefused, NotAllowed: No sentinel names it, and one of them gave this reason.
             NotConnected: No sentinel names it.
         """
         problems: list[Exception] = []
-        for sentinel, address, limit in self._in_turn():
+        deadline, parts = time.monotonic() + self.handshake_timeout, len(self._sentinels)
+        for place, sentinel in enumerate(self.sentinels()):
+            address: Address = (sentinel.settings["host"], sentinel.settings["port"])
+            now = time.monotonic()
+            if now >= deadline:
+                break
+            self._silent[address] = now  # until it has answered, however the asking ends
+            limit = (deadline - now) / (parts - place + 1 if place else 2)
             try:
                 return self._named(await ask(sentinel, limit), address)
             except Exception as error:  # redis-py lets pass what a peer's nonsense makes of its parser
