@@ -32,9 +32,9 @@ from .transport.packing import CommandRecorder
 from .transport.startup import StartupWait
 
 _FRESH = 3.0  # seconds for which the first notices of a publisher about a key go to all nodes of a cluster
-QUIET = 60.0
-"""After this silence (seconds) a publisher's notices of a key go to all nodes again: clients that find keys by pattern
-have dropped the key by then."""
+_QUIET = 60.0
+"""After this silence (seconds) a publisher's notices of a key go to all nodes again: clients may have begun to look for
+keys by pattern while the key was gone."""
 
 _KEPT = 10_000  # top-level keys whose last numbers a publisher remembers
 
@@ -64,7 +64,7 @@ class PublisherIdentity:
         # No lock between threads: calls on one key come one after the other (`Transport.ordered`), and those on other
         # keys touch other entries.
         publisher, number, before, fresh = self._last.get(channel) or (self.publisher, 0, -math.inf, 0.0)
-        if now - before > QUIET:
+        if now - before > _QUIET:
             fresh = now + _FRESH
         self._last[channel] = publisher, number + 1, now, fresh
         with contextlib.suppress(KeyError):  # another thread has just forgotten a key
@@ -87,8 +87,7 @@ class PublisherIdentity:
     def is_fresh(self, keys: Keys) -> bool:
         """Return whether this publisher has just begun with a top-level key of a cluster, which others may not know.
 
-        Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet, or not
-        any more.
+        Notices go to the key's own node. Clients that find keys by pattern do not follow a new key there yet.
         """
         last = self._last.get(keys.channel) if self.transport.sharded else None
         return last is not None and time.monotonic() < last[3]

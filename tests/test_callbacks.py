@@ -5,7 +5,6 @@ import contextlib
 import errno
 import gc
 import os
-import signal
 import threading
 import time
 import weakref
@@ -16,7 +15,7 @@ from conftest import PATIENCE, aeventually, eventually, python
 import reem
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
-from reem_async.concurrency.queues import BoundedQueue, Ended, Every, Last, Newest
+from reem_async.concurrency.queues import BoundedQueue, Ended, Every, Last
 from reem_async.concurrency.timeouts import time_limit
 from reem_async.errors import WrongLoop
 
@@ -283,32 +282,6 @@ print(*taken)
 """
 
 
-@pytest.mark.long
-@pytest.mark.skipif(not hasattr(signal, "SIGUSR1"), reason="this system has no such signals")
-def test_a_signal_with_a_handler_does_not_end_the_wait_at_a_queue():
-    """Ctrl-C does, since its handler raises; then the next one to wait takes what comes."""
-    done = python(_SIGNALLED)
-    assert (done.stdout, done.stderr) == ("handled interrupted 1\n", "")
-
-
-_SIGNALLED = """
-import os, signal, threading
-from reem_async.concurrency.queues import Last, BoundedQueue
-said, queue = [], BoundedQueue(Last(10))
-def usr1(*_):
-    said.append("handled")
-signal.signal(signal.SIGUSR1, usr1)
-threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGUSR1]).start()
-threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
-try:
-    queue.take_waiting()
-except KeyboardInterrupt:
-    said.append("interrupted")
-threading.Timer(0.1, queue.put, [1]).start()
-print(*said, queue.take_waiting())
-"""
-
-
 def test_a_call_of_listen_in_a_wrong_loop_changes_nothing(server_url, key):
     """WrongLoop is raised; in its own loop the subscriber goes on as before: one call for each update."""
     told = []
@@ -351,21 +324,3 @@ async def test_the_cancelled_result_of_something_else_ends_nothing(ainterface, a
     assert [(update.data, update.gap) for update in heard] == [(0, False), (1, False), (2, False)]
     assert caplog.text.count("the subscription goes on") == 1  # then counted
     assert "connection" not in caplog.text
-
-
-async def test_updates_that_arrive_together_wait_as_the_policy_says(ainterface, pspace, key):
-    """With Newest, a plain function that is slower than the updates is called with the last of them only."""
-    told = []
-
-    def callback(data, updated_path):
-        told.append(data)
-        time.sleep(0.05)
-
-    def publish():
-        for number in range(50):
-            pspace[key()] = number
-
-    async with CallbackSubscriber(key(), ainterface, callback, policy=Newest()):
-        await asyncio.to_thread(publish)
-        await aeventually(lambda: told[-1:] == [49])
-    assert len(told) < 25

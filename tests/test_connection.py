@@ -20,7 +20,7 @@ from reem_async.concurrency.timeouts import moved_last
 from reem_async.errors import BadInput, ConnectionLost, NotConnected
 from reem_async.plan import Plan
 from reem_async.plan.notices import note_of
-from reem_async.pubsub import subscription_commands
+from reem_async.pubsub import manager as manager_module
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
@@ -324,7 +324,7 @@ async def test_a_stopped_server_is_noticed_by_who_only_follows(server):
 @pytest.mark.alone
 async def test_a_connection_that_breaks_gives_no_other_more_time(server, monkeypatch):
     """The others are asked whether the server is gone, but not one that owes an answer: it would be waited for anew."""
-    monkeypatch.setattr(subscription_commands, "_PERIOD", 1000.0)
+    monkeypatch.setattr(manager_module, "_PERIOD", 1000.0)
     async with reem_async.RedisInterface(server, timeout=1) as interface:
         store = reem_async.KeyValueStore(interface)
         await store["foo"].write(1)

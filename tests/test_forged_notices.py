@@ -392,21 +392,6 @@ async def test_a_message_that_cannot_be_read_is_a_gap_of_its_key_alone(server_ur
     ]  # fmt: skip
 
 
-async def test_a_recorder_reads_only_the_key_anew_of_which_a_message_could_not_be_read(
-    server_url, ainterface, key, tmp_path, quiet
-):
-    if server_url.startswith("redis+cluster"):
-        pytest.skip("what is told to all nodes is not told to those who follow a key")
-    keys = [key("foo"), key("bar")]
-    store = reem_async.KeyValueStore(ainterface)
-    async with Recorder(ainterface, keys, tmp_path / "run.mcap") as recorder:
-        await store[keys[1]].write(1)
-        with redis.Redis.from_url(server_url) as raw:
-            raw.publish("{" + keys[1] + "}:notices", b"nonsense")
-        await aeventually(lambda: recorder.status.gaps == 1)
-    assert recorder.status.gaps == 1
-
-
 # --- what is refused when it is written -----------------------------------------------------------------------
 
 
@@ -430,12 +415,6 @@ def test_namespaces_that_would_meet_with_others_are_refused(module, namespace):
         module.RedisInterface("127.0.0.1", namespace=namespace)
     if len(namespace) < 20 and namespace[-1] != ":":
         assert f"write {namespace + ':'!r}" in str(refused.value)
-
-
-@pytest.mark.parametrize("namespace", ["", "robot1:", "robots/r1:", "robots/", "arm_2.", "r_", "[1]"])
-def test_namespaces_that_end_with_a_separator_are_as_they_were(namespace):
-    """On the server too: it goes before the key as it is."""
-    assert reem.RedisInterface("127.0.0.1", namespace=namespace)._direct.session.keys("a").document == namespace + "a"
 
 
 async def test_namespaces_of_which_one_begins_with_the_other_do_not_meet(server_url, key):

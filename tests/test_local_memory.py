@@ -6,7 +6,6 @@ import gc
 import mmap
 import os
 import socket
-import threading
 
 import numpy as np
 import orjson
@@ -165,21 +164,6 @@ def test_an_interrupt_in_the_middle_of_reading_leaves_no_lock_and_no_descriptor(
     check_all_slots(segment)
 
 
-@pytest.mark.long
-def test_views_may_go_in_any_thread_and_in_the_garbage_collector():
-    segment, before = Segment(1000), descriptors()
-    for _ in range(20):
-        reader = LocalReader()
-        cycle = [reader.view(put(segment, b"x"), 1), reader]
-        cycle.append(cycle)
-        del cycle, reader
-        thread = threading.Thread(target=gc.collect)
-        thread.start()
-        thread.join()
-    check_all_slots(segment)
-    assert descriptors() == before
-
-
 def test_a_view_outlives_its_reader_and_its_publisher():
     before = descriptors()
     segment, reader = Segment(1000), LocalReader()
@@ -239,13 +223,6 @@ def test_an_idle_segment_is_given_up(monkeypatch):
     local.answered(other, 1)
     assert not local._segments
     assert descriptors() == before
-
-
-def test_what_is_closed_makes_no_memory_any_more():
-    local = LocalPath()
-    assert local.host
-    local.close()
-    assert not local.host
 
 
 def test_without_descriptors_there_is_no_slot_and_no_view_and_nothing_is_raised():

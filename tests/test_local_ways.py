@@ -141,15 +141,6 @@ def test_a_large_value_may_go_anywhere(what, server_url, open_front, key):
     assert updates[1]["n"] == 1
 
 
-def test_several_places_in_one_update(server_url, key):
-    with heard(server_url, key("cam")) as updates, reem.RedisInterface(server_url) as interface:
-        space = reem.PublishSpace(interface)
-        space[key("cam")] = {"n": 0}
-        space[key("cam")].update({"left": image(1), "right": image(2), "n": 3})
-        eventually(lambda: updates and "right" in updates[-1] and updates[-1]["n"] == 3)
-    assert_same(updates[-1], {"left": image(1), "right": image(2), "n": 3})
-
-
 def test_who_follows_a_part_gets_the_part(server_url, open_front, key):
     space = open_front("PublishSpace")
     with reem.RedisInterface(server_url) as interface:
@@ -224,17 +215,3 @@ def test_whatever_serves(server, front, mode, request):
                     eventually(lambda value=value: updates and updates[-1]["n"] == value["n"])
                     assert_same(updates[-1], value)
                     assert in_slot(updates[-1]["image"])
-
-
-def test_another_namespace_and_another_database_hear_nothing(plain):
-    with (
-        heard(plain.url, "cam") as one,
-        heard(plain.url, "cam", namespace="robot2:") as other,
-        reem.RedisInterface(plain.url + "/3") as third,
-        reem.RedisInterface(plain.url) as first,
-    ):
-        reem.PublishSpace(third)["cam"] = {"image": BIG, "n": 3}
-        reem.PublishSpace(first)["cam"] = {"image": BIG, "n": 0}
-        eventually(lambda: one and one[-1]["n"] == 0)
-    assert len(one) == 1
-    assert not other

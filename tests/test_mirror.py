@@ -19,7 +19,7 @@ from test_ships import Pose, PoseShip
 import reem
 import reem_async
 from reem_async.errors import BadValue, InterfaceClosed, MissingKey, ReadOnly, Stale
-from reem_async.pubsub import subscription_commands
+from reem_async.pubsub import manager as manager_module
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
 
@@ -258,7 +258,7 @@ async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_t
     ainterface, akvs, key, raw, monkeypatch
 ):
     """However many keys are followed beside; then the next one that needs them decides."""
-    monkeypatch.setattr(subscription_commands, "_PERIOD", 1000.0)
+    monkeypatch.setattr(manager_module, "_PERIOD", 1000.0)
     manager = manager_of(ainterface.session)
 
     def calls(command):
@@ -272,7 +272,7 @@ async def test_frequent_signs_of_life_ask_for_nothing_else_and_last_as_long_as_t
             await aeventually(lambda: calls("ping") >= pings + 20)
             assert calls("get") == gets
             assert mirror.age < 10
-        monkeypatch.setattr(subscription_commands, "_PERIOD", 1.0)
+        monkeypatch.setattr(manager_module, "_PERIOD", 1.0)
         await aeventually(lambda: manager._heartbeats._period == 0.3 / 3)
     await aeventually(lambda: manager._heartbeats._period == 1.0)
 

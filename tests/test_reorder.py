@@ -14,10 +14,10 @@ from hypothesis import given, settings
 import reem_async
 from reem_async.errors import InterfaceClosed
 from reem_async.plan.notices import Notice
-from reem_async.pubsub import key_watcher, reorder
+from reem_async.pubsub import key_watcher
+from reem_async.pubsub.key_watcher import ReorderBuffer
 from reem_async.pubsub.manager import manager_of
 from reem_async.pubsub.monitor import Monitor
-from reem_async.pubsub.reorder import ReorderBuffer
 from reem_async.tools.recording import Recorder, open_log
 
 CHANNEL = b"{key}:notices"
@@ -58,7 +58,7 @@ def handed(listener, *, here=False):
 def played(draw, ways):
     """What a listener was told when the two ways, to all nodes and at the key's own, brought these, interleaved."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reorder, "_PATIENCE", 0.001)
+        patch.setattr(key_watcher, "_PATIENCE", 0.001)
         return asyncio.run(_played(draw, ways))
 
 
@@ -110,7 +110,7 @@ def test_what_neither_way_brings_is_a_hole_in_the_numbers_and_all_else_is_told_o
 )
 async def test_what_does_not_come_is_not_waited_for_for_ever(monkeypatch, publisher, number, doubt):
     """What is missing shows in the numbers; of a publisher nothing is known of, it is said that there may be more."""
-    monkeypatch.setattr(reorder, "_PATIENCE", 0.01)
+    monkeypatch.setattr(key_watcher, "_PATIENCE", 0.01)
     listener = Heard()
     made = handed(listener)
     made.told_to_all(notice(1))
@@ -124,18 +124,8 @@ async def test_what_does_not_come_is_not_waited_for_for_ever(monkeypatch, publis
     assert listener.told == [("p", 1), *doubt, *((publisher, number + more) for more in range(3))]
 
 
-async def test_who_follows_from_the_beginning_waits_for_nobody():
-    """A key that was there already: others may have published to it for long."""
-    listener = Heard()
-    made = handed(listener, here=True)
-    made.told_here(notice(70))
-    made.told_to_all(notice(69))
-    made.told_here(notice(71))
-    assert listener.told == [("p", 70), ("p", 71)]
-
-
 async def test_of_a_crowd_of_updates_some_are_forgotten(monkeypatch):
-    monkeypatch.setattr(reorder, "_MOST", 3)
+    monkeypatch.setattr(key_watcher, "_MOST", 3)
     listener = Heard()
     made = handed(listener)
     for number in range(10):
@@ -145,15 +135,6 @@ async def test_of_a_crowd_of_updates_some_are_forgotten(monkeypatch):
         made.told_here(notice(2, f"p{number}"))
         assert len(made._waiting) <= 3
     assert len(listener.told) == 20
-
-
-async def test_a_listener_that_is_gone_is_told_nothing():
-    listener = Heard()
-    made = handed(listener)
-    del listener
-    made.told_to_all(notice(1))
-    made.told_here(notice(9, "q"))
-    await aeventually(lambda: not made.waits)
 
 
 @contextlib.asynccontextmanager

@@ -118,17 +118,6 @@ def test_any_top_level_key_is_watched_and_disturbs_nobody_beside_it(watching, kv
     assert (update.path, update.value, update.gap) == (key("beside"), 4, False)
 
 
-def test_large_arrays_may_stay_at_the_server(watching, kvs, key):
-    kvs[key("cam")] = {"image": IMAGE, "n": 1}
-    watch = watching(key("*"), largest=1000)
-    before = watch.next().data["image"]
-    assert (before.label, before.summary) == ("numpy", "uint8[480,640,3]")
-    kvs[key("cam")]["image"] = IMAGE + 1
-    update = watch.next()
-    assert (update.path, update.value.summary) == (f"{key('cam')}.image", "uint8[480,640,3]")
-    assert update.value is not before
-
-
 def test_patterns_that_overlap_tell_each_change_once(watching, kvs, pspace, key):
     watch = watching(key("*"), key("a*"), f"{key('a')}.x")
     pspace[key("a")] = {"x": 1}

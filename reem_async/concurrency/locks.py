@@ -51,10 +51,7 @@ class Locks(Generic[Lock]):
 
 
 class WeakList(Generic[Item]):
-    """Those of some objects that still live. Threads may share it.
-
-    No WeakSet: leaving one takes steps that Ctrl-C may divide, and another thread may be going through it.
-    """
+    """Those of some objects that still live. Threads may share it, and Ctrl-C may come, unlike with a WeakSet."""
 
     def __init__(self) -> None:
         self._references: list[weakref.ref[Item]] = []
@@ -77,8 +74,7 @@ class Inherited(WeakList[Item]):
 class ThreadLock:
     """A thread lock with the face of an asynchronous one; waiting for it blocks the thread.
 
-    Ctrl-C may come between any two steps, also just after it was taken, or before it is given back: `let_go` is for
-    that. And a thread that has it, in a `__del__` for example, does not wait for itself.
+    A thread that has it, in a `__del__` for example, does not wait for itself. `let_go` is for after Ctrl-C.
     """
 
     __slots__ = ("__weakref__", "_lock")

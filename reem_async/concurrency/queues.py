@@ -78,9 +78,8 @@ class BoundedQueue:
     """The updates that wait for one loop; one thread puts them in at a time, any number of threads take them out.
 
     Ctrl-C may interrupt a taking thread at any step, and must not block the putting thread. So there is no lock: each
-    step that matters is one of C, which Python does not divide. Updates are numbered, so that the one dropped for
-    another is named, and not the first at that moment. A loss is noted before the update after it is put in, so that
-    the next one taken out reports it, however many were dropped in between.
+    step that matters is one of C, which Python does not divide. Updates are numbered, so that the one that is dropped
+    is named. A loss is noted before the update after it is put in, and the next one that is taken reports it.
     """
 
     def __init__(self, policy: Policy) -> None:
@@ -108,18 +107,14 @@ class BoundedQueue:
             self._items[self._last] = update
             if self._items.pop(self._last - self._policy.bound, EMPTY) is not EMPTY:
                 self._skip()
-                if len(self._gaps) > 1:
-                    self._join_gaps(self._last - self._policy.bound)
+                # What was lost before dropped updates is kept in one.
+                gone = [number for number in self._gaps.copy() if number <= self._last - self._policy.bound]
+                if len(gone) > 1:
+                    self._gaps[gone[-1]] = total([self._gaps.pop(number, 0) for number in gone])
         self._tell()
 
-    def _join_gaps(self, dropped: int) -> None:
-        """Keep in one what was lost before updates that were dropped, the last of which had this number."""
-        gone = [number for number in self._gaps.copy() if number <= dropped]
-        if len(gone) > 1:
-            self._gaps[gone[-1]] = total([self._gaps.pop(number, 0) for number in gone])
-
     def skip(self) -> None:
-        """Note that an update will never come: a newer one of the same path has taken its place."""
+        """Note that an update will never come: a newer one has taken its place."""
         self._skip()
         self._tell()
 

@@ -33,10 +33,7 @@ def give_way() -> None:
 
 
 def come_second() -> None:
-    """Come a little after others for the processor from now on, with all threads begun later, where that can be.
-
-    A batch thread that wakes does not take the processor from the running one.
-    """
+    """Come a little after others for the processor from now on, with all threads begun later, where that can be."""
     with contextlib.suppress(AttributeError, OSError):
         os.nice(_NICER)
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -59,8 +56,7 @@ def stand_back() -> None:
 def take_short_turns() -> None:
     """Have this thread, but none that it begins, take turns of 0.1 ms, where that can be: Linux from 6.12 on.
 
-    Its share of the processor stays what it was, but when it is woken it comes before threads with longer turns, so
-    also before those that were woken earlier. A thread with another policy than the ordinary one is left as it is.
+    When it is woken it comes before threads with longer turns. One with another policy is left as it is.
     """
     if sys.platform != "linux" or sys.maxsize < 1 << 32 or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return
@@ -74,8 +70,7 @@ def take_short_turns() -> None:
 def keep_memory() -> None:
     """Have this process keep the memory it frees for what comes next, up to 64 MiB a thread, where that can be.
 
-    Large blocks are given back to the system otherwise, and each page that is taken again costs a fault: for a
-    camera of 28 MB/s twelve thousand a second.
+    Else each page costs a fault when it is taken again: for a camera of 28 MB/s twelve thousand a second.
     """
     if sys.platform == "linux":
         with contextlib.suppress(AttributeError, OSError):  # another C library

@@ -35,10 +35,9 @@ _TURNS = 100  # turns of an event loop that a time limit for the server lasts at
 
 @asynccontextmanager
 async def server_timeout(seconds: float) -> AsyncIterator[None]:
-    """Raise TimeoutError after `seconds` in which the event loop was free to see what the server does.
+    """Raise TimeoutError after `seconds`, of which a turn of the event loop counts a hundredth at most.
 
-    A turn of the loop counts a hundredth of the limit at most, however long it takes: while other tasks compute, no
-    answer can be seen.
+    While other tasks compute, no answer can be seen.
     """
     loop = asyncio.get_running_loop()
     timer: asyncio.TimerHandle | None = None
@@ -81,10 +80,7 @@ def timeout(seconds: float) -> Iterator[None]:
 
 
 def waiting_limit(seconds: float | None) -> float | None:
-    """Return for how long to wait: `seconds`, else the limit of the `with timeout(...)` block around, if there is one.
-
-    Raises BadType or BadValue for what is no time.
-    """
+    """Return `seconds`, else the limit of the `with timeout(...)` block around; raises BadType or BadValue."""
     if seconds is None:
         return _given.get()
     check_number("timeout", seconds, "use seconds, 0 or more, or None for no limit")
@@ -103,7 +99,6 @@ def check_timeout(seconds: float) -> float:
 
 
 def time_limit(default: float) -> float:
-    """Return the time limit of a call made now."""
     given = _given.get()
     return default if given is None else given
 
@@ -111,12 +106,7 @@ def time_limit(default: float) -> float:
 def moved_last(last: float, now: float, before: int, left: int, limit: float) -> float:
     """Return when a byte of a large value on its way up moved last.
 
-    Args:
-        last: When one had moved at the last look.
-        now: The time.
-        before: How many bytes were not confirmed at the last look.
-        left: How many are not confirmed now.
-        limit: The time limit of the call, in seconds.
+    It had moved at `last` by the last look, at which `before` bytes were not confirmed. Now `left` are not.
     """
     if left >= before:
         return last

@@ -23,7 +23,6 @@ class Descriptor:
 
     @property
     def is_own(self) -> bool:
-        """Whether the number still stands for the same file."""
         try:
             return self._now() == self._file
         except OSError:
@@ -40,11 +39,8 @@ class Descriptor:
 class Pipe:
     """Wakeups that are bytes in a pipe.
 
-    The thread that is woken may get the processor at once, while the other one is still waking it. That one lets go
-    of the interpreter to write to a descriptor; a lock it would release with the interpreter in its hands, for which
-    the woken thread would have to wait again.
-
-    An eventfd would do with one descriptor, but fstat does not tell it from another eventfd, or from an epoll.
+    A thread lets go of the interpreter to write to a descriptor, so the one that it wakes may run at once. A lock it
+    would release with the interpreter in its hands. (fstat does not tell an eventfd from another one, or an epoll.)
     """
 
     def __init__(self) -> None:

@@ -36,10 +36,7 @@ def _named(user: int) -> str:
 
 
 def reason_against() -> str:
-    """Return why memory cannot be shared here, empty if it can; tried with a segment of a page.
-
-    Once, but where memory or descriptors were just short: that may pass.
-    """
+    """Return why memory cannot be shared here, empty if it can; tried once, with a segment of a page."""
     try:
         return _found_against()
     except OSError as error:

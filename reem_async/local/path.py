@@ -34,10 +34,7 @@ _KEYS = 1000  # keys whose local audience is cached
 
 
 class LocalPath:
-    """The shared memory of one interface, `memory` bytes at most. Raises BadValue.
-
-    If `mode` is "early", subscribers on this host are notified before the server has the update.
-    """
+    """The shared memory of one interface, `memory` bytes at most. Raises BadValue."""
 
     def __init__(self, mode: Any = "auto", memory: Any = MEMORY) -> None:
         if mode not in _MODES:
@@ -105,10 +102,7 @@ class LocalPath:
         return self._audiences.get(keys.channel, (0, 0.0))[0]
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:
-        """Copy an update of a key into shared memory; None if there is no room for it now, or memory is not to be had.
-
-        It is not called twice at a time for the same key. See `Segment.put`.
-        """
+        """Copy an update of a key into shared memory, one at a time; None if there is no room. See `Segment.put`."""
         try:
             segment = self._segment(keys.channel, starts(sizes)[-1])
             written = None if segment is None else segment.put(pieces, sizes)
@@ -119,14 +113,13 @@ class LocalPath:
         return Slot(self.host, self._pid, segment.descriptor, segment.inode, *written)
 
     def kept(self, channel: str) -> object:
-        """Return what keeps the memory of a channel from being given back, as long as it is kept."""
+        """Return what keeps the memory of a channel."""
         return self._segments.get(channel)
 
     def _segment(self, channel: str, room: int) -> Segment | None:
         """Return the segment of a key with so many bytes in each slot, made if need be; None if that is too much.
 
-        Without a lock, which a handler of signals or a forked child might find taken: each step stands for itself. Two
-        threads that make segments of two keys at the same time may find each other's too much.
+        Without a lock, which a forked child might find taken: each step stands for itself.
         """
         if self._pid != os.getpid():  # those are the parent's: a forked child has its own
             self._pid, self._segments = os.getpid(), {}

@@ -1,8 +1,7 @@
 """Views of what publishers of the same host have put into their shared memory.
 
-Each view locks its slot through an open file description of its own, which is closed when the last array that looks
-into the slot is gone: nothing is counted and no line of Python runs, so it may happen in any thread, during garbage
-collection, or by the kernel, and no Ctrl-C can come in between.
+Each view locks its slot through an open file description of its own, which is closed with the last array that looks
+into the slot: by any thread, the garbage collector or the kernel, and no Ctrl-C can come in between.
 """
 
 from __future__ import annotations
@@ -36,18 +35,18 @@ _LARGEST = 1 << 34  # bytes of a segment: no publisher makes one of 16 GB
 _BLOCK = 512  # bytes of what `st_blocks` counts, whatever the file system's blocks are
 
 
-class _Pin(NamedTuple):
-    """A slot that is being looked into."""
-
-    root: weakref.ref[_Root]  # what all arrays that look into it refer to
-    number: int
-    stamp: int  # what it held then
-
-
 class _Root(np.ndarray[Any, Any]):
     """What all arrays that look into a slot refer to."""
 
     lock: mmap.mmap  # has the description open by which the slot is locked
+
+
+class _Pin(NamedTuple):
+    """A slot that is being looked into."""
+
+    root: weakref.ref[_Root]
+    number: int
+    stamp: int  # what it held then
 
 
 class _Mapping:
@@ -61,11 +60,6 @@ class _Mapping:
         self._shape = _checked(self._descriptor, slot)
         self._map = mmap.mmap(self._descriptor, self._shape.size, prot=mmap.PROT_READ)
 
-    @property
-    def is_looked_into(self) -> bool:
-        """Whether there is a view of a slot."""
-        return any(pin.root() is not None for pin in self.pins)
-
     def view(self, slot: Slot, size: int) -> memoryview | None:
         """Return a view of the first `size` bytes of a slot; None if it does not hold any more what is meant."""
         if slot.number >= self._shape.slots or not 0 < size <= self._shape.room:
@@ -76,7 +70,7 @@ class _Mapping:
             if root is not None and (pin.number, pin.stamp) == (slot.number, slot.stamp) and len(root) >= size:
                 return root.data[:size]
         lock = self._locked(slot.number)
-        if lock is None or self._stamp(slot.number) != slot.stamp:
+        if lock is None or STAMP.unpack_from(self._map, stamp_at(slot.number)) != (slot.stamp,):
             return None
         content = np.frombuffer(self._map, np.uint8, size, self._shape.start(slot.number))
         if len(self.pins) >= _PINS:
@@ -95,10 +89,6 @@ class _Mapping:
             # A mapping has it open, too, and gives it back without any code of ours. It is not looked into.
             lock = mmap.mmap(file.fileno(), mmap.PAGESIZE, prot=mmap.PROT_READ)
             return lock if lock_for_reading(file.fileno(), number) else None
-
-    def _stamp(self, number: int) -> int:
-        stamp: int = STAMP.unpack_from(self._map, stamp_at(number))[0]
-        return stamp
 
 
 def _opened(slot: Slot) -> int:
@@ -143,7 +133,7 @@ class LocalReader:
     def view(self, slot: Slot, size: int) -> memoryview | None:
         """Return the first `size` bytes of a slot, read-only; None if they are not to be had (any more).
 
-        The slot is not written while anything refers to the view. It may be a copy, for a program that keeps many.
+        The slot is not written while anything refers to the view, which may be a copy.
         """
         place = slot.process, slot.descriptor, slot.inode
         try:
@@ -163,7 +153,8 @@ class LocalReader:
         """Unmap the segments that nothing was looked for in of late: their publishers may be gone."""
         before = time.monotonic() - _IDLE
         for place, mapping in list(self._mappings.items()):
-            if mapping.used < before and not mapping.is_looked_into:  # else its views would not be counted any more
+            # Else its views would not be counted any more.
+            if mapping.used < before and all(pin.root() is None for pin in mapping.pins):
                 self._mappings.pop(place, None)
 
     def close(self) -> None:

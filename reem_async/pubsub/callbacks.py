@@ -27,7 +27,7 @@ logger = logging.getLogger("reem.subscribe")
 _TOLD = frozenset(10**power for power in range(1, 12))
 """Numbers of equal exceptions of a callback that are worth a line: at 200 Hz each would fill the log."""
 
-_GIVEN = "data", "updated_path"
+_GIVEN = "data", "updated_path"  # the names of the first two arguments
 
 _current_call: ContextVar[asyncio.Task[Any] | None] = ContextVar("_current_call", default=None)
 """The task that awaits the callback which this code belongs to; tasks that the callback starts inherit it."""
@@ -36,10 +36,8 @@ _current_call: ContextVar[asyncio.Task[Any] | None] = ContextVar("_current_call"
 def arranged(function: Callable[..., Any], kwargs: Mapping[str, Any]) -> Callable[[Update], Any]:
     """Return what calls `function` for an update: data and path by name if it has these names, else in this order.
 
-    REEM 0.1 gave both by name, the manual says that they come first: so a function may name them in any order, take
-    them as `**kwargs`, or call them what it likes. Besides them it gets `kwargs`, and the update if it has a parameter
-    of that name or takes `**kwargs`. One that takes `*args` too hands all on to a function of which nothing is known,
-    and gets no update. Raises BadType if it cannot be called so.
+    It gets `kwargs` too, and the update if it has a parameter of that name or takes `**kwargs` without `*args`. Raises
+    BadType if it cannot be called so.
     """
     try:
         signature = inspect.signature(function)
@@ -106,7 +104,7 @@ def checked_on_silent(function: Any, kwargs: Mapping[str, Any], ttl: float | Non
 
 
 class Caller:
-    """Calls one callback; both fronts use it, each on a thread of its own choice."""
+    """Calls one callback, in both fronts."""
 
     def __init__(
         self, channel: str, function: Callable[[Update], Any], on_silent: Callable[[], Any] = lambda: None
@@ -118,9 +116,9 @@ class Caller:
         self._dropped = 0
 
     def call(self, update: Update, dropped: int) -> Any:
-        """Call the function, unless the update is only the value that was there already; what it raises is logged.
+        """Call the function, unless the update is only the value that was there already; log what it raises.
 
-        So is the number of updates that were `dropped` until now, if it has grown.
+        Log the number of updates that were `dropped` until now, if it has grown.
         """
         # Before the call, so that the log has the loss ahead of what it may cause.
         if dropped > self._dropped:
@@ -172,8 +170,7 @@ class Caller:
 class Calls:
     """The calls of one subscriber on the event loop, one after the other, until its queue is closed.
 
-    They are made in the loop's next turn, when all that arrived in this one has been told to everybody. A task of
-    their own would do the same at a higher price; only what must be awaited gets one.
+    They are made in the loop's next turn, without a task: only what must be awaited gets one.
     """
 
     def __init__(self, caller: Caller, updates: Stream[Update], kept: set[Any]) -> None:
@@ -193,7 +190,6 @@ class Calls:
         self._go_on()
 
     def _go_on(self) -> None:
-        """Have the calls made that are due, unless that is under way."""
         if not self._busy and not self.loop.is_closed():
             self._busy = True
             self.loop.call_soon(self._call_waiting, context=self._context)
@@ -236,15 +232,13 @@ class Calls:
         self._resume()
 
     def _resume(self) -> None:
-        """Go on with the calls where one has left off; what came meanwhile waits in the queue."""
         self._busy = False
         self._go_on()
 
     def _leaves(self, error: BaseException) -> bool:
         """Return whether an exception leaves the event loop, as it would from any callback of asyncio.
 
-        Of SystemExit only the first: the loop runs again while the program closes what it has open, and the calls that
-        still come then must not break that off.
+        Of SystemExit only the first: later ones would break off what the program closes in the loop.
         """
         if isinstance(error, SystemExit):
             has_exited, self._has_exited = self._has_exited, True
@@ -260,8 +254,8 @@ class Calls:
     async def done(self) -> None:
         """Wait until the queue, which is closed, is empty and all calls were made.
 
-        Returns at once within a callback, this one or any other, and in tasks that it has started: two callbacks that
-        close each other would wait for ever. No call is made in another event loop than theirs, nor in a forked child.
+        Returns at once within any callback and in tasks that it has started: two that close each other would wait for
+        ever.
         """
         caller = _current_call.get()
         if self.loop is asyncio.get_running_loop() and (caller is None or caller.done()):

@@ -1,7 +1,6 @@
 """Which of the updates that were heard of are in what was read: a state machine without I/O, clock or tasks.
 
-A copy is kept by updates, and by reads of what the updates do not contain. Updates go on coming during a read. Those
-that are in what was read are `covered`; the others come `later` and have to be applied to it.
+Updates go on coming during a read. Those that are in what was read are `covered`; the others come `later`.
 
         IDLE --- asked(in_order=True) ----> IN_ORDER ------------------------+
          |                                                                   |
@@ -14,16 +13,13 @@ that are in what was read are `covered`; the others come `later` and have to be 
         any -- asked() --> IN_ORDER or ASIDE: what is asked for now has all that was heard
         any -- give_up() --> IDLE
 
-Updates are heard in the order in which the server made them. What makes a read fit between them:
+Updates are heard in the server's order. What makes a read fit between them:
 
 - IN_ORDER: its reply comes over the connection of the notices. What came before the reply is in it, what comes
   behind it is newer.
 - ASIDE: it comes over another connection. It has what was heard of before it was asked for. Of what came since, its
   note (`{foo}:last`, read in the same transaction) says which was the last that it has.
 - FENCING: that one may still be on its way. A PING on the connection of the notices is answered behind it.
-
-What is done with covered and later updates is the owner's: `replica.py` keeps a tree, the recorder a queue of what is
-to be written (`tools/recording/key_queue.py`), the browser a history.
 """
 
 from __future__ import annotations
@@ -57,8 +53,6 @@ _ASIDE = Phase.ASIDE, Phase.FENCING
 
 
 class Heard(NamedTuple, Generic[U]):
-    """What was heard."""
-
     update: U | None  # the update; None if something was published, or lost, of which nothing else is known
     missed: int | None  # how many updates were lost before it, None if unknown
     follows: bool = True  # its number is not lower than what was heard of its publisher before
@@ -135,7 +129,7 @@ class Division(Generic[U]):
         return not undecided
 
     def take(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
-        """Return what is covered and what is later: what was read is known now."""
+        """Return what is covered and what is later."""
         covered, later = self.covered, [*self._doubtful, *self._later]
         self.phase, self.begins = _IDLE, False
         self.covered, self._doubtful, self._later = [], [], []
@@ -154,7 +148,7 @@ async def divided_read(
 ) -> T:
     """Read a key, and again in the rare case that it is not known which updates are in what was read.
 
-    `take` of the division has them then. If this raises or is cancelled, the division is as if nothing had been asked.
+    If this raises or is cancelled, the division is as if nothing had been asked.
 
     Args:
         division: Hears the updates of the key meanwhile.

@@ -1,7 +1,7 @@
 """One top-level key: reads of it, put between its updates. A state machine without I/O, clock or tasks.
 
-A subscriber, a recording and the page follow a key in the same way: they receive its updates, and read what the updates
-do not contain. Each read is a sequence of steps, which a driver performs:
+Subscribers, recordings and the page receive the updates, and read what these do not contain. A read is a sequence of
+steps, which a driver performs:
 
         read(plan) ----> Arm -- armed() --> Read -- answered() --+------------> Open -- take() --> at rest
             |                                ^                   |               ^
@@ -75,7 +75,7 @@ class HeldAttachments:
         self.asked: frozenset[str] = frozenset()  # the keys that the last plan reads
         self._keys = keys
         self._stale: set[str] = set()  # suffixes of those that were changed since they were asked for
-        self._raw: RawRead | None = None
+        self.raw: RawRead | None = None  # what ships make values of
 
     def ask(self, plan: Plan) -> None:
         """A plan is sent: its reply has all that was changed until now."""
@@ -106,16 +106,9 @@ class HeldAttachments:
             self._stale.add(suffix)
         return True
 
-    def opening(self, raw_read: RawRead) -> None:
-        self._raw = raw_read
-
-    def failed(self) -> None:
-        """They could not, or nothing of it is kept."""
-        self._raw = None
-
     def opened(self) -> None:
-        """They have: keep those whose keys were not changed since."""
-        raw, self._raw = self._raw, None
+        """Keep those that ships have made values of and whose keys were not changed since."""
+        raw, self.raw = self.raw, None
         if raw is None:
             return
         for slot, ship, _ in raw.slots:
@@ -185,7 +178,6 @@ class KeyFeed(Generic[U]):
         self.attachments.ask(plan)
 
     def armed(self) -> Read:
-        """The keys were touched: the server reports what is changed from now on."""
         assert self._plan is not None
         self.division.asked(in_order=False)
         return Read(self.number, self._plan)
@@ -203,7 +195,6 @@ class KeyFeed(Generic[U]):
         return Fence(self.number)
 
     def fenced(self) -> Step | None:
-        """Go on: all updates that were published before the fence have been received."""
         outcome, self._outcome = self._outcome, []
         return self._decode(outcome)
 
@@ -216,18 +207,18 @@ class KeyFeed(Generic[U]):
             return None
         self._plan = None
         if self.tracked:
-            self.attachments.opening(result)
+            self.attachments.raw = result
         return Open(self.number, result)
 
     def take(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
-        """Return which updates are in what was read, and which came later: the ships have made values of it."""
+        """Return which updates are in what was read, and which came later."""
         if self.tracked:
             self.attachments.opened()
         return self.division.take()
 
     def give_up(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
         """Return the same for a read that has failed."""
-        self.attachments.failed()
+        self.attachments.raw = None
         self._plan, self._outcome = None, []
         return self.division.give_up()
 

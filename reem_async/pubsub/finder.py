@@ -25,10 +25,9 @@ async def present_keys(session: Session, tops: Iterable[str]) -> set[str]:
 
 
 async def find_regularly(find: Callable[[], Awaitable[bool]]) -> None:
-    """Call `find` every second, less often where it takes long, until it returns False.
+    """Call `find` every second from the next one on, less often where it takes long, until it returns False.
 
-    The first call is a second from now. After a call that fails the next one is a second later: it may have waited
-    long for a server that is gone, which is no work for it. `Misuse` ends this, such as a closed interface.
+    After a call that fails the next one is a second later. `Misuse` ends this, such as a closed interface.
     """
     while True:
         await asyncio.sleep(_PERIOD)

@@ -183,9 +183,7 @@ class Follower(Listener):
         """Return the seconds for which the server may have had something else than the copy. Any thread may.
 
         Counts from when the last question was sent whose answer confirmed the copy: replies are in order with notices
-        and invalidation messages, so all that was changed before the question has been applied. If the server does not
-        report what is only stored, only a read confirms the copy. An early update that the server does not confirm
-        counts from its arrival.
+        and invalidation messages. If the server does not report what is only stored, only a read confirms the copy.
         """
         return time.monotonic() - min(self._valid_at, self._replica.unconfirmed_since)
 
@@ -234,11 +232,13 @@ class Follower(Listener):
         if isinstance(output, Read):
             self._read(output)
         elif isinstance(output, Fence):
-            self._fence(output.number)
+            if self._wire is not None:
+                self._wire.send([("PING",)], partial(self._fenced, output.number))
         elif isinstance(output, Look):
             self._looks.ask()
         elif isinstance(output, Arm):
-            self._arm(output)
+            if self._wire is not None:
+                self._wire.send([("TYPE", key) for key in output.keys], partial(self._armed, output.number))
         elif isinstance(output, Stored):
             self._looks.found()
             self._tell_state(output.path, output.data, output.value, Origin.STORED)
@@ -261,10 +261,6 @@ class Follower(Listener):
     def _look(self) -> None:
         self._replica.look()
         self._perform()
-
-    def _arm(self, command: Arm) -> None:
-        if self._wire is not None:
-            self._wire.send([("TYPE", key) for key in command.keys], partial(self._armed, command.number))
 
     @contained
     def _armed(self, number: int, outcome: list[Reply] | Exception) -> None:
@@ -307,10 +303,6 @@ class Follower(Listener):
         self._replica.replies(number, outcome)
         self._perform()
 
-    def _fence(self, number: int) -> None:
-        if self._wire is not None:
-            self._wire.send([("PING",)], partial(self._fenced, number))
-
     @contained
     def _fenced(self, number: int, outcome: list[Reply] | Exception) -> None:
         self._replica.fenced(number, outcome if isinstance(outcome, Exception) else None)
@@ -339,16 +331,13 @@ class Follower(Listener):
                     raise
                 # Of something that was cancelled, and whose result a ship has asked for.
                 slot.container[slot.key] = command.raw_read.give_up(slot, BadData(f"a ship was cancelled: {error!r}"))
-        self._opened_aside(command)
+        self._opened(command)
 
     @contained
-    def _opened_aside(self, command: Open) -> None:
-        self._opened(command)
-        self._perform()
-
     def _opened(self, command: Open) -> None:
         self._manager.report(command.raw_read.unreadable)
         self._replica.opened(command.number, command.raw_read.holder[0])
+        self._perform()
 
     # --- what the replica tells
 
@@ -366,7 +355,7 @@ class Follower(Listener):
             queue.put(Update(path, data, value, False, *stamp, *how, late, False, arrived))
 
     def _heard(self, notice: Notice) -> tuple[float, float | None]:
-        """Note since when an update counts; return how late it was, and when it arrived, if it counts with a `ttl`."""
+        """Note since when an update counts; return how late it was, and when it arrived if it counts with a `ttl`."""
         self.live_since = -math.inf if notice.arrived is None else notice.arrived - notice.late
         return notice.late, notice.arrived
 
@@ -409,7 +398,7 @@ def checked_largest(largest: float | None) -> float:
 
 
 def unnoticed(tree: Any) -> None:
-    """Ignore a state."""
+    pass
 
 
 def own(tree: Any) -> Any:

@@ -1,9 +1,11 @@
 """Patterns of channels in a cluster, where servers have none: the keys are looked for, and each is followed.
 
-A key that is found a moment after it was made would have been published to already. So publishers
-tell all nodes what they publish in their first seconds with a key, by a channel of the old kind, for
-which there are patterns; a listener that hears of a key this way follows it from then on. A `ReorderBuffer` for each
-key puts in one order what is heard in both ways.
+In its first seconds with a key a publisher notifies all nodes by a channel of the old kind, for which there are
+patterns. A listener that hears of a key this way follows it at its own node from then on, over another connection.
+
+Each way brings the updates in the server's order, but either may be behind: nodes pass on what is sent to all up to
+50 ms late. So what comes at the key's node waits in a `ReorderBuffer` until the other way has brought all that is
+older. From then on the key's node is the only one listened to.
 """
 
 from __future__ import annotations
@@ -12,7 +14,6 @@ import asyncio
 import collections
 import logging
 import re
-import time
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
@@ -22,26 +23,26 @@ from ..errors import InterfaceClosed, RedisError
 from ..plan.keys import DOCUMENT, keys_of
 from ..plan.notices import Notice
 from ..plan.paths import fits
-from ..session import QUIET
 from ..transport import Transport, scanned
 from ..transport.wire import Wire
 from .finder import find_regularly
+from .gaps import Stamp
 from .listeners import Beginning, Listener, Topic
-from .reorder import ReorderBuffer
 
 logger = logging.getLogger("reem.subscribe")
 
 # Seconds between looks whether a key is settled, and how often: a second in all, twice what a buffer waits.
 _MOMENT, _MOMENTS = 0.005, 200
 
-_GONE = QUIET + 30.0
-"""Seconds without a key and without an update of it until it is dropped: by then no publisher still assumes that this
-process follows the key."""
-
-_MOST = 10_000  # keys whose publishers are remembered, at most: any client may announce any number of keys to all nodes
+_MOST = 10_000  # keys, and updates of a key, that are remembered: any client may announce any number to all nodes
 
 _TAIL = "}:notices"
 _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
+
+
+_PATIENCE = 0.5  # seconds to wait for what is older: ten times as long as nodes took to pass it on
+_REMEMBERED = 5.0
+"""Seconds for which is remembered what all nodes were told, once the key's own node is listened to: it may be late."""
 
 
 class Subscriptions(Protocol):
@@ -146,27 +147,14 @@ class KeyWatcher:
         return bool(self._followed)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:
-        """Follow the keys that are not followed yet, and let go of those that are gone."""
+        """Follow the keys that are not followed yet."""
         async for page in scanned(self._manager.transport, _glob(listener), DOCUMENT):
             await self._found(listener, page, late=late)
-        new_keys, long_ago = self._new_keys.get(listener), time.monotonic() - _GONE
-        followed = self._followed.get(listener, {}) if new_keys is not None else {}
-        for name in [
-            name for name, key_listener in followed.items() if key_listener.begun and key_listener.seen < long_ago
-        ]:
-            if new_keys is not None and new_keys.forget(followed[name].topic.name):
-                key_listener = followed.pop(name)
-                key_listener.let_go()
-                await self._manager.unfollow_here(key_listener)
 
     async def _found(self, listener: Listener, documents: Sequence[bytes], *, late: bool) -> None:
         followed, new_keys = self._followed.get(listener), self._new_keys.get(listener)
         if followed is None:
             return
-        now = time.monotonic()
-        for name in documents:
-            if name in followed:
-                followed[name].seen = now
         found = {
             name: _KeyListener(listener, name, new_keys)
             for name in documents
@@ -206,24 +194,17 @@ class _Part(Listener):
 
     def __init__(self, listener: Listener, topic: Topic) -> None:
         super().__init__(topic, listener.max_batch_delay)
-        self._listener: Callable[[], Listener | None] = weakref.ref(listener)
-
-    def let_go(self) -> None:
-        self._listener = _nobody
+        self.listener: Callable[[], Listener | None] = weakref.ref(listener)
 
     def lost(self, reason: Exception) -> None:
         if self.ready is not None:
             super().lost(reason)
-        elif (listener := self._listener()) is not None:
+        elif (listener := self.listener()) is not None:
             listener.lost(reason)
 
     def invalidate(self, channel: bytes) -> None:
-        if (listener := self._listener()) is not None:
+        if (listener := self.listener()) is not None:
             listener.invalidate(channel)
-
-
-def _nobody() -> None:
-    return None
 
 
 class _KeyListener(_Part):
@@ -234,29 +215,21 @@ class _KeyListener(_Part):
         super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
         self._new_keys = new_keys  # where its first notices came from, or None if only this key is meant
         self.begun = False  # it is followed
-        # When the key was there last, something was heard of it, or it began to be followed
-        self.seen = time.monotonic()
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         self.begun = True
-        self.seen = time.monotonic()
         if self._new_keys is not None:
             self._new_keys.buffer(self.topic.name, here=True).begun()
             self._new_keys.begin(wire, beginning)
-        elif (listener := self._listener()) is not None:
+        elif (listener := self.listener()) is not None:
             listener.start(wire, beginning)
         super().start(wire, beginning)
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        self.seen = time.monotonic()
         if self._new_keys is not None:
             self._new_keys.buffer(channel, here=True).told_here(notice)
-        elif (listener := self._listener()) is not None:
+        elif (listener := self.listener()) is not None:
             listener.on_notice(notice, channel)
-
-    def invalidate(self, channel: bytes) -> None:
-        self.seen = time.monotonic()
-        super().invalidate(channel)
 
 
 class _NewKeysListener(_Part):
@@ -278,21 +251,13 @@ class _NewKeysListener(_Part):
         return all(buffer is None or buffer.here for buffer in found)
 
     def buffer(self, channel: bytes, *, here: bool = False) -> ReorderBuffer:
-        """Return the buffer of a key; a new one as given, so that of a forgotten key all is taken as it comes."""
+        """Return the buffer of a key; a new one as given."""
         found = self._buffers.get(channel)
         if found is None:
             if len(self._buffers) >= _MOST:
                 del self._buffers[next(iter(self._buffers))]
-            found = self._buffers[channel] = ReorderBuffer(self._listener, channel, here=here)
+            found = self._buffers[channel] = ReorderBuffer(self.listener, channel, here=here)
         return found
-
-    def forget(self, channel: bytes) -> bool:
-        """Forget a key; return False if an update of it waits to be handed on."""
-        found = self._buffers.get(channel)
-        if found is not None and found.waits:
-            return False
-        self._buffers.pop(channel, None)
-        return True
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
         self.begin(wire, beginning)
@@ -305,12 +270,9 @@ class _NewKeysListener(_Part):
                 beginning = Beginning.FIRST
             else:
                 self._telling = True
-                asyncio.get_running_loop().call_soon(self._told)
-        if (listener := self._listener()) is not None:
+                asyncio.get_running_loop().call_soon(setattr, self, "_telling", False)
+        if (listener := self.listener()) is not None:
             listener.start(wire, beginning)
-
-    def _told(self) -> None:
-        self._telling = False
 
     def looked(self) -> None:
         """The first look is over: hand on what came of keys that are newer."""
@@ -319,10 +281,105 @@ class _NewKeysListener(_Part):
             self.on_notice(notice, channel)
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        if (listener := self._listener()) is None:
+        if (listener := self.listener()) is None:
             return
         if self._early is not None:
             self._early.append((notice, channel))
             return
         self.buffer(channel).told_to_all(notice)
         self._key_watcher.heard(listener, _document(channel))
+
+
+class ReorderBuffer:
+    """What one listener hears of one key, in order.
+
+    Args:
+        listener: Returns the listener, None if it was dropped.
+        channel: The key's channel.
+        here: The key's node is the only one listened to, from the beginning or by now.
+    """
+
+    def __init__(self, listener: Callable[[], Listener | None], channel: bytes, *, here: bool = False) -> None:
+        self.here = here
+        self._listener = listener
+        self._channel = channel
+        self._told: dict[Stamp, None] = {}  # what all nodes were told: it comes at the key's node too
+        self._ahead: dict[str, tuple[int, float]] = {}  # of these the highest number of each publisher, with its time
+        self._waiting: list[Notice] = []  # what came at the key's node and may be ahead of the other way
+        self._first: dict[str, int] = {}  # of these the first number of each publisher
+        self._timer: asyncio.TimerHandle | None = None  # ends the waiting, and later the remembering
+
+    @property
+    def waits(self) -> bool:
+        """Whether an update has come and is not handed on yet."""
+        return bool(self._waiting)
+
+    def told_to_all(self, notice: Notice) -> None:
+        """Take an update that its publisher sent to all nodes."""
+        stamp = notice.publisher, notice.sequence, notice.time
+        if self.here or stamp in self._told:
+            return
+        first = self._first.get(notice.publisher)
+        if first is not None and notice.sequence >= first:  # this way has caught up: all that is older was told
+            self._settle()
+            return
+        if len(self._told) >= _MOST:
+            self._forget()
+        self._told[stamp] = None
+        self._ahead[notice.publisher] = max(self._ahead.get(notice.publisher, (0, 0.0)), stamp[1:])
+        self._tell(notice)
+
+    def begun(self) -> None:
+        """The key is followed at its own node: what is published from now on comes there."""
+        if not self.here and self._timer is None:
+            self._timer = asyncio.get_running_loop().call_later(_PATIENCE, self._give_up)
+
+    def told_here(self, notice: Notice) -> None:
+        """Take an update that came at the key's own node."""
+        if self.here:
+            self._tell_once(notice)
+            return
+        self.begun()
+        self._waiting.append(notice)
+        self._first.setdefault(notice.publisher, notice.sequence)
+        is_told = (notice.publisher, notice.sequence, notice.time) in self._told  # then all that is older was, too
+        if is_told or len(self._waiting) >= _MOST:
+            self._settle()
+
+    def _give_up(self) -> None:
+        """Wait no longer: older updates were lost, if there were any."""
+        listener = self._listener()
+        if listener is not None and any(
+            number > 1 and publisher not in self._ahead for publisher, number in self._first.items()
+        ):  # how many is unknown
+            listener.invalidate(self._channel)
+        self._settle()
+
+    def _settle(self) -> None:
+        """Hand on what waits, and listen to the key's own node only from now on."""
+        if self._timer is not None:
+            self._timer.cancel()
+        self.here = True
+        waiting, self._waiting, self._first = self._waiting, [], {}
+        for notice in waiting:
+            self._tell_once(notice)
+        self._timer = asyncio.get_running_loop().call_later(_REMEMBERED, self._forget) if self._told else None
+
+    def _forget(self) -> None:
+        self._told.clear()
+        self._ahead.clear()
+
+    def _tell_once(self, notice: Notice) -> None:
+        """Hand on what came at the key's node, unless that was done before, or what is newer was handed on.
+
+        A number far ahead, or of an earlier time, is one that a stranger made up: it must not hide what is lower.
+        """
+        number, time = self._ahead.get(notice.publisher, (0, 0.0))
+        is_older = notice.sequence < number <= notice.sequence + _MOST and notice.time <= time
+        if not is_older and (notice.publisher, notice.sequence, notice.time) not in self._told:
+            self._tell(notice)
+
+    def _tell(self, notice: Notice) -> None:
+        listener = self._listener()
+        if listener is not None:
+            listener.on_notice(notice, self._channel)

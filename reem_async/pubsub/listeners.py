@@ -40,10 +40,7 @@ class Beginning(Enum):
     """How a listener begins over a connection."""
 
     FIRST = auto()
-    """For the first time: it has missed nothing."""
-
-    AFTER_LOSS = auto()
-    """After a connection was lost, or a slot moved: what was published meanwhile is unknown."""
+    AFTER_LOSS = auto()  # of a connection, or a slot has moved: what was published meanwhile is unknown
 
 
 def contained(method: Callable[Concatenate[Any, Arguments], None]) -> Callable[Concatenate[Any, Arguments], None]:
@@ -97,7 +94,7 @@ class Listener:
         """Take an update that the server may not have yet, and may yet refuse."""
 
     def changed(self, key: str | None) -> None:
-        """A key of what is followed was changed, the document's or an attachment's; None for every key."""
+        """A document or attachment was changed; None for every key."""
 
     def on_note(self, note: bytes | None) -> None:
         """Compare with the server's note of the last update; all before it has been handed over."""
@@ -160,7 +157,7 @@ def is_message(message: list[Any]) -> bool:
 
 
 class Inbox:
-    """Tells each listener what is pushed for him."""
+    """Notifies each listener of what is pushed for it."""
 
     def __init__(
         self,
@@ -180,10 +177,8 @@ class Inbox:
         self._moved = moved  # called with topics that their server does not have any more, and why
         self._empty = empty  # called with a topic that has no listener any more
         self.early = EarlyInbox(self._take_early)
-        self._last_early: tuple[bytes, Notice | None] = (
-            b"",
-            None,
-        )  # the bytes are decoded once if the server's are equal
+        # The bytes are decoded once if the server's are equal
+        self._last_early: tuple[bytes, Notice | None] = b"", None
         self._warned: set[bytes] = set()
         # Notified of every key that the server says was changed, whichever listener read it
         self.watchers = ListenerGroup()
@@ -233,7 +228,8 @@ class Inbox:
             return
         for listener in listeners:
             try:
-                listener.on_notice(notice if listener.local or notice.slot is None else _unseen(notice), channel)
+                seen = listener.local or notice.slot is None  # else the listener does not read the publisher's memory
+                listener.on_notice(notice if seen else notice._replace(value=ANNOUNCED), channel)
             except Exception as error:  # one message must not end the connection for all that follow
                 self._unreadable(channel, error)
                 listener.invalidate(channel)
@@ -254,7 +250,7 @@ class Inbox:
             self._unreadable(channel, error)
 
     def _changed(self, names: Any) -> None:
-        """Notify the listeners of keys that the server says were changed; names of keys, or None for all."""
+        """Notify the listeners of keys that were changed; None for all."""
         if names is None:
             for group in (*self._topics.values(), self.watchers):
                 for listener in group.present():
@@ -278,8 +274,3 @@ class Inbox:
                 shorten(channel),
                 error,
             )
-
-
-def _unseen(notice: Notice) -> Notice:
-    """Return a notice for listeners that do not read the publisher's memory."""
-    return notice._replace(value=ANNOUNCED)

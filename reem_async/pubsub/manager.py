@@ -12,14 +12,16 @@ import logging
 import os
 import random
 import time
+import weakref
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 from ..concurrency.queues import noop
 from ..concurrency.tasks import Tasks
 from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
 from ..local.path import LocalPath
-from ..plan import Reply
+from ..plan import Command, Reply
 from ..plan.placeholders import Unreadable
 from ..session import Session
 from ..ships.registry import Ships
@@ -28,13 +30,14 @@ from ..transport.route import Moved, is_unapplied
 from ..transport.wire import Wire, close_all
 from .key_watcher import KeyWatcher
 from .listeners import NO_LISTENERS, Beginning, Inbox, Listener, ListenerGroup, Topic
-from .subscription_commands import Heartbeats, Invalidations, Subscribing
+from .subscription_commands import Invalidations, Subscribing
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport
 
 logger = logging.getLogger("reem.subscribe")
 
+_PERIOD = 1.0  # seconds between looks at a connection; one that is dead shows a call's time limit later
 _LONGEST_PAUSE = 0.5  # seconds between tries to connect: with one that hangs before it, still less than two in all
 _MOST_REPORTED = 1000  # places that cannot be read of which is warned: programs may publish under ever new names
 
@@ -59,7 +62,6 @@ class SubscriptionManager:
         self._wires: dict[Transport, Wire] = {}
         self._topics: dict[Topic, ListenerGroup] = {}
         self._subscribed: dict[Topic, Wire] = {}
-        self._unsure: set[Topic] = set()  # their keys are on their way to another node
         self._beginners: Sequence[Listener] = ()  # they begin by themselves once their topics are subscribed
         self._lock = asyncio.Lock()
         self.tasks = Tasks()  # all that runs in the background for what is followed; ended by `close`
@@ -294,7 +296,6 @@ class SubscriptionManager:
         if self._topics.get(topic, NO_LISTENERS).present():
             return
         self._topics.pop(topic, None)
-        self._unsure.discard(topic)
         self._subscribing.leave(self._subscribed.pop(topic, None), topic)
 
     def forget_empty(self) -> list[Listener]:
@@ -316,19 +317,12 @@ class SubscriptionManager:
         """Hand a listener the server's note of its key, unless that is an error of the server."""
         if isinstance(note, Moved):  # this node is only a replica now
             self._moved([listener.topic], str(note))
-        elif is_unapplied(note):
-            self._unsure.add(listener.topic)
         elif not isinstance(note, Exception):
-            if listener.topic in self._unsure:  # they are back: what was published meanwhile went elsewhere
-                self._unsure.discard(listener.topic)
-                for each in self._listeners([listener.topic]):
-                    each.invalidate(listener.topic.name)
             listener.on_note(note)
 
     def _moved(self, topics: list[Topic], reason: str) -> None:
         for topic in topics:
             wire = self._subscribed.pop(topic, None)
-            self._unsure.discard(topic)
             if wire is None:  # we have left it ourselves
                 continue
             if wire.alive:
@@ -342,7 +336,6 @@ class SubscriptionManager:
         topics = [topic for topic, there in self._subscribed.items() if there is wire]
         for topic in topics:
             del self._subscribed[topic]
-            self._unsure.discard(topic)
         for node, there in list(self._wires.items()):
             if there is wire:
                 del self._wires[node]
@@ -442,3 +435,89 @@ class SubscriptionManager:
         """Whether it goes on: not in a forked child, nor when its event loop was closed. Any thread may ask."""
         pid, loop = self.place
         return pid == os.getpid() and not loop.is_closed()
+
+
+class Heartbeats:
+    """Asks over each connection for the notes of the last updates, every second.
+
+    Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
+    time to live has passed. Belongs to an event loop.
+    """
+
+    def __init__(self, manager: SubscriptionManager) -> None:
+        self._manager = manager
+        self._period = _PERIOD
+        self._beating: dict[Wire, asyncio.Task[Any]] = {}
+
+    def start(self, wire: Wire) -> None:
+        self._beating[wire] = self._manager.tasks.start(self._beat(wire), "reem heartbeat")
+
+    def lost(self, wire: Wire) -> None:
+        self._beating.pop(wire, None)
+
+    def limit_period(self, seconds: float) -> None:
+        """Send probes at least that often as long as a listener needs it."""
+        if seconds < self._period:
+            self._period = seconds
+            for wire, task in list(self._beating.items()):
+                task.cancel()
+                self.start(wire)
+
+    async def _beat(self, wire: Wire) -> None:
+        loop = asyncio.get_running_loop()
+        looked = loop.time()
+        while True:
+            await asyncio.sleep(self._period)
+            if not wire.alive:
+                return
+            notes, answered, now = [], loop.create_future(), loop.time()
+            if now - looked > _PERIOD - self._period / 2:
+                looked = now
+                self._period = self._needed()
+                notes = self._notes(wire)
+            asked: list[Command] = [("GET", note) for note in notes] or [("PING",)]
+            self._probe(wire, now)
+            wire.send(asked, partial(self._on_notes, wire, notes, answered))
+            await answered  # a connection breaks only if nothing newer waits on it
+
+    # Functions of their own, since a task that held listeners while it waits would keep those that are dropped.
+
+    def _needed(self) -> float:
+        """Return the seconds between looks that those who still listen need."""
+        return min([_PERIOD, *(listener.heartbeat for listener in self._manager.forget_empty())])
+
+    def _notes(self, wire: Wire) -> list[str]:
+        return sorted({listener.note for listener in self._manager.listeners_over(wire) if listener.note is not None})
+
+    def _probe(self, wire: Wire, now: float) -> None:
+        """Ask for the types of the documents that are due by the middle of this period."""
+        documents: dict[str, list[weakref.ref[Listener]]] = {}
+        for listener in self._manager.listeners_over(wire):
+            if (document := listener.probe(now + self._period / 2)) is not None:
+                documents.setdefault(document, []).append(weakref.ref(listener))
+        if documents:
+            asked: list[Command] = [("TYPE", document) for document in documents]
+            wire.send(asked, partial(self._on_probes, list(documents.values()), now))
+
+    def _on_probes(self, asked: list[list[weakref.ref[Listener]]], sent: float, kinds: list[Reply] | Exception) -> None:
+        if isinstance(kinds, Exception):
+            return
+        for group, kind in zip(asked, kinds, strict=True):
+            for reference in group:
+                if (listener := reference()) is not None:
+                    listener.on_probe(kind, sent)
+
+    def _on_notes(
+        self, wire: Wire, names: list[str], answered: asyncio.Future[None], notes: list[Reply] | Exception
+    ) -> None:
+        if not answered.done():  # cancelled
+            answered.set_result(None)
+        if isinstance(notes, Exception):
+            return
+        self._manager.answered()
+        if not names:
+            return
+        found = dict(zip(names, notes, strict=False))
+        for listener in self._manager.listeners_over(wire):
+            if listener.note in found:
+                self._manager.on_note(listener, found[listener.note])

@@ -40,10 +40,7 @@ class Tried(NamedTuple):
 
 
 class Wait:
-    """One call of `wait_until`, and the states of the copy that it has not seen yet.
-
-    The event loop adds states, the caller takes them out, perhaps on another thread; each step is one of C.
-    """
+    """One call of `wait_until`. The event loop adds states, the caller takes them out, perhaps on another thread."""
 
     def __init__(self) -> None:
         # Trees, the oldest first. They are never changed in place.
@@ -174,7 +171,6 @@ class Mirror(Following):
         return default if found is MISSING and default is not MISSING else own(found)
 
     def _check_begun(self) -> Follower:
-        """Return the follower; raise Stale if there is none."""
         follower = self._link.follower
         if follower is None:
             raise Stale(f"{self.channel}: this mirror does not follow yet; use it in a `with`, or call listen() first")
@@ -191,10 +187,6 @@ class Mirror(Following):
         if self._link.interface_closed:
             raise Stale(f"{self.channel}: the RedisInterface of this mirror is closed; make new ones")
         return self._check_begun()
-
-    def _check(self) -> None:
-        if (refusal := self._refusal(self._check_open())) is not None:
-            raise refusal
 
     def _refusal(self, follower: Follower) -> Stale | None:
         """Return the error of an answer; None if the copy may be relied on."""
@@ -248,7 +240,6 @@ class Mirror(Following):
             InterfaceClosed: The mirror was closed, or the interface.
         """
         timeout = _limit(predicate, timeout)
-        # Kept, to tell its end from a TimeoutError that the predicate raises.
         limit = asyncio.timeout(timeout)
         try:
             async with limit:
@@ -325,7 +316,6 @@ class Mirror(Following):
 
 
 def _limit(predicate: Any, timeout: float | None) -> float | None:
-    """Return for how long to wait; raise BadType or BadValue for what cannot be waited for."""
     if not callable(predicate):
         raise BadType(f"predicate={shorten(predicate)} is not a function; use one that is called with the value")
     return waiting_limit(timeout)
@@ -354,7 +344,8 @@ class MirrorAccessor(LocalAccessor):
             MissingKey: Nothing is here.
             Stale: As `Mirror.value`; Silent is one.
         """
-        self._subscriber._check()
+        if (refusal := self._subscriber._refusal(self._subscriber._check_open())) is not None:
+            raise refusal
         return super().read()
 
     def get(self, default: Any = None) -> Any:

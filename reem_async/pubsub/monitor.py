@@ -86,9 +86,8 @@ class Monitor(PatternStream[Event]):
         policy: What to keep for a loop that is slower than the updates; `Every(10_000)` if not given.
         namespaces: A glob of namespaces to watch at once, such as "robots/*:", in place of the interface's own.
             `event.namespace` says which it was: the shortest that fits.
-        patience: Seconds that updates may wait here for each other while many come, unless somebody who follows
-            something through this interface is in a hurry. Who only notes what happens costs publishers less so:
-            he is woken less often.
+        patience: Seconds that updates may wait here for each other while many come, unless another subscriber of this
+            interface waits for its updates. That costs publishers less.
 
     Attributes:
         invalidated: Called with a top-level key of which a message could not be read.
@@ -96,9 +95,7 @@ class Monitor(PatternStream[Event]):
         resynchronised: Called when it is followed again after a loss, once for each connection.
         changed: Called with each key that the server says was changed, None for all, after `watch_changes`.
 
-    A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each
-    other: they come from different nodes. There, whose servers have no patterns for what only one node is told,
-    the keys are looked for, and publishers tell all nodes for the first seconds of a key.
+    A publisher's updates of a key come in their order. In a cluster, those of different keys may overtake each other.
 
     Raises:
         BadKey: Not a pattern.
@@ -179,11 +176,8 @@ class Monitor(PatternStream[Event]):
     def _resynchronised(self) -> None:
         if not self._resynchronising:  # all patterns of one connection begin in the same turn
             self._resynchronising = True
-            asyncio.get_running_loop().call_soon(self._end_turn)
+            asyncio.get_running_loop().call_soon(setattr, self, "_resynchronising", False)
             self.resynchronised()
-
-    def _end_turn(self) -> None:
-        self._resynchronising = False
 
     def _doubt(self, channel: bytes) -> None:
         place = self._split(channel)
@@ -193,7 +187,7 @@ class Monitor(PatternStream[Event]):
         self.invalidated(place[1])
 
     def _owe(self, whole: str, missed: int) -> None:
-        """Have the next event of a key say that updates were lost."""
+        """Have the next event of a key report a loss."""
         if len(self._owed) >= _MOST_OWED:
             self._owed.clear()
             self._lost()

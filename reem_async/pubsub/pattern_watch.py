@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import weakref
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 
 from ..concurrency.queues import BoundedQueue, Last, Policy, chosen
@@ -56,70 +56,58 @@ class PatternWatch(PatternStream[Update]):
     ) -> None:
         super().__init__(session, parse_patterns(patterns), chosen(policy, Last(_MOST_WAITING)))
         self._largest = checked_largest(largest)
-        self._followed: dict[str, list[Follower]] = {}
-        self._born: dict[str, list[Notice]] = {}  # about to be followed
-        self._failed: set[str] = set()  # could not be followed: what is there later was not made just then
-        self._unreadable: dict[str, tuple[Path, ...]] = {}  # places in keys, because of what is there, or of rights
-        self._warned: set[tuple[str, Path]] = set()
+        self._followed: dict[str, dict[Path, Follower]] = {}  # by top-level key, and the place in it
+        self._born: dict[str, list[Notice]] = {}  # what was heard of keys that are about to be followed
+        # Because of what is there, or of rights; tried again in each search
+        self._unreadable: set[tuple[str, Path]] = set()
 
     def _listener(self, topic: Topic) -> Listener:
         return _Publishers(self, topic)
 
     async def _begin(self, manager: SubscriptionManager) -> None:
         # The patterns are subscribed to by now: a key that is made during the search is heard of.
-        await self._follow(self._new(await present_keys(self._session, self.tops)), late=False)
+        await self._follow(await present_keys(self._session, self.tops), late=False)
         manager.tasks.start(find_regularly(_searching(weakref.ref(self))), "reem discovery")
 
     def _leaving(self) -> list[Listener]:
-        leaving = [*self._listeners, *(each for there in self._followed.values() for each in there)]
+        leaving = [*self._listeners, *(each for there in self._followed.values() for each in there.values())]
         self._followed = {}
         self._born.clear()
-        self._failed.clear()
         self._unreadable.clear()
-        self._warned.clear()
         return leaving
-
-    def _new(self, found: set[str]) -> list[str]:
-        lacking = (found - self._followed.keys()) | (found & self._unreadable.keys())
-        return sorted(name for name in lacking if self._paths(name))
 
     def _paths(self, name: str) -> list[Path]:
         """Return the places to follow in a key: what the patterns spell out, but not what is below another of these."""
         paths = {spelled_out(pattern.rest) for pattern in self.patterns if pattern.concerns((name,))}
         return [path for path in paths if not any(path[: len(other)] == other for other in paths - {path})]
 
-    async def _follow(self, names: Iterable[str], *, late: bool) -> None:
-        """Follow some keys. A warning names what cannot be read; each search tries it again."""
+    async def _follow(self, found: set[str], *, late: bool) -> None:
+        """Follow what is not followed yet of some keys. A warning names what cannot be read."""
         manager = self._manager
         if manager is None or self._closed:  # meanwhile
             return
-        coming: dict[str, dict[Path, Follower]] = {}
-        for name in names:
-            is_new = late and name not in self._failed and name not in self._followed
-            self._failed.discard(name)
-            if places := self._lacking(name):
-                born = self._born.setdefault(name, [])
-                there = {path: self._follower(name, path, born if is_new else None, manager) for path in places}
-                self._followed.setdefault(name, []).extend(there.values())
-                coming[name] = there
-        followers = [follower for there in coming.values() for follower in there.values()]
+        unreadable = {name for name, _ in self._unreadable}
+        coming: dict[tuple[str, Path], Follower] = {}
+        for name in sorted((found - self._followed.keys()) | (found & unreadable)):
+            is_new = late and name not in unreadable
+            for path in self._paths(name):
+                there = self._followed.setdefault(name, {})
+                if path not in there:
+                    born = self._born.setdefault(name, [])
+                    there[path] = coming[name, path] = self._follower(name, path, born if is_new else None, manager)
+        followers = list(coming.values())
         try:
             await manager.subscribe_all(followers)
-            for name in list(coming):
-                await self._begin_key(name, coming[name], manager)
-                self._born.pop(name, None)  # not earlier: each follower of the key is to have what was heard
-                del coming[name]
+            for place, follower in list(coming.items()):
+                await self._begin_place(place, follower, manager)
+                del coming[place]
         finally:
-            for name, there in coming.items():  # they are found again
-                self._born.pop(name, None)
-                self._put_off(name, there)
-            if self._closed:  # meanwhile
-                for follower in followers:
+            for follower in followers:
+                self._born.pop(follower.keys.name, None)
+                if self._closed:  # meanwhile
                     self._let_go(follower)
-
-    def _lacking(self, name: str) -> Iterable[Path]:
-        unreadable = self._unreadable.pop(name, ())
-        return unreadable if name in self._followed else self._paths(name)
+            for name, path in coming:  # they are found again
+                self._drop(name, path)
 
     def _follower(self, name: str, path: Path, born: list[Notice] | None, manager: SubscriptionManager) -> Follower:
         session, keys = self._session, self._session.keys(name)
@@ -128,37 +116,19 @@ class PatternWatch(PatternStream[Update]):
         follower.born = born
         return follower
 
-    async def _begin_key(self, name: str, there: dict[Path, Follower], manager: SubscriptionManager) -> None:
-        """Begin to follow places in one key, and take them out; those that cannot be read are put off."""
-        unreadable: dict[Path, Follower] = {}
-        for path, follower in list(there.items()):
-            try:
-                await manager.follow_here(follower)
-            except ReemError as error:
-                if isinstance(error, RedisError | InterfaceClosed) and not isinstance(error, NotAllowed | WrongKind):
-                    raise
-                unreadable[path] = follower
-                if (name, path) not in self._warned:
-                    self._warned.add((name, path))
-                    logger.warning("%s cannot be watched until that is mended: %s", show((name, *path)), error)
-            else:
-                self._warned.discard((name, path))
-            del there[path]
-        if unreadable:
-            self._put_off(name, unreadable)
-            self._unreadable[name] = tuple(unreadable)
-
-    def _put_off(self, name: str, there: dict[Path, Follower]) -> None:
-        """Drop followers that could not begin, which is tried again; those of other places in the key go on."""
-        left = [each for each in self._followed.get(name, []) if each not in there.values()]
-        for follower in there.values():
-            self._let_go(follower)
-        if left:
-            self._followed[name] = left
-            self._unreadable[name] = (*self._unreadable.get(name, ()), *there)
+    async def _begin_place(self, place: tuple[str, Path], follower: Follower, manager: SubscriptionManager) -> None:
+        name, path = place
+        try:
+            await manager.follow_here(follower)
+        except ReemError as error:
+            if isinstance(error, RedisError | InterfaceClosed) and not isinstance(error, NotAllowed | WrongKind):
+                raise
+            self._drop(name, path)
+            if place not in self._unreadable:
+                self._unreadable.add(place)
+                logger.warning("%s cannot be watched until that is mended: %s", show((name, *path)), error)
         else:
-            self._followed.pop(name, None)
-            self._failed.add(name)
+            self._unreadable.discard(place)
 
     def heard(self, notice: Notice, channel: bytes) -> None:
         name = name_of(channel, self._session.namespace)
@@ -168,15 +138,16 @@ class PatternWatch(PatternStream[Update]):
                 born.append(notice)
             return
         # The follower of a deleted key has told that; an unreadable one waits for a search.
-        if (notice.deleted and not notice.path) or name in self._followed or name in self._unreadable:
+        if (notice.deleted and not notice.path) or name in self._followed:
             return
-        if name and self._manager is not None and self._paths(name):
+        paths = self._paths(name) if name else []
+        if paths and self._manager is not None and self._unreadable.isdisjoint((name, path) for path in paths):
             self._born[name] = [notice]
-            self._manager.tasks.start(self._follow_late([name]), "reem discovery of new keys")
+            self._manager.tasks.start(self._follow_late({name}), "reem discovery of new keys")
 
-    async def _follow_late(self, names: Iterable[str]) -> None:
+    async def _follow_late(self, found: set[str]) -> None:
         try:
-            await self._follow(names, late=True)
+            await self._follow(found, late=True)
         except (RedisError, OSError, InterfaceClosed) as error:
             logger.debug("new keys are not followed yet: %s", error)
 
@@ -189,13 +160,17 @@ class PatternWatch(PatternStream[Update]):
         asyncio.get_running_loop().call_soon(self._drop_if_gone, name)
 
     def _drop_if_gone(self, name: str) -> None:
-        if all(follower.gone for follower in self._followed.get(name, [])):
-            self._drop(name)
+        there = self._followed.get(name, {})
+        if all(follower.gone for follower in there.values()):
+            for path in list(there):
+                self._drop(name, path)
 
-    def _drop(self, name: str) -> None:
-        self._unreadable.pop(name, None)
-        for follower in self._followed.pop(name, []):
-            self._let_go(follower)
+    def _drop(self, name: str, path: Path) -> None:
+        there = self._followed.get(name, {})
+        if path in there:
+            self._let_go(there.pop(path))
+        if not there:
+            self._followed.pop(name, None)
 
     def _let_go(self, follower: Follower) -> None:
         follower.queues = []  # it reports nothing more: the next follower of the place does
@@ -205,14 +180,11 @@ class PatternWatch(PatternStream[Update]):
     async def look(self) -> None:
         followed = list(self._followed)
         found = await present_keys(self._session, self.tops)
-        self._failed &= found
-        for name in self._unreadable.keys() - found:
-            del self._unreadable[name]
-        self._warned = {each for each in self._warned if each[0] in found}
+        self._unreadable = {place for place in self._unreadable if place[0] in found}
         for name in followed:  # of a place in a key, no update says that all of the key is gone
             if name not in found:
                 self._drop_if_gone(name)
-        await self._follow_late(self._new(found))
+        await self._follow_late(found)
 
 
 def _searching(reference: weakref.ref[PatternWatch]) -> Callable[[], Awaitable[bool]]:

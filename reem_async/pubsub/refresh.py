@@ -28,8 +28,8 @@ BACKGROUND_RATE = 8 << 20
 class RefreshTimer(Generic[Owner]):
     """Calls for looks at one thing that changes. Belongs to an event loop.
 
-    A published update is a change too, which its notice explains. So most looks at what is published find nothing:
-    where a notice has come with the change the look waits, after each look that found nothing twice as long.
+    Most looks at what is published find nothing: its notice explains the change. So where a notice has come with the
+    change the look waits, after each look that found nothing twice as long.
     """
 
     def __init__(self, owner: Owner, look: Callable[[Owner], None], pace: Pace) -> None:
@@ -45,7 +45,6 @@ class RefreshTimer(Generic[Owner]):
 
     @property
     def due(self) -> bool:
-        """Whether a change was reported and not looked at."""
         return self._next is not None
 
     def ask(self) -> None:

@@ -1,8 +1,6 @@
 """The local copy of a path, kept equal to the server's: a state machine without I/O, clock or tasks.
 
-What happens goes in by the methods: notices, notes, replies, a connection that begins or is lost. What is to be done,
-and what is to be told, comes out of `outputs`, in order. `follower.py` drives it; tests drive it with every order of
-events that a server can bring about.
+Its methods take what happens. Commands and events come out of `outputs`, in order. `follower.py` drives it.
 
         begin()
            |
@@ -24,24 +22,18 @@ events that a server can bring about.
         any -- lost() --> OFFLINE -- begin() --> READING
 
 Large values are read over another connection than that of the notices: servers close a subscribed connection that owes
-over 32 MB, and small updates should not wait behind an image. `feed.py` draws the steps
-of a read, `division.py` says which of the updates that were heard meanwhile are in what was read.
+over 32 MB, and small updates should not wait behind an image. `feed.py` draws the steps of a read, `division.py` says
+which of the updates that were heard meanwhile are in what was read.
 
-The second source of change is the server itself (CLIENT TRACKING): of each key that was read over the connection of the
-notices it says once that a client has modified it, in order with notices and replies. That comes in as `changed`. What
-was changed, and whether a notice has told of it already, the next snapshot shows, which also has the server tell of
-the next change. What a snapshot differs in from the copy, the notices in it applied, is reported as `Stored`.
+With CLIENT TRACKING the server reports once (`changed`) that a key was modified which was read over the connection of
+the notices, in order with notices and replies. The next snapshot shows what was changed, and has the next change
+reported. What it differs in from the copy, the notices in it applied, is reported as `Stored`.
 
-- READING in order: a change that is reported before the reply was made before it, so the reply has it.
-- ARMING: of what is read over another connection the server would tell that one. So the keys are touched first over the
-  connection of the notices. What is reported between that and the snapshot may or may not be in it, so there is a look.
-- Attachments whose keys were not changed since they were read are not fetched again. In a snapshot
-  that was taken aside they belong together with the rest only if no change of theirs comes before its fence.
-
-An update may be reported early, before the server has it (`on_early`), to a copy that is CURRENT. The update itself
-confirms it and is not reported again. If it is not confirmed, or another update of the same place comes first, the
-place is read and reported with a gap. A look waits until all early updates are confirmed. After a read that begins for
-another reason the update is reported again. `EarlyUpdates` draws it.
+- READING in order: a change that is reported before the reply is in the reply.
+- ARMING: keys that are read over another connection are touched over this one first. What is reported between that and
+  the snapshot may or may not be in it, so there is a look.
+- Attachments whose keys were not changed are not fetched again. With a snapshot that was taken aside they belong
+  together only if no change of theirs comes before its fence.
 """
 
 from __future__ import annotations
@@ -76,23 +68,16 @@ __all__ = [
 
 
 _NONE = object()
-_UNCONFIRMED = (
-    100  # early updates of one publisher that a copy has at most: what follows is reported when it is confirmed
-)
+_UNCONFIRMED = 100  # early updates of one publisher in a copy; further ones are reported when they are confirmed
 _PATIENT = 3  # notes, one a second, after which what was told early should have been confirmed: at least two seconds
 
 
 class Outcome(Enum):
     """What an update says of those that were told early."""
 
-    NEW = auto()
-    """Nothing: it is to be taken as any other."""
-
-    CONFIRMED = auto()
-    """It is one of them."""
-
-    WRONG = auto()
-    """One of them is not what the server has, or in another order."""
+    NEW = auto()  # nothing: it is to be taken as any other
+    CONFIRMED = auto()  # it is one of them
+    WRONG = auto()  # one of them is not what the server has, or in another order
 
 
 class State(Enum):
@@ -150,10 +135,10 @@ class Replica:
     # --- what happens to the connection
 
     def begin(self, *, initial: bool, tracked: bool = False, born: bool = False) -> None:
-        """A connection that is subscribed begins: the first one, or one after a loss.
+        """Start on a connection that is subscribed: the first one (`initial`), or one after a loss.
 
-        The key is just `born` if nothing was there a moment ago: what is there now is reported as what changed. It is
-        `tracked` if `changed` will be called for what is read over it and changed afterwards.
+        If nothing was there a moment ago (`born`), what is there now is reported as what changed. If `tracked`,
+        `changed` is called for what is read over it and changed afterwards.
         """
         self._feed.begin(initial=initial or born, tracked=tracked)
         self._begins = True
@@ -189,7 +174,7 @@ class Replica:
         return self._early.since
 
     def on_early(self, notice: Notice, moment: float = 0.0) -> None:
-        """A publisher says at this moment what it is about to publish: reported if it certainly comes next."""
+        """Report what a publisher is about to publish, if it certainly comes next to a copy that is CURRENT."""
         early = self._early
         if self.state is not _CURRENT or notice.value is ANNOUNCED or not early.fits(notice):
             return
@@ -201,7 +186,7 @@ class Replica:
             early.told(notice, before, moment)
 
     def _settles(self, notice: Notice, missing: int) -> bool:
-        """Compare an update with what was told early; return whether there is nothing more to do for it."""
+        """Return whether there is nothing more to do for an update, by what was told early."""
         outcome = self._early.settle(notice, missing)
         if outcome is Outcome.WRONG:
             self._early.clear()
@@ -228,10 +213,7 @@ class Replica:
     # --- what the server says was changed
 
     def changed(self, key: str | None) -> None:
-        """A key was changed after it had been read over this connection: told once, in order with notices.
-
-        It is the document's or an attachment's, None for every key.
-        """
+        """A document or attachment was changed after it had been read over this connection; None for every key."""
         feed = self._feed
         was_dirty = feed.dirty
         if feed.tracked and self.state is not State.OFFLINE and feed.change(key) and not was_dirty:
@@ -250,7 +232,6 @@ class Replica:
             self._read()
 
     def armed(self, number: int, error: Exception | None = None) -> None:
-        """The keys were touched, unless there was an `error`: changes are reported from now on."""
         if number != self._feed.number or self.state is not State.ARMING:
             return
         if error is not None:
@@ -319,12 +300,10 @@ class Replica:
         self.outputs.append(step)
 
     def replies(self, number: int, outcome: list[Reply] | Exception) -> None:
-        """What a plan brought; in order with notices, unless it is a `bulk` one."""
         if self._awaits(number, Phase.IN_ORDER, Phase.ASIDE):
             self._go_on(outcome if isinstance(outcome, Exception) else partial(self._feed.answered, outcome))
 
     def fenced(self, number: int, error: Exception | None = None) -> None:
-        """All that was published before the fence was asked for has arrived, unless there was an `error`."""
         if self._awaits(number, Phase.FENCING):
             self._go_on(error or self._feed.fenced)
 
@@ -346,10 +325,7 @@ class Replica:
             self._perform(step)
 
     def opened(self, number: int, tree: Any) -> None:
-        """The ships have made a tree of a snapshot: it is the copy now.
-
-        Tells of the updates that it has, then applies what came later.
-        """
+        """Take the tree of a snapshot for the copy, report the updates in it, and apply later ones."""
         if number != self._feed.number or self.state is not State.OPENING:
             return
         covered, later = self._feed.take()
@@ -386,18 +362,15 @@ class Replica:
 class EarlyUpdates:
     """Updates that were reported before the server had them, in the order of each publisher.
 
-            told()                                   settle(): the update itself comes
-        ----------> in the copy --------------------------------------------------------> confirmed, already reported
-                       |  |                          settle(): something else comes first
-                       |  +-------------------------------------------------------------> wrong, reported with a gap
-                       | read(): a snapshot takes the copy's place, and may not have it
-                       v
-                    awaited ------------------------------------------------------------> reported again by its notice
-                          |                          settle(): something else comes first
-                          +-------------------------------------------------------------> wrong, reported with a gap
+    The update itself confirms one. A wrong one has the place read and reported with a gap.
 
-    In both states it is wrong, too, if it does not come for long (`overdue`): the server has refused it, or its
-    publisher is dead.
+            told()                     settle(): the update itself comes
+        ----------> in the copy ------------------------------------------> confirmed, not reported again
+                         | read(): a snapshot, which may not have it
+                         v
+                      awaited --------------------------------------------> reported again by its notice
+
+        both -- settle(): something else comes first, or overdue(): refused, or its publisher is dead --> wrong
 
     Args:
         path: What the copy holds.
@@ -426,12 +399,11 @@ class EarlyUpdates:
         return len(self._told.get(notice.publisher, ())) < _UNCONFIRMED and not self._touches(notice)
 
     def last(self, publisher: str) -> int | None:
-        """Return the number of the last one of a publisher."""
         chain = self._told.get(publisher)
         return chain[-1][0].sequence if chain else None
 
     def told(self, notice: Notice, before: Any, moment: float) -> None:
-        """An update was reported, and applied to the copy, which was `before` until then."""
+        """Note an update that was reported, and applied to the copy, which was `before` until then."""
         if not self._told:
             self._base, self._in_copy = before, True
         self._notes.setdefault(notice.publisher, 0)
@@ -458,19 +430,15 @@ class EarlyUpdates:
                 outcome = Outcome.CONFIRMED
         if self._in_copy:
             self.since = min([each[0][1] for each in self._told.values()], default=math.inf)
-            self._confirm(notice, missing)
+            if not self._told:
+                self._base = _NONE
+            elif missing == 0 and concerns(notice, self._path) and is_whole(notice, self._path, self._base):
+                with contextlib.suppress(CannotApply):  # the copy itself is read in this case
+                    self._base = applied(self._base, notice, self._path)
         return outcome
 
-    def _confirm(self, notice: Notice, missing: int) -> None:
-        """Apply what the server has to the copy without early updates."""
-        if not self._told:
-            self._base = _NONE
-        elif missing == 0 and concerns(notice, self._path) and is_whole(notice, self._path, self._base):
-            with contextlib.suppress(CannotApply):  # the copy itself is read in this case
-                self._base = applied(self._base, notice, self._path)
-
     def overdue(self) -> bool:
-        """The server was asked for its note; return whether one of them should have been confirmed by now."""
+        """Return, for each note of the server, whether one of them should have been confirmed by now."""
         for publisher in self._notes:
             self._notes[publisher] += 1
         return any(notes >= _PATIENT for notes in self._notes.values())

@@ -1,9 +1,7 @@
 """Silence: for how long no update may arrive until what was received last counts for nothing.
 
-All clocks are this program's `time.monotonic`. A clock starts when the notice of an update arrives, so it needs neither
-the server nor the publisher, nor their clocks. Only published updates count, equal values too. What is found at the
-beginning or after a loss may be of any age, and plain writes have no publisher that could fall silent. While the key
-has an owner, its updates alone count: see `plan.leases.FenceFilter`.
+The clock is this program's `time.monotonic`, from when the notice of an update arrives. Only published updates count,
+equal values too; while the key has an owner, its updates alone: see `plan.leases.FenceFilter`.
 """
 
 from __future__ import annotations

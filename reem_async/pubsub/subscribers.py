@@ -98,7 +98,7 @@ class Watch(Stream[Update]):
         keys: The top-level key's names.
         path: The path below it.
         policy: What to keep for a loop that is slower than the updates.
-        queue: Where they go, if it is not to be a plain one.
+        queue: Where they go; a plain queue if not given.
         stored: Yield what is only stored, too.
         ttl: Seconds without a published update after which there is silence. Only updates that are not older are
             yielded then, and one when silence begins (`silent`).

@@ -1,26 +1,22 @@
-"""What is sent over a subscription connection: SUBSCRIBE, CLIENT TRACKING and periodic probes."""
+"""What is sent over a subscription connection: SUBSCRIBE, CLIENT TRACKING, and TYPE to touch keys."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import weakref
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, Protocol
 
-from ..concurrency.tasks import Tasks
 from ..errors import ServerNotReady, is_of_command
-from ..plan import Command, Reply, blamed
+from ..plan import Reply, blamed
 from ..transport import Transport
 from ..transport.wire import Wire
-from .listeners import Listener, Topic
+from .listeners import Topic
 
 logger = logging.getLogger("reem.subscribe")
 
 _TRACK = ("CLIENT", "TRACKING", "ON")
 """Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
-_PERIOD = 1.0  # seconds between looks at a connection; one that is dead shows a call's time limit later
 
 
 class Subscribing:
@@ -29,15 +25,13 @@ class Subscribing:
     def __init__(
         self,
         transport: Transport,
-        host: str | None,
-        confirmed: Callable[[Topic, Wire], None],
-        joined: Callable[[bytes], None],
+        host: str | None,  # what names this host to publishers that share memory with it; none if that is off
+        confirmed: Callable[[Topic, Wire], None],  # called when the server has confirmed a subscription
+        joined: Callable[[bytes], None],  # called with a channel of which publishers here can count the listeners now
     ) -> None:
         self._transport = transport
-        self._host = host  # what names this host to publishers that share memory with it; none if that is off
-        # Called with a topic and the connection when the server has confirmed a subscription
+        self._host = host
         self._on_confirmed = confirmed
-        # Called with a channel of which publishers on this host can count the listeners now
         self._on_joined = joined
         self._invited: set[Topic] = set()  # publishers of this host know of a listener
 
@@ -146,100 +140,3 @@ class Invalidations:
                 reason,
                 right,
             )
-
-
-class Connections(Protocol):
-    """What is needed of the subscription manager, which imports this module."""
-
-    tasks: Tasks
-
-    def listeners_over(self, wire: Wire) -> list[Listener]: ...
-    def forget_empty(self) -> list[Listener]: ...
-    def answered(self) -> None: ...
-    def on_note(self, listener: Listener, note: Reply) -> None: ...
-
-
-class Heartbeats:
-    """Asks over each connection for the notes of the last updates, every second.
-
-    Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
-    time to live has passed. Belongs to an event loop.
-    """
-
-    def __init__(self, manager: Connections) -> None:
-        self._manager = manager
-        self._period = _PERIOD
-        self._beating: dict[Wire, asyncio.Task[Any]] = {}
-
-    def start(self, wire: Wire) -> None:
-        self._beating[wire] = self._manager.tasks.start(self._beat(wire), "reem heartbeat")
-
-    def lost(self, wire: Wire) -> None:
-        self._beating.pop(wire, None)
-
-    def limit_period(self, seconds: float) -> None:
-        """Send probes at least that often as long as a listener needs it."""
-        if seconds < self._period:
-            self._period = seconds
-            for wire, task in list(self._beating.items()):
-                task.cancel()
-                self.start(wire)
-
-    async def _beat(self, wire: Wire) -> None:
-        loop = asyncio.get_running_loop()
-        looked = loop.time()
-        while True:
-            await asyncio.sleep(self._period)
-            if not wire.alive:
-                return
-            notes, answered, now = [], loop.create_future(), loop.time()
-            if now - looked > _PERIOD - self._period / 2:
-                looked = now
-                self._period = self._needed()
-                notes = self._notes(wire)
-            asked: list[Command] = [("GET", note) for note in notes] or [("PING",)]
-            self._probe(wire, now)
-            wire.send(asked, partial(self._on_notes, wire, notes, answered))
-            await answered  # a connection breaks only if nothing newer waits on it
-
-    # Functions of their own, since a task that held listeners while it waits would keep those that are dropped.
-
-    def _needed(self) -> float:
-        """Return the seconds between looks that those who still listen need."""
-        return min([_PERIOD, *(listener.heartbeat for listener in self._manager.forget_empty())])
-
-    def _notes(self, wire: Wire) -> list[str]:
-        return sorted({listener.note for listener in self._manager.listeners_over(wire) if listener.note is not None})
-
-    def _probe(self, wire: Wire, now: float) -> None:
-        """Ask for the types of the documents that are due by the middle of this period."""
-        documents: dict[str, list[weakref.ref[Listener]]] = {}
-        for listener in self._manager.listeners_over(wire):
-            if (document := listener.probe(now + self._period / 2)) is not None:
-                documents.setdefault(document, []).append(weakref.ref(listener))
-        if documents:
-            asked: list[Command] = [("TYPE", document) for document in documents]
-            wire.send(asked, partial(self._on_probes, list(documents.values()), now))
-
-    def _on_probes(self, asked: list[list[weakref.ref[Listener]]], sent: float, kinds: list[Reply] | Exception) -> None:
-        if isinstance(kinds, Exception):
-            return
-        for group, kind in zip(asked, kinds, strict=True):
-            for reference in group:
-                if (listener := reference()) is not None:
-                    listener.on_probe(kind, sent)
-
-    def _on_notes(
-        self, wire: Wire, names: list[str], answered: asyncio.Future[None], notes: list[Reply] | Exception
-    ) -> None:
-        if not answered.done():  # cancelled
-            answered.set_result(None)
-        if isinstance(notes, Exception):
-            return
-        self._manager.answered()
-        if not names:
-            return
-        found = dict(zip(names, notes, strict=False))
-        for listener in self._manager.listeners_over(wire):
-            if listener.note in found:
-                self._manager.on_note(listener, found[listener.note])

@@ -143,7 +143,7 @@ class KeyReader:
 
     async def _opened(self, raw_read: RawRead, *, keeps: bool) -> tuple[Fetched, Reply]:
         """Have the ships make values, and keep of which of them nothing else is known."""
-        self.feed.attachments.opening(raw_read)
+        self.feed.attachments.raw = raw_read
         await opened(raw_read)
         manager_of(self._session).report(raw_read.unreadable)
         made = [(slot, slot.container[slot.key]) for slot, ship, _ in raw_read.slots if ship.blob is not None]
@@ -153,7 +153,7 @@ class KeyReader:
         if keeps:
             self.feed.attachments.opened()
         else:
-            self.feed.attachments.failed()  # what was read is not to stay in memory
+            self.feed.attachments.raw = None  # what was read is not to stay in memory
         for slot, value in made:
             slot.container[slot.key] = New(value, slot.container[slot.key])
         return Fetched(raw_read.holder[0], size_of(raw_read), raw_read.also[0]), raw_read.also[0]
