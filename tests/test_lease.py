@@ -412,7 +412,7 @@ async def test_a_lease_ends_with_its_interface_and_its_server(server):
         await cmd.write(1)
         with redis.Redis.from_url(server.url) as client:
             client.flushall()
-        with pytest.raises(LeaseLost):
+        with pytest.raises(LeaseLost, match="or the server has lost its data"):
             await cmd.write(3)
         await cmd.acquire()
         follower = redis.Redis.from_url(server.url).pubsub()

@@ -93,7 +93,7 @@ class Lease:
         if self.held is not None and found == self.held.text:
             return True
         if found is None:
-            self._lost = f"the lease has expired, since it was not renewed for {self._milliseconds / 1000:g} s"
+            self._lost = f"the lease has expired ({self._milliseconds / 1000:g} s), or the server has lost its data"
         else:
             self._lost = f"{claimed(found)} has taken it over"
         return False
