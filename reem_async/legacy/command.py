@@ -30,7 +30,7 @@ def migrate(
     """Convert data of REEM 0.1 or older, or of a server without JSON, in place.
 
     Without --yes everything is read and checked, and nothing is changed. End the programs of old versions
-    first. Each key is one transaction, so this can be interrupted at any time and started again; new data
+    first. Each key is written in one transaction. This can be interrupted at any time and started again; new data
     is left alone. An old RDB file is loaded by `reem up --from FILE`.
 
     Exit code 1 if a key cannot be converted; it stays as it is.
@@ -60,9 +60,6 @@ def _show(done: Migration, as_json: bool) -> None:
         return
     good = [key for key in done.keys if not key.problem]
     columns([[clean(key.name), clean(_what(key)), _removed(key)] for key in good], ["cyan", "", "dim"])
-    for key in good:
-        if key.lost:
-            note(f"{', '.join(key.lost)}: kept, but not in the document; REEM 0.1 may have forgotten it by mistake")
     for key in done.problems:
         note(f"{key.name} is left as it is: {key.problem}")
     keys = counted(len(good), "key")

@@ -24,7 +24,6 @@ class OldKey:
     places: dict[str, str] | None = None  # of ships' values, with labels; None if there is no second document
     rooted: bool = False  # its value is no dict and was stored in one
     stale: list[str] = field(default_factory=list)  # Redis keys of arrays that old programs have left behind
-    lost: list[str] = field(default_factory=list)  # Redis keys of other arrays that are in no document, see `Migrated`
 
     @property
     def misread(self) -> bool:
@@ -39,7 +38,7 @@ async def find(session: Session, *, stale: bool = True) -> list[OldKey]:
     """
     found: dict[str, OldKey] = {}
     async for names in _pages(session, DOCUMENT):
-        for name, reply in zip(names, await _asked(session, [_question(name) for name in names]), strict=True):
+        for name, reply in zip(names, await asked(session, [_question(name) for name in names]), strict=True):
             _note(session, found, name, reply)
     if stale and any(each.places is not None for each in found.values()):
         async for names in _pages(session, "hash"):
@@ -63,7 +62,7 @@ def _decoded(key: bytes) -> str | None:
         return None
 
 
-async def _asked(session: Session, commands: Sequence[tuple[Any, ...]]) -> Sequence[Reply]:
+async def asked(session: Session, commands: Sequence[tuple[Any, ...]]) -> Sequence[Reply]:
     if not commands:
         return []
     replies: Sequence[Reply] = await session.run(Plan(commands, lambda replies: replies))
@@ -91,17 +90,24 @@ def _note(session: Session, found: dict[str, OldKey], document: str, reply: Repl
 async def _add_stale(session: Session, found: dict[str, OldKey], names: Sequence[str]) -> None:
     """Add the hashes that are arrays of old keys, but not in their documents."""
     owned = [(name, owner) for name in names if (owner := _owner(session, found, name)) is not None]
-    replies = await _asked(session, [("HKEYS", name) for name, _ in owned])
+    replies = await asked(session, [("HKEYS", name) for name, _ in owned])
     for (name, owner), fields in zip(owned, replies, strict=True):
         if isinstance(fields, NotAllowed):  # else the arrays would silently stay for ever
             raise fields
-        if isinstance(fields, list | set) and is_array(frozenset(map(bytes, fields))):
-            place = name[len(session.namespace) + len(owner.name) :]
-            (owner.lost if _may_be_lost(place, owner.places or ()) else owner.stale).append(name)
+        place = name[len(session.namespace) + len(owner.name) :]
+        if (
+            isinstance(fields, list | set)
+            and is_array(frozenset(map(bytes, fields)))
+            and not _may_be_lost(place, owner.places or ())
+        ):
+            owner.stale.append(name)
 
 
 def _may_be_lost(place: str, places: Iterable[str]) -> bool:
-    """Return whether this name begins with that of another place, but is not inside it."""
+    """Return whether this name begins with that of another place, but is not inside it.
+
+    Writing `foo.image` made old programs forget `foo.image2`: that array stays.
+    """
     return any(place.startswith(each) and place[len(each) :][:1] not in ("", ".", "[") for each in places)
 
 
