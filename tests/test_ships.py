@@ -257,6 +257,32 @@ async def test_an_async_subscriber_sees_ships_too(server_url, key):
         assert (update.value, update.data) == (Pose(1.0, 1.0), {"at": Pose(1.0, 1.0)})
 
 
+async def test_calls_of_services_carry_what_ships_make(server_url, key, raw, ship, numpy_ship):
+    """Both ways, beside small and large arrays. A side without the ship gets an error that names it."""
+
+    async def turned(pose, **others):
+        return {"pose": Pose(pose.y, pose.x), "others": others}
+
+    async with (
+        reem_async.RedisInterface(server_url, ships=[numpy_ship, ship]) as one,
+        reem_async.RedisInterface(server_url, ships=[numpy_ship, type(ship)()]) as two,
+        reem_async.RedisInterface(server_url) as lacking,
+    ):
+        kvs, others = reem_async.KeyValueStore(one), reem_async.KeyValueStore(lacking)
+        async with kvs[key()].serve(turned), others[key()]["plain"].serve(turned):
+            place = reem_async.KeyValueStore(two)[key()]
+            for size in (3, 100_000, 100_000):
+                answer = await place.call(pose=Pose(1.0, 2.0), image=np.arange(size))
+                assert answer["pose"] == Pose(2.0, 1.0)
+                assert_same(answer["others"], {"image": np.arange(size)})
+            assert keys_of(raw, key()) == set()
+            with pytest.raises(reem.RemoteError, match=r"BadData: .*pose', which this interface lacks"):
+                await place["plain"].call(pose=Pose(1.0, 2.0))
+            with pytest.raises(BadType, match=rf"{key()}\.pose: .*Pose.*cannot be stored"):
+                await others[key()].call(pose=Pose(1.0, 2.0))
+        await aeventually(lambda: keys_of(raw, key()) == set())
+
+
 class AskingShip(reem_async.SpecialDatatypeShip):
     """Asks for something, which may have been cancelled."""
 
