@@ -158,6 +158,38 @@ def test_who_leaves_without_a_word_is_gone_within_a_second(server, front, fault)
         assert again.since > there.since
 
 
+ROLES = """
+import sys, time, reem
+with reem.RedisInterface(sys.argv[1], name="planner") as interface:
+    kvs = reem.KeyValueStore(interface)
+    kp = kvs["control"].parameter("kp", 1.0)
+    with kvs["command"].mirror(ttl=0.5) as command:
+        print("up", flush=True)
+        while True:
+            print(kp.value, command.value(default="silent"), kvs["double"].call(number=2), flush=True)
+            time.sleep(0.05)
+"""
+
+
+def test_a_program_that_was_stopped_goes_on_in_each_role(server):
+    """It calls, follows commands and has a parameter: afterwards it gets present values, and its call its answer."""
+    with reem.RedisInterface(server.url) as interface:
+        kvs, space = reem.KeyValueStore(interface), reem.PublishSpace(interface)
+
+        def last_line_is(*words):
+            space["command"] = words[1]
+            return process.stdout.readline().split() == [*map(str, words)]
+
+        with kvs["double"].serve(lambda number: 2 * number), program(server.url, ROLES) as process:
+            eventually(lambda: last_line_is(1.0, 7, 4))
+            os.kill(process.pid, signal.SIGSTOP)
+            eventually(lambda: not interface.nodes())
+            kvs["control"]["kp"] = 3.0
+            os.kill(process.pid, signal.SIGCONT)
+            eventually(lambda: last_line_is(3.0, 8, 4))
+            eventually(interface.nodes)
+
+
 @pytest.mark.parametrize(
     "keep", [pytest.param(True, marks=pytest.mark.long, id="with its data"), pytest.param(False, id="without")]
 )
