@@ -318,24 +318,15 @@ class ClusterTransport(CompositeTransport):
         return answers
 
     async def _scattered(self, commands: Sequence[Command], slots: Sequence[int | None], bulk: bool) -> list[Reply]:
-        """Send commands that belong to several slots: node by node, then one by one what a node did not take."""
+        """Send commands that belong to several slots, a round trip for each slot."""
         answers: list[Reply] = list(commands)
-        nodes: dict[Transport | None, list[int]] = {}
+        grouped: dict[int | None, list[int]] = {}
         for place, slot in enumerate(slots):
-            nodes.setdefault(None if slot is None else self._owners[slot], []).append(place)
-        left = nodes.pop(None, [])
-        for node, places in nodes.items():
-            assert node is not None
-            try:
-                got = await node.roundtrip([commands[place] for place in places], bulk=bulk)
-            except NotConnected:  # nothing was applied
-                left += places
-                continue
-            for place, reply in zip(places, got, strict=True):
+            grouped.setdefault(slot, []).append(place)
+        for places in grouped.values():
+            replies = await self.roundtrip([commands[place] for place in places], bulk=bulk)
+            for place, reply in zip(places, replies, strict=True):
                 answers[place] = reply
-            left += [places[refused] for refused in places_refused(got)]
-        for place in sorted(left):
-            (answers[place],) = await self.roundtrip([commands[place]], bulk=bulk)
         return answers
 
     async def _publish(self, commands: Sequence[Command], bulk: bool) -> list[Reply]:
