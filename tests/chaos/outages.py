@@ -21,7 +21,7 @@ from reem_async.concurrency.queues import Last
 from .proxy import Proxy
 from .scoreboard import Run, row, tell
 from .servers import PrivateServer
-from .tools import Log, background, became, frame, measured, order, program, quantile, said, state_of
+from .tools import Log, background, became, frame, measured, order, program, quantile, said
 
 TOP = "top"
 LARGE = np.zeros(300_000, np.uint8)
@@ -160,7 +160,7 @@ class _Victims:
                     self.unanswered.append("a call was answered by nobody")
 
         async def flag() -> None:
-            self.flagged.append(await became(lambda: state_of(self.following) in LOST, max(seconds, 4.0)))
+            self.flagged.append(await became(lambda: self.following.state in LOST, max(seconds, 4.0)))
 
         calls = self._append, self._append_blocking, self._large, self._large_blocking
         await asyncio.gather(*map(call, calls), flag())

@@ -61,13 +61,6 @@ async def became(condition: Callable[[], Any], seconds: float) -> float | None:
     return time.monotonic() - begun
 
 
-def state_of(interface: Any) -> str:
-    state = getattr(interface, "state", None)
-    if state is None:
-        raise AssertionError("RedisInterface has no `state`: what became of a connection cannot be observed")
-    return str(state)
-
-
 @contextlib.asynccontextmanager
 async def background(*coroutines: Any):
     """Run coroutines beside the block and cancel them after it; the first failure of one is raised."""
