@@ -116,7 +116,7 @@ def test_a_file_is_saved_and_loaded_as_a_whole(cli, store, tmp_path):
             "arm.n: 4\ncontrol.kp: 99\nno.no: 1\n",
             "control.kp: 99.0 is out of range; use 0.0 to 10.0 1/s; no program",
         ),
-        ("arm.n: 4\ncontrol.mode: on\n", "control.mode: True is not of type str"),
+        ("arm.n: 4\ncontrol.mode: on\n", "control.mode: True is not of type str; put a text into quotes"),
         ("arm.n: 4\ncontrol.kp: 2026-11-26\n", "control.kp"),
         ("arm.n: 4\n5: 5\n", "a path is a str"),
         ("arm.n: 4\n'a..b': 5\n", "is not a path"),

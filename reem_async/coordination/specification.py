@@ -15,6 +15,10 @@ from ..plan.paths import shorten
 _MOST_CHOICES = 100
 _MOST_ELEMENTS = 64  # of a vector
 _LONGEST_UNIT, _LONGEST_HELP, _LONGEST_TEXT = 40, 500, 1000  # characters
+_HINTS = {
+    "int": "; a parameter takes floats if its default is one, such as 2.0",
+    "str": '; put a text into quotes, such as "off"',  # in YAML off and 2026-01-01 are none
+}
 _LOWEST, _HIGHEST = -(2**63), 2**63 - 1  # servers calculate with 64 bits
 
 _OPTIONAL = {"low": None, "high": None, "unit": "", "help": "", "choices": ()}
@@ -191,8 +195,7 @@ def _converted(where: str, value: Any, kind: str) -> Any:
 def _scalar(where: str, value: Any, kind: str) -> Any:
     found = _scalar_type(value)
     if found != kind and not (kind == "float" and found == "int"):
-        hint = "; a parameter takes floats if its default is one, such as 2.0" if kind == "int" else ""
-        raise BadType(f"{where}: {shorten(value)} is not of type {kind}{hint}")
+        raise BadType(f"{where}: {shorten(value)} is not of type {kind}{_HINTS.get(kind, '')}")
     if kind == "str":
         text = str.__str__(value)
         if len(text) > _LONGEST_TEXT:
