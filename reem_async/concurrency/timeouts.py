@@ -63,8 +63,9 @@ def timeout(seconds: float) -> Iterator[None]:
     """Give every call of REEM inside the block another time limit than its interface's.
 
     A call is given up once no byte has moved for that long, in either direction, while its reply is
-    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread. `next()` of a watch
-    and `wait_until()` of a mirror, which have no limit of their own, wait for that long.
+    due: a large array on a slow link is not cut off. It holds for the calls of this task or thread. `watch.next()` and
+    `mirror.wait_until()`, which have no limit of their own, wait for that long. A loop over a watch, and Python's
+    `next(watch)`, wait without a limit.
 
     Args:
         seconds: The limit, above 0.
