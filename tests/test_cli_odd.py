@@ -50,7 +50,7 @@ def test_before_a_whole_key_goes_it_is_asked(cli, kvs, press, code, left):
         said = b""
         while b"[y/N]" not in said:
             said += process.stderr.read(1)
-        assert b"Delete a (" in said
+        assert b"Delete a with all" in said
         time.sleep(0.1)
         if press == "^C":
             process.send_signal(signal.SIGINT)

@@ -117,9 +117,6 @@ def save(
     file: Annotated[
         Path | None, typer.Argument(metavar="FILE", show_default=False, help="The file to make; printed without it.")
     ] = None,
-    match: Annotated[
-        list[str] | None, typer.Option("--match", metavar="PATTERN", help="Only these; may be given several times.")
-    ] = None,
     force: Force = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
@@ -130,11 +127,11 @@ def save(
 
     Examples:
         reem param save tuned.yaml
-        reem param save --match 'control.*' > control.yaml
+        reem param save > tuned.yaml
     """
 
     async def work(interface: RedisInterface) -> int:
-        found = await _declared(interface, match)
+        found = await _declared(interface, None)
         text = "".join(_yaml(it) for it in found if not it.invalid)
         if file is None:
             sys.stdout.write(text)

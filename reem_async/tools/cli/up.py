@@ -80,11 +80,11 @@ def _up_cluster(*, plain: bool) -> None:
         sys.stdout.flush()
 
 
-def _use(url: str, variable: str | None = None, *, json: bool, data: str) -> list[tuple[str, str]]:
+def _use(url: str, password: str | None = None, *, json: bool, data: str) -> list[tuple[str, str]]:
     """Return how documents and data are kept, and what a program does to connect."""
-    password = f', password=os.environ["{variable}"]' if variable else ""
-    imports = "import os; from" if variable else "from"
-    connect = f'import KeyValueStore, RedisInterface; kvs = KeyValueStore(RedisInterface("{url}"{password}))'
+    login = f', password=os.environ["{PASSWORD_VARIABLE}"]' if password else ""
+    imports = "import os; from" if password else "from"
+    connect = f'import KeyValueStore, RedisInterface; kvs = KeyValueStore(RedisInterface("{url}"{login}))'
     return [
         ("documents", "stored as JSON" if json else "stored as text: the server has no JSON module"),
         ("data", data),
@@ -107,13 +107,6 @@ def up(
     directory: Annotated[
         Path | None,
         typer.Option(file_okay=False, help="Keep the data here; without it, it is gone with the server."),
-    ] = None,
-    password_from_env: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help=f"Environment variable that holds the password; {PASSWORD_VARIABLE} is used if it is set.",
-        ),
     ] = None,
     snapshot: Annotated[
         Path | None,
@@ -146,6 +139,8 @@ def up(
 
     With --from, a past state can be looked at beside the live one, which is not touched.
 
+    The environment variable REEM_PASSWORD gives it a password.
+
     Examples:
       reem up
       reem up --directory /var/lib/robot --port 6400 --maxmemory 2gb
@@ -154,21 +149,22 @@ def up(
       reem up --plain
     """
     if cluster:
-        if any(given is not None for given in (port, directory, password_from_env, snapshot, maxmemory)):
+        if any(given is not None for given in (port, directory, snapshot, maxmemory)):
             fail("--cluster takes no other option than --plain: it is in memory, on free ports, without a password")
         _up_cluster(plain=plain)
         return
-    variable = _password_variable(password_from_env)
+    password = os.environ.get(PASSWORD_VARIABLE)
+    if password == "":
+        fail(f"the environment variable {PASSWORD_VARIABLE} is empty; unset it, or give it a password")
     if port is None:
         port = 0 if snapshot else DEFAULT_PORT
     if snapshot is not None and snapshot.exists() and not snapshot.is_file():
         fail(f"{snapshot} is no file; give a snapshot")
     try:
-        password = os.environ[variable] if variable else None
         server = EmbeddedServer(port, directory, password, snapshot, json=not plain, maxmemory=maxmemory)
         with server:  # until it is up, Ctrl-C ends the loading at once
             stop = Stop()
-            _describe(server, directory, variable, snapshot)
+            _describe(server, directory, password, snapshot)
             while not stop.wait(LOOK_SECONDS):
                 # A server that ends by itself has said why in its log, which goes with its directory.
                 if not server.running:
@@ -204,17 +200,7 @@ def _who_is_there(port: int) -> str:
     )
 
 
-def _password_variable(name: str | None) -> str | None:
-    """The variable to read, None for no password. An empty one is an error, not a server without password."""
-    if name is None and PASSWORD_VARIABLE not in os.environ:
-        return None
-    name = name or PASSWORD_VARIABLE
-    if not os.environ.get(name):
-        fail(f"the environment variable {name} is {'empty' if name in os.environ else 'not set'}")
-    return name
-
-
-def _describe(server: EmbeddedServer, directory: Path | None, variable: str | None, snapshot: Path | None) -> None:
+def _describe(server: EmbeddedServer, directory: Path | None, password: str | None, snapshot: Path | None) -> None:
     # localhost and not 127.0.0.1: this way clients find the Unix socket, which is quicker.
     url = f"redis://localhost:{server.port}"
     emit(styled("REEM's server is up.", "green") + f" (process {server.pid})")
@@ -223,11 +209,14 @@ def _describe(server: EmbeddedServer, directory: Path | None, variable: str | No
             *((("snapshot", _summary(snapshot)),) if snapshot else ()),
             ("address", url),
             ("socket", f"unix://{server.socket_path}"),
-            ("password", f"the value of {variable}" if variable else "none: any user of this machine can connect"),
+            (
+                "password",
+                f"the value of {PASSWORD_VARIABLE}" if password else "none: any user of this machine can connect",
+            ),
         ]
     )
     data = f"{server.directory}, kept" if directory else "in memory, gone when the server stops"
-    facts_lines(_use(url, variable, json=server.json, data=data))
+    facts_lines(_use(url, password, json=server.json, data=data))
 
 
 def _summary(path: Path) -> str:

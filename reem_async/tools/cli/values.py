@@ -9,7 +9,6 @@ import sys
 import time
 import zipfile
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Any, NoReturn
 
@@ -17,16 +16,12 @@ import numpy as np
 import typer
 
 from reem_async.connection import RedisInterface
-from reem_async.errors import MissingKey
-from reem_async.plan.paths import Path as KeyPath
-from reem_async.plan.paths import show
 from reem_async.plan.trees import walk
 from reem_async.store.accessor import Accessor
 from reem_async.store.catalog import Outline, outline
-from reem_async.store.reader import DocumentReader
 from reem_async.store.space import PublishSpace
 from reem_async.store.store import KeyValueStore
-from reem_async.tools.cli.listing import as_data, below_arrays, describe
+from reem_async.tools.cli.listing import as_data, below_arrays
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import (
     clean,
@@ -38,9 +33,8 @@ from reem_async.tools.cli.output import (
     size_text,
     typed,
     width,
-    write_over,
 )
-from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
+from reem_async.tools.cli.running import USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
 
 _MOST_AS_TEXT = 200_000
@@ -51,8 +45,6 @@ _MOST_FOR_PREVIEW = 256_000_000
 
 # Hz, with --count and no --rate.
 _RATE = 1.0
-# Seconds between two looks at how far it is.
-_SHOWN_EVERY = 0.5
 
 
 def get(
@@ -87,7 +79,7 @@ def get(
 
     Examples:
         reem get foo.bar.subkey
-        reem get robot.joints[0]     an element of a list or of an array
+        reem get robot.joints[0]     an element of a list
         reem get robot.name --raw
         reem get cam.image -o image.png
         reem get pose --json | jq .x
@@ -102,16 +94,7 @@ def get(
             raise there_already(output)
         store = KeyValueStore(interface)
         # First what it is, without arrays: then what is too large to be shown is not fetched.
-        try:
-            node = await outline(interface, store.at(path).full_path)
-        except MissingKey as missing:
-            item = await _item(interface, store.at(path).full_path, missing)
-            if output is not None:
-                note(save(item, output, path, replace=force))
-            else:
-                shown = isinstance(item, np.ndarray) and not as_json
-                emit(preview(item, width() if is_terminal() else 100) if shown else json_text(item))
-            return
+        node = await outline(interface, store.at(path).full_path)
         if output is not None:
             note(save(await store.get(path), output, path, replace=force))
             return
@@ -122,22 +105,6 @@ def get(
         emit(json_text(await store.get(path)))
 
     run("get", work, url, namespace)
-
-
-async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -> Any:
-    """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
-    for end in range(len(path) - 1, 0, -1):
-        if not isinstance(path[end], int):
-            break
-        with suppress(MissingKey):
-            if (await outline(interface, path[:end])).kind != "numpy":
-                break
-            array = await DocumentReader(interface.session, path[0]).read(path[1:end])
-            try:
-                return array[path[end:]]
-            except IndexError as error:
-                raise CommandFailed(f"{show(path)}: {error}", NOTHING) from None
-    raise missing
 
 
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
@@ -215,7 +182,7 @@ def delete(
         place = _place(interface, path, publish)
         # Only for a whole top-level key, and only on a terminal: a script cannot answer.
         if len(place.full_path) == 1 and not yes and sys.stdin.isatty():
-            await _ask(interface, path)
+            _ask(f"Delete {clean(path)} with all that is below it at {interface.hostname}?")
         await place.delete()
 
     run("del", work, url, namespace)
@@ -225,20 +192,16 @@ def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
     return (PublishSpace if publish else KeyValueStore)(interface).at(path)
 
 
-async def _ask(interface: RedisInterface, path: str) -> None:
-    """Ask before a whole key goes; raises MissingKey, and CommandFailed if the answer is no."""
-    what = describe(await outline(interface, path), 60)
-    if not _agreed(f"Delete {clean(path)} ({what}) at {interface.hostname}?"):
-        raise CommandFailed("nothing was deleted")
-
-
-def _agreed(question: str) -> bool:
+def _ask(question: str) -> None:
+    """Ask before a whole key goes; raises CommandFailed if the answer is no."""
     # asyncio's handler would only set a flag for the event loop, which stands still while it is asked.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         sys.stderr.write(f"{question} [y/N]: ")
         sys.stderr.flush()
-        return sys.stdin.readline().strip().lower() in ("y", "yes")  # the end of the input is no answer
+        # The end of the input is no answer.
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            raise CommandFailed("nothing was deleted")
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -287,16 +250,13 @@ def pub(
 async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, said: str) -> None:
     """Publish `count` times, or until Ctrl-C; `said` is printed once the first one was taken."""
     start, done, late = time.monotonic(), 0, 0
-    due, shown = start, start
+    due = start
     try:
         while done != count:
             await place.write(value)
             done += 1
             if done == 1:
                 note(said)
-            if time.monotonic() > shown + _SHOWN_EVERY:
-                shown = time.monotonic()
-                write_over(f"{done} times in {shown - start:.1f} s, {(done - 1) / (shown - start):.1f} Hz")
             if done == count:
                 break
             # By the plan and not from now on, so that the rate is kept however long each call takes.
@@ -308,7 +268,6 @@ async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, s
     except asyncio.CancelledError:  # Ctrl-C
         pass
     seconds = time.monotonic() - start
-    write_over("")
     reached = f", {(done - 1) / seconds:.1f} Hz" if done > 1 and seconds > 0 else ""
     note(f"published {done} times in {seconds:.1f} s{reached}" + (f", {late} times late" if late else ""))
 
@@ -444,19 +403,17 @@ def _write_png(value: Any, file: IO[bytes], where: str) -> str:
         raise CommandFailed("png needs pillow: pip install pillow; or use an .npy file") from None
     array = _array(value, where, "png")
     # Pillow takes grey pictures as two axes only.
-    if array.ndim == 3 and array.shape[2] == 1:
-        array = array[:, :, 0]
-    if array.dtype == bool:
-        array = array.astype(np.uint8) * 255
-    grey = array.ndim == 2 and array.dtype in (np.uint8, np.uint16)
-    colour = array.ndim == 3 and array.shape[2] in (3, 4) and array.dtype == np.uint8
-    if not (grey or colour) or not array.size:
+    picture = array[:, :, 0] if array.ndim == 3 and array.shape[2] == 1 else array
+    try:
+        if array.dtype not in (np.uint8, np.uint16, np.bool_):
+            raise TypeError
+        Image.fromarray(picture).save(file, "PNG")
+    except (TypeError, ValueError, OSError, SystemError):
         raise CommandFailed(
             f"{where} is {array.dtype}[{','.join(map(str, array.shape))}]; png takes uint8 with 1, 3 or 4 channels, "
             "uint16 with one, or bool; use an .npy file"
-        )
-    Image.fromarray(array).save(file, "PNG")
-    return f"{array.shape[1]} x {array.shape[0]}" + (", taken as RGB" if colour else "")
+        ) from None
+    return f"{picture.shape[1]} x {picture.shape[0]}" + (", taken as RGB" if picture.ndim == 3 else "")
 
 
 def _write_bytes(value: Any, file: IO[bytes], where: str) -> str:
