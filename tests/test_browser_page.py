@@ -384,12 +384,6 @@ def test_numbers_have_a_line_in_the_tree(visit, pspace, key):
     expect(row(page, key()).locator("canvas.spark")).to_be_hidden()
 
 
-def test_lines_of_complex_numbers_say_what_they_are(visit, kvs, key):
-    kvs[key()] = np.exp(1j * np.arange(50))
-    page = visit.open(f"/view/{key()}")
-    expect(page.locator("#view")).to_contain_text("The magnitude of complex numbers.")
-
-
 TICKS = [
     (-4e17, 1e17, "-4e+17"),
     (5_000_020, 20, "5000020"),

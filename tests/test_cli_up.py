@@ -52,31 +52,6 @@ def test_up_until_told_to_stop(number):
             assert probe.connect_ex(("127.0.0.1", port)) != 0
 
 
-STORM = """
-import os, signal, threading
-from reem_async.tools.cli.up import Stop
-
-stop = Stop()
-ended = threading.Event()
-
-def send():
-    while not ended.is_set():
-        os.kill(os.getpid(), signal.SIGINT)
-
-sender = threading.Thread(target=send)
-sender.start()
-assert all(stop.wait(1.0) for _ in range(20000))
-ended.set()
-sender.join()
-print("done")
-"""
-
-
-def test_a_signal_may_come_at_any_moment():
-    run = python(STORM, flags=())
-    assert (run.stdout, run.returncode) == ("done\n", 0), run.stderr
-
-
 def test_says_what_to_type(tmp_path):
     with up("--port", "0", "--directory", str(tmp_path / "x" / ("long" * 20))) as (_, said):
         url = f"redis://localhost:{port_in(said)}"

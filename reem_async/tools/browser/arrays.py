@@ -54,8 +54,6 @@ def cell(item: Any) -> str:
     """Return one item of an array as text: numbers with all their digits, of which the page shows six."""
     if isinstance(item, np.floating):
         return str(item).removesuffix(".0")
-    if isinstance(item, np.complexfloating):
-        return f"{complex(item):.5g}"
     if isinstance(item, np.integer) and not isinstance(item, np.timedelta64):
         return str(int(item))
     if isinstance(item, np.bool_):
@@ -65,15 +63,9 @@ def cell(item: Any) -> str:
 
 
 def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
-    """Return an array of one axis, or its columns, as lines: the extremes of each part where there are too many.
-
-    Of complex numbers it is the magnitude, and `magnitude` says so.
-    """
-    if plane.ndim not in (1, 2) or plane.dtype.kind not in "biufc":
+    """Return an array of one axis, or its columns, as lines: the extremes of each part where there are too many."""
+    if plane.ndim not in (1, 2) or plane.dtype.kind not in "biuf":
         raise BadValue(f"an array of {plane.dtype} {list(plane.shape)} is no line; choose axes with an index")
-    magnitude = plane.dtype.kind == "c"
-    if magnitude:
-        plane = np.abs(plane)
     columns = plane.reshape(-1, 1) if plane.ndim == 1 else plane
     total = columns.shape[1]
     columns = columns[:, :_MOST_CURVES]
@@ -84,7 +76,6 @@ def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
         "times": places,
         "lines": [[finite(item) for item in column] for column in columns[places].T.tolist()],
         "more": total - columns.shape[1],
-        "magnitude": magnitude,
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import heapq
 import math
 import time
 from bisect import bisect_right
@@ -112,46 +111,29 @@ class Frames:
             self._thin_evenly(most, now)
 
     def _thin_evenly(self, most: int, now: float) -> None:
-        """Let go of the frame whose absence makes the shortest gap for its bytes, again and again.
+        """Let go of frames that come soon after the one before them, for their bytes, until at most so many are left.
 
         The gap is weighed with the root of the size: that makes the pictures shown at any instant, of all
         paths, the least old in the sum that the bytes allow.
         """
-        before: dict[Frame, Frame | None] = {}
-        after: dict[Frame, Frame | None] = {}
-        for line in self._lines.values():
-            before |= dict(zip(line, [None, *line[:-1]], strict=True))
-            after |= dict(zip(line, [*line[1:], None], strict=True))
-
-        def score(frame: Frame) -> float:
-            left, right = before[frame], after[frame]
-            # Without the first there would be nothing at all for a while: it counts for a whole span more.
-            start = now - 2 * self._seconds if left is None else left.time
-            gap = (now if right is None else right.time) - start
-            return float(max(gap, 0.0) / frame.size**0.5)
-
-        heap = [(score(frame), number, frame) for number, frame in enumerate(before)]
-        heapq.heapify(heap)
-        gone: set[Frame] = set()
-        while heap and self.bytes > most:
-            value, number, frame = heapq.heappop(heap)
-            # Scores are not updated in the heap but when they come up: its neighbours may have gone since.
-            if value != (current := score(frame)):  # what was beside it has gone
-                heapq.heappush(heap, (current, number, frame))
-            elif _has_both(frame):
-                self._drop_whole(frame)
-                heapq.heappush(heap, (score(frame), number, frame))
-            else:
-                self._empty(frame)
-                gone.add(frame)
-                left, right = before[frame], after[frame]
-                if left is not None:
-                    after[left] = right
-                if right is not None:
-                    before[right] = left
-        self._lines = {
-            path: rest for path, line in self._lines.items() if (rest := [it for it in line if it not in gone])
-        }
+        shortest = 1e-5 * self._seconds
+        while self.bytes > most:
+            shortest *= 1.2
+            for path, line in list(self._lines.items()):
+                # Without the first there would be nothing at all for a while: it counts for two spans.
+                left, kept = now - 3 * self._seconds, []
+                for frame in line:
+                    short = self.bytes > most and frame.time - left < shortest * frame.size**0.5
+                    if short and _has_both(frame):
+                        self._drop_whole(frame)
+                        short = False
+                    if short:
+                        self._empty(frame)
+                    else:
+                        kept.append(frame)
+                        left = frame.time
+                self._lines[path] = kept
+        self._lines = {path: line for path, line in self._lines.items() if line}
 
     def _drop_whole(self, frame: Frame) -> None:
         self.bytes -= frame.size
@@ -397,15 +379,9 @@ class History:
         earlier = [when for when in times if when < at - 1e-6]
         return earlier[-1] if earlier else None
 
-    def matching(self, words: Iterable[str], at: float) -> Iterator[tuple[str, Any]]:
-        """Yield the keys, and what they held, that may have all of these words in their name or in names below it."""
-        needed = [word.encode() for word in words]
+    def trees(self, at: float) -> Iterator[tuple[str, Any]]:
+        """Yield the keys, and what they held, as far as it is known."""
         for name, line in list(self._lines.items()):
-            # The text of a document is searched before it is parsed: most do not have the words.
-            if not line.changes and line.text is not None:
-                text = name.encode().lower() + b" " + line.text.lower()
-                if not all(word in text for word in needed):
-                    continue
             tree = line.state(at)
             if tree is not UNKNOWN and tree is not MISSING:
                 yield name, tree

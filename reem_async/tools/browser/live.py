@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -294,11 +293,4 @@ class LiveSource:
     async def search(self, text: str, at: float | None, most: int) -> list[Path]:
         """Return paths with `text` in them: keys first, then what is below those that the buffer knows."""
         needle, when = text.lower(), self.history.clock.now() if at is None else at
-        return matching(needle, self._names(at), self.history.matching(_words(needle), when), most)
-
-
-def _words(needle: str) -> list[str]:
-    """Return the words that the names in a path must have for `needle` to be in it: no indices, nothing escaped."""
-    if "\\" in needle:
-        return []
-    return [word for word in re.findall("[a-z0-9_]+", needle) if not word.isdigit()]
+        return matching(needle, self._names(at), self.history.trees(when), most)

@@ -41,7 +41,7 @@ def look_at(dtype: np.dtype[Any], shape: tuple[int, ...]) -> ArrayViews:
     # The order is that of the tabs of the page.
     if numeric and len(shape) >= 2:
         views["image"] = _leading(shape, 3 if _has_channels(shape) else 2)
-    if numeric or dtype.kind == "c":
+    if numeric:
         views["line"] = _line_slice(shape)
     views["table"] = _leading(shape, 2) if not _has_channels(shape) else (None, None, 0)[-len(shape) :]
     if _has_channels(shape) and len(shape) > 3:

@@ -14,14 +14,12 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import typer
-from rich.cells import cell_len, set_cell_size
 
 from reem_async.plan.paths import suffix
 from reem_async.tools import jsontext
 
 # What moves the cursor, changes colours or breaks lines: keys and values come from anywhere.
 _CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-_NARROWEST = 10  # characters that still say something of a name
 _UNITS = ("B", "kB", "MB", "GB", "TB")
 
 
@@ -130,32 +128,22 @@ def columns(
 ) -> None:
     """Print rows of clean cells: aligned and coloured on a terminal, separated by tabs elsewhere.
 
-    Columns in `right` are numbers; those in `shrink` are cut on a narrow terminal, in this order.
+    Columns in `right` are numbers; those in `shrink` are cut on a narrow terminal, the widest first.
     """
     if not is_terminal():
         for row in rows:
             emit("\t".join(row))
         return
-    # Widths in cells of the terminal: Chinese characters take two, accents none.
-    kept = [list(row) for row in rows]
-    if not kept:
-        return
-    widths = [max(cell_len(cell) for cell in column) for column in zip(*kept, strict=True)]
-    # Columns are cut in the given order, each down to its least width, until the row fits.
-    excess = sum(widths) + 2 * (len(widths) - 1) - width()
-    for place in shrink:
-        less = min(max(excess, 0), max(widths[place] - _NARROWEST, 0))
-        widths[place] -= less
-        excess -= less
-    for row in kept:
-        cells = []
-        for place, (cell, size, style) in enumerate(zip(row, widths, styles, strict=True)):
-            if cell_len(cell) > size:
-                cell = set_cell_size(cell, size - 1) + "…"
-            blanks = " " * (size - cell_len(cell))
-            text = styled(cell, style) if style else cell
-            cells.append(blanks + text if place in right else text + blanks)
-        emit("  ".join(cells).rstrip())
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    for place, style in enumerate(styles):
+        table.add_column(style=style, justify="right" if place in right else "left", no_wrap=place not in shrink)
+    for row in rows:
+        table.add_row(*[Text(cell, no_wrap=True, overflow="ellipsis") for cell in row])
+    Console().print(table)
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import select
 import signal
 import sys
 import time
@@ -22,32 +21,26 @@ from reem_async.tools.cli.options import existing
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_users, interface_to
 
-LOOK_SECONDS = 0.5
-"""Seconds between looks whether the server is still there."""
+LOOK_SECONDS = 0.1  # between looks whether the server is still there, and whether to end
 
 DEFAULT_PORT = 6379
 
 
 class Stop:
-    """Set by Ctrl-C, by SIGTERM, and when the terminal closes.
-
-    A pipe, not a `threading.Event`: a handler that runs while the main thread is inside of `Event.wait` would
-    wait for a lock that this very thread holds.
-    """
+    """Set by Ctrl-C, by SIGTERM, and when the terminal closes."""
 
     def __init__(self) -> None:
-        self._reader, self._writer = os.pipe()
-        # A handler must not block, not even when the pipe is full.
-        os.set_blocking(self._writer, False)
+        self.is_set = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, self._handle)
 
     def _handle(self, _number: int, _frame: FrameType | None) -> None:
-        with suppress(BlockingIOError):  # full, so it is set already
-            os.write(self._writer, b"x")
+        self.is_set = True
 
-    def wait(self, seconds: float) -> bool:
-        return bool(select.select([self._reader], [], [], seconds)[0])
+    def wait(self) -> bool:
+        """Wait a moment; return whether the command is to end."""
+        time.sleep(LOOK_SECONDS)  # not a `threading.Event`: a handler may wait for its lock, which this thread holds
+        return self.is_set
 
 
 def fail(message: str) -> NoReturn:
@@ -68,7 +61,7 @@ def _up_cluster(*, plain: bool) -> None:
             facts_lines([("address", cluster.url), *zip(labels, nodes, strict=True)])
             facts_lines(_use(cluster.url, json=cluster.json, data="in memory, gone when the cluster stops"))
             left = list(cluster.nodes)
-            while not stop.wait(LOOK_SECONDS):
+            while not stop.wait():
                 for node in [node for node in left if node.ended()]:
                     left.remove(node)
                     emit(f"The node on port {node.port} has ended; the others go on.")
@@ -165,7 +158,7 @@ def up(
         with server:  # until it is up, Ctrl-C ends the loading at once
             stop = Stop()
             _describe(server, directory, password, snapshot)
-            while not stop.wait(LOOK_SECONDS):
+            while not stop.wait():
                 # A server that ends by itself has said why in its log, which goes with its directory.
                 if not server.running:
                     fail(f"the server ended by itself; its log ends:\n{_log_end(server)}")

@@ -218,9 +218,8 @@ export class ArrayView {
     if (this.view !== "line") return;
     this.tell(data);
     this.plot.set(data);
-    const said = [data.magnitude && "The magnitude of complex numbers.", data.more && `${data.more} more columns are not drawn.`].filter(Boolean);
-    this.more.hidden = !said.length;
-    setText(this.more, said.join(" "));
+    this.more.hidden = !data.more;
+    setText(this.more, `${data.more} more columns are not drawn.`);
   }
 
   histogramStage() { this.plot = new Histogram(this.stage, { label: "Histogram" }); }
