@@ -1,6 +1,5 @@
 """The package: what is installed beside it, what its metadata says, and the private names of redis-py that it uses."""
 
-import importlib
 import os
 import re
 import subprocess
@@ -8,8 +7,6 @@ import sys
 from importlib import metadata
 
 import pytest
-import redis
-import redis.asyncio
 from conftest import ROOT
 
 import reem_async
@@ -66,43 +63,3 @@ def test_version_and_extras_are_those_of_the_distribution():
     }
     assert {"server", "tools"} <= named <= set(about.get_all("Provides-Extra"))
     assert not [text for text in texts if re.search(r"\breem\[[a-z]", text)]
-
-
-PRIVATE = {
-    "redis._parsers": ["BaseParser.parse_error"],
-    "redis.connection": [
-        "HiredisRespSerializer.pack",
-        "Connection.connect",
-        "UnixDomainSocketConnection",
-        "SSLConnection",
-    ],
-    "redis.asyncio.connection": ["parse_url", "Connection.connect", "Connection.read_response", "SSLConnection"],
-    "redis.crc": ["key_slot"],
-}
-
-
-@pytest.mark.parametrize(("module", "name"), [(module, name) for module, names in PRIVATE.items() for name in names])
-def test_redis_py_has_the_name(module, name):
-    found = importlib.import_module(module)
-    for part in name.split("."):
-        assert hasattr(found, part), (
-            f"redis-py {redis.__version__} has no {module}.{name}, which reem_async.transport uses"
-        )
-        found = getattr(found, part)
-
-
-async def test_connections_of_redis_py_have_the_attributes(server_url):
-    """Which reem_async.transport takes over once redis-py has connected."""
-    blocking = redis.Redis.from_url(server_url, protocol=3).connection_pool.make_connection()
-    asynchronous = redis.asyncio.Redis.from_url(server_url, protocol=3).connection_pool.make_connection()
-    try:
-        blocking.connect()
-        await asynchronous.connect()
-        for connection, names in ((blocking, ["_sock", "handshake_metadata"]), (asynchronous, ["_reader", "_writer"])):
-            for name in names:
-                assert getattr(connection, name, None), (
-                    f"{type(connection)} of redis-py {redis.__version__} has no {name}"
-                )
-    finally:
-        blocking.disconnect()
-        await asynchronous.disconnect()

@@ -102,7 +102,6 @@ def at_of(request: Request) -> float | None:
 
 
 def number_of(request: Request, name: str) -> float | None:
-    """Return a finite number, None if there is none."""
     text = request.query_params.get(name, "")
     if not text:
         return None
@@ -116,7 +115,6 @@ def number_of(request: Request, name: str) -> float | None:
 
 
 def integer_of(request: Request, name: str, default: int, most: int) -> int:
-    """Return a number from 0 to `most`."""
     number = number_of(request, name)
     return default if number is None else int(max(0, min(number, most)))
 
@@ -261,7 +259,6 @@ class Api:
         return reply({"at": await self._source.step(at, forward, path_in(request))})
 
     async def activity(self, request: Request) -> Response:
-        """Return how many changes there were, for the strip above the slider."""
         status = self._source.status()
         bins = max(integer_of(request, "bins", 100, 400), 1)
         span, path = (status.start, status.end), path_in(request)
@@ -278,7 +275,6 @@ class Api:
         return reply({"found": found, "most": _MOST_FOUND})
 
     async def parameters(self, request: Request) -> Response:
-        """Return the parameters at and below a path: what programs have declared, and what they use now."""
         found = await self._source.parameters(path_in(request))
         return reply({"parameters": [_control(it) for it in found[:_MOST_PARAMETERS]]})
 
@@ -341,7 +337,6 @@ def _marked(node: Node, marks: tuple[set[Path], set[Path]]) -> dict[str, Any]:
 
 
 def _thinned(series: Series) -> Series:
-    """Return a series with as many points as a screen has room for."""
     if len(series.times) <= _MOST_POINTS:
         return series
     places = thinned(np.array(series.lines, float).T, _MOST_POINTS)  # None becomes NaN
@@ -375,7 +370,6 @@ class Events:
         return [Route("/events", answered(self.events), methods=["GET"])]
 
     async def events(self, request: Request) -> Response:
-        """Answer with a stream that goes on until the page or the program ends."""
         if self._clients >= _MOST_CLIENTS:
             raise RefusedRequest(503, f"{_MOST_CLIENTS} pages are open already; close some")
         # The second keeps a proxy (nginx) from collecting events before it passes them on.

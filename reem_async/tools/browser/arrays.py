@@ -31,7 +31,6 @@ _SAMPLE = 4_000_000  # numbers that histograms and statistics look at; of larger
 
 
 def table(plane: np.ndarray[Any, Any], row: int, column: int, rows: int, columns: int) -> dict[str, Any]:
-    """Return some rows and columns of an array of at most two axes, as text."""
     if plane.ndim > 2:
         raise BadValue(f"a table shows two axes, not {plane.ndim}; choose the others with an index")
     grid = plane.reshape(-1, 1) if plane.ndim == 1 else plane.reshape(1, 1) if plane.ndim == 0 else plane
@@ -80,7 +79,6 @@ def line(plane: np.ndarray[Any, Any]) -> dict[str, Any]:
 
 
 def histogram(array: np.ndarray[Any, Any], bins: int = 64) -> dict[str, Any]:
-    """Return how many numbers of an array fall into each of `bins` equal parts of their range."""
     if array.dtype.kind not in "biuf":
         raise BadValue(f"an array of {array.dtype} has no histogram; show it as a table")
     flat = _sampled(array).astype(np.float64)
@@ -100,7 +98,6 @@ def histogram(array: np.ndarray[Any, Any], bins: int = 64) -> dict[str, Any]:
 
 
 def statistics(array: np.ndarray[Any, Any]) -> dict[str, Any]:
-    """Return the smallest and largest number, the mean, and how many are not finite; empty for what has none."""
     if array.dtype.kind not in "biuf" or not array.size:
         return {}
     sample = _sampled(array)
@@ -146,7 +143,7 @@ class Arrays:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._turns: anyio.CapacityLimiter | None = None
+        self._turns = anyio.CapacityLimiter(1)  # one at a time: numpy would take all processors
 
     def routes(self) -> list[Route]:
         asked = {
@@ -164,10 +161,6 @@ class Arrays:
     async def _do(self, size: int, work: Callable[[], Result]) -> Result:
         if size <= _SMALL:
             return work()
-        # Made here, since it belongs to the event loop that runs by now. One at a time: numpy would take all
-        # processors.
-        if self._turns is None:
-            self._turns = anyio.CapacityLimiter(1)
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
     async def _sample(self, request: Request) -> Sample:
@@ -194,7 +187,6 @@ class Arrays:
         return array, {"statistics": said, **_when(sample)}
 
     async def array(self, request: Request) -> Response:
-        """Return dtype, shape, and how an array can be shown."""
         array = (await self._sample(request)).value
         look = look_at(array.dtype, array.shape)
         return reply(

@@ -76,7 +76,6 @@ class Allowance:
 
 
 def _rest(took: float) -> float:
-    """Return for how many seconds nothing is read after reading took so many."""
     return min(_REST * took, _LONGEST_REST)
 
 
@@ -169,7 +168,6 @@ class FollowedKey:
         return len(text or b"")
 
     async def _read(self, most: float) -> RawRead:
-        """Perform the steps of a read."""
         session, feed, noted = self._session, self.feed, (("GET", self._keys.last),)
         await session.ships.ready()
         held = feed.attachments.values
@@ -274,8 +272,6 @@ class FollowedKey:
 
 
 class Follower:
-    """Keeps a `History` up to date."""
-
     def __init__(self, interface: RedisInterface, history: History) -> None:
         self._interface = interface
         self.session = interface.session
@@ -349,7 +345,6 @@ class Follower:
         self._pump()
 
     def _pump(self) -> None:
-        """Take the updates that have arrived already."""
         for event in arrived(self._monitor):
             self._take(event)
 

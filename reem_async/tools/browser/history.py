@@ -98,7 +98,6 @@ class Frames:
                 del self._lines[path]
 
     def thin(self, most: int, now: float) -> None:
-        """Let go of so much that at most so many bytes are left."""
         # First the whole arrays of which there is a picture, oldest first, down to a quarter of the room.
         spare = sorted([frame for line in self._lines.values() for frame in line if _has_both(frame)], key=_TIME)
         held = sum([frame.described.size for frame in spare])
@@ -161,8 +160,6 @@ LARGEST_TEXT = 1 << 18  # bytes of a document's text up to which it is kept as t
 
 
 class History:
-    """What is known of the past of every top-level key."""
-
     def __init__(self, seconds: float, budget: int) -> None:
         self.seconds = seconds  # how long a change is kept
         self.budget = budget  # bytes that all of it may take; the oldest goes first
@@ -240,7 +237,6 @@ class History:
         return self._lines[name]
 
     def _trim(self, when: float) -> None:
-        """Make what is too old, or too much, part of the state before; in batches, since that costs a copy."""
         if when >= self._trimmed + _TRIM_SECONDS:
             self._trimmed = when
             self._fold(sum(1 for _ in takewhile(lambda change: change.time < when - self.seconds, self._all)))
@@ -294,7 +290,6 @@ class History:
         return len(path) > 1 and max(line.newest(path, now), line.moved(path, now)) <= since
 
     def existed(self, name: str, at: float) -> bool | None:
-        """Return whether there was such a key, None if that is not known."""
         line = self._lines.get(name)
         state = UNKNOWN if line is None else line.state(at)
         return None if state is UNKNOWN else state is not MISSING
@@ -322,7 +317,6 @@ class History:
         return Kept(frame, max(newest - frame.time, 1e-3))
 
     def last(self, paths: Sequence[Path], at: float) -> dict[Path, float]:
-        """Return when each path last changed before `at`, as far as that is known."""
         groups: dict[str, list[Path]] = {}
         for path in paths:
             if path and path[0] in self._lines:
@@ -353,12 +347,10 @@ class History:
                 yield change
 
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
-        """Yield what was at `path` at `start` and after each change."""
         line = self._lines.get(str(path[0]))
         return iter(()) if line is None else line.values(path, start, end)
 
     def times(self, path: Path) -> list[float]:
-        """Return when there were changes that concern `path` (all of them for the root), in order."""
         if not path:
             return [change.time for change in self._all if not change.answer]
         line = self._lines.get(str(path[0]))

@@ -252,7 +252,6 @@ class LiveSource:
     # --- time
 
     async def changes(self, since: float, until: float, most: int) -> list[Path]:
-        """Return which paths were published or seen to change, the newest first; from the buffer."""
         found: dict[Path, None] = {}
         for change in self.history.between(since, until):
             found[change.path] = None
@@ -261,7 +260,6 @@ class LiveSource:
         return list(found)
 
     async def differing(self, since: float, until: float, most: int) -> set[Path]:
-        """Return which paths have another value at one instant than at another; from the buffer."""
         before, after = (lambda name, at=at: self.history.tree((name,), at) for at in (since, until))
         return differing(await self.changes(since, until, most), before, after, most)
 
@@ -282,7 +280,6 @@ class LiveSource:
         return found if frames else []
 
     async def series(self, path: Path, start: float, end: float) -> Series:
-        """Return numbers over time, the present one last."""
         samples = list(self.history.values(path, max(start, self.history.start), end))
         if not samples:
             (node,) = await peek(self.interface.session, [path])

@@ -64,7 +64,7 @@ class LogSource:
         # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
         self._times = lru_cache(_CACHED)(self.log.news_times)
         self._state = lru_cache(_CACHED)(self._read_state)
-        self._turns: anyio.CapacityLimiter | None = None
+        self._turns = anyio.CapacityLimiter(1)
 
     async def start(self) -> None:
         """Nothing is to be done."""
@@ -85,8 +85,6 @@ class LogSource:
         return {"recording": f"{code}value = log[{path!r}].at({when})\ntimes, values = log[{path!r}].history()\n"}
 
     async def _do(self, work: Callable[[], Result]) -> Result:
-        if self._turns is None:
-            self._turns = anyio.CapacityLimiter(1)
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
     def _read_state(self, at: float) -> dict[str, Any]:
@@ -125,7 +123,6 @@ class LogSource:
         return Page(len(keys), start, [node for node in nodes if node is not None])
 
     async def value(self, path: Path, at: float | None) -> Sample:
-        """Return the value at a path; raises MissingKey, DamagedRecording."""
         return Sample(await self._do(lambda: self.log.value_at(path, self._when(at))))
 
     async def changes(self, since: float, until: float, most: int) -> list[Path]:

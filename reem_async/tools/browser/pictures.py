@@ -25,8 +25,6 @@ _MOST_CURVES = 16  # columns up to which an array is drawn as lines
 
 @dataclass(frozen=True, slots=True)
 class ArrayViews:
-    """How an array can be shown."""
-
     view: str  # what says most: "image", "line" or "table"; empty for an array without items
     views: dict[str, Slice]  # all that make sense, each with the part of the array it begins with
 
@@ -98,7 +96,6 @@ def parse_slice(text: str, shape: tuple[int, ...], most_free: int) -> Slice:
 
 
 def part(array: np.ndarray[Any, Any], chosen: Slice) -> np.ndarray[Any, Any]:
-    """Return the part of an array, without copying it."""
     view: np.ndarray[Any, Any] = array[tuple([slice(None) if index is None else index for index in chosen])]
     return np.asarray(view)
 
@@ -180,7 +177,6 @@ def paint(
 
 
 def range_of(plane: np.ndarray[Any, Any], low: float | None, high: float | None) -> tuple[float, float, int]:
-    """Return the numbers for the first and the last colour, and how many are not finite."""
     bad = 0
     if plane.dtype == np.uint8 or plane.dtype == np.bool_:
         least, most = 0.0, 255.0 if plane.dtype == np.uint8 else 1.0

@@ -166,8 +166,6 @@ class NotKept(ReemError):
 
 
 class Status(NamedTuple):
-    """How things are with a source."""
-
     start: float  # from when on its past can be shown, in seconds since 1970
     end: float  # the newest instant
     lost: str = ""  # why nothing can be read at the moment; empty if all is well
@@ -175,16 +173,12 @@ class Status(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """A value at an instant."""
-
     value: Any  # the value, arrays included; a `Preview` of an array of which no more is kept
     late: float = 0.0  # seconds by which it is older than it should be, since what came after was not kept
     age: float | None = None  # seconds from when it was read to the instant asked for; None if that is not known
 
 
 class Series(NamedTuple):
-    """Numbers over time."""
-
     names: list[str]  # what each line is: one empty text, or the indexes of a list
     times: list[float]  # seconds since 1970
     lines: list[list[float | None]]  # for each name as many numbers as there are times, None where there was no number

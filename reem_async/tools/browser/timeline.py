@@ -22,8 +22,6 @@ _LOOK_BACK = 2000  # changes looked at to find when a path last changed
 
 
 class BufferedChange(NamedTuple):
-    """One change."""
-
     time: float  # seconds since 1970
     path: Path  # what changed, top-level key first
     value: Any  # what is there since; MISSING if it was removed, PENDING if it is not known
@@ -32,8 +30,6 @@ class BufferedChange(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """A value of the past."""
-
     value: Any  # the value; MISSING if there was none, UNKNOWN if it is not known what there was
     late: float = 0.0  # seconds from this value to a later change before the instant asked for, which was not kept
 
@@ -228,7 +224,6 @@ class BufferedPast(Past[int]):
         return [self._times[number - self._gone] for number in self._known.of(path)]
 
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
-        """Yield what was at `path`, at `start` and after each change that may have changed it."""
         first = self._gone + self.upto(start)
         value = self.at(path, first - 1)
         yield start, value

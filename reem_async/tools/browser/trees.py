@@ -43,13 +43,11 @@ class Frame:
 
     @property
     def size(self) -> int:
-        """Return about how many bytes the content takes."""
         small = len(self.preview.file) + _OVERHEAD if self.preview else 0
         return small + (self.described.size + _OVERHEAD if self.whole is not None else 0)
 
 
 def framed(tree: Any) -> Any:
-    """Return `tree` with a `Frame` in the place of each array and of bytes; it takes milliseconds for a picture."""
     return mapped(tree, lambda it: Frame(it) if isinstance(it, np.ndarray | bytes) else it)
 
 
@@ -58,7 +56,6 @@ def thawed(tree: Any) -> Any:
 
 
 def described(value: Any) -> Unfetched:
-    """Return what is to be said of a value that a ship carries."""
     if isinstance(value, Unfetched):
         return value
     if isinstance(value, Frame):

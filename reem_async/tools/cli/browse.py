@@ -85,7 +85,6 @@ def browse(
 
 
 def check_packages(log: Path | None) -> None:
-    """Raise CommandFailed if a package that the page needs is not installed."""
     # Looked for before anything is imported, so that all that is missing is named at once.
     needed = _PACKAGES | ({"mcap": "mcap"} if log else {})
     absent = [name for module, name in needed.items() if find_spec(module) is None]
@@ -207,7 +206,6 @@ def _first_of(wanted: int | None, usual: int, start: Any) -> Any:
 
 @contextmanager
 def _programs(url: str) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Run the robot's programs; they end when their standard input does."""
     command = [sys.executable, "-m", "reem_async.tools.demo.robot"]
     # In a session of their own: Ctrl-C is for this command, which then ends them.
     running = [

@@ -221,7 +221,6 @@ async def _orphans(interface: RedisInterface, *, clean: bool) -> Finding:
 
 
 def _info(reply: Any) -> Mapping[str, str] | None:
-    """Return the fields of INFO; those that come several times (modules) joined by line ends."""
     if not isinstance(reply, bytes | bytearray | str):
         return None
     text = reply if isinstance(reply, str) else bytes(reply).decode(errors="replace")

@@ -209,7 +209,6 @@ def describe(node: Outline, limit: int) -> str:
 
 
 def as_data(node: Outline) -> Any:
-    """Return the value with a text in place of each array and of bytes."""
     if node.plain:
         return node.value
     if node.kind == "dict":

@@ -84,7 +84,6 @@ def _row(node: NodeInfo) -> tuple[str, ...]:
 
 
 def _duration(seconds: float) -> str:
-    """Return a duration for people, with two units: `1 h 5 min`."""
     whole = int(seconds)
     if whole < 60:
         return f"{whole} s"

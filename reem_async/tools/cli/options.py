@@ -36,13 +36,12 @@ def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
 
 async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
     async with interface_to(url, namespace, _SECONDS) as interface:
-        store, outer = KeyValueStore(interface), _begun(incomplete)
+        store, (begun, dot, _) = KeyValueStore(interface), incomplete.rpartition(".")
+        outer = parse(begun) if dot else ()
         if outer:  # nothing of the dict is fetched but its keys
-            keys = await store.at(typed(outer)).keys()
-        else:
-            # The server leaves out the others: it may have a million keys.
-            glob = "*" if incomplete.startswith("[") else f"{incomplete}*"
-            keys = [name async for name in names(interface, glob)]
+            keys = await store.at(begun).keys()
+        else:  # the server leaves out the others: it may have a million keys
+            keys = [name async for name in names(interface, f"{incomplete}*")]
         shown = [typed((*outer, key)) for key in keys]
         found = [each for each in shown if each.startswith(incomplete)][:_MOST]
         goes_on = False
@@ -51,17 +50,6 @@ async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
                 goes_on = bool(await store.at(found[0]).keys())
         # A shell puts a blank behind the only choice. With two it waits for more to be typed, such as the next dot.
         return [found[0], f"{found[0]}."] if goes_on else sorted(found)
-
-
-def _begun(incomplete: str) -> tuple[str | int, ...]:
-    """Return the whole elements of a path before the one that is being typed; none at the top."""
-    # The longest whole path in front of the last separator. Within a quoted key a separator is none, and what stands
-    # before it does not parse.
-    for end in range(len(incomplete), 0, -1):
-        if incomplete[end - 1] in ".[" and end > 1:
-            with suppress(ValueError):  # within a quoted key
-                return parse(incomplete[: end - 1])
-    return ()
 
 
 # localhost and not 127.0.0.1: it stands for the server's Unix socket, which is quicker.
@@ -148,7 +136,6 @@ Timeout = Annotated[
 
 
 def named_ships(names: list[str] | None) -> list[Any]:
-    """Return the ships of an interface: those named by `--ship`, then the default ones."""
     # The user's own ships first, as in a program: they may take what the default ones would.
     return [*map(ship_named, names or ()), *default_ships()]
 

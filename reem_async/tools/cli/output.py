@@ -80,7 +80,6 @@ def json_text(value: Any, *, pretty: bool = False) -> str:
 
 
 def figures(status: Any, digits: int) -> dict[str, float]:
-    """Return the fields of a dataclass of numbers, rounded, for JSON."""
     return {name: round(number, digits) for name, number in dataclasses.asdict(status).items()}
 
 
@@ -105,7 +104,6 @@ def counted(number: int, noun: str) -> str:
 
 
 def named(names: Sequence[str], most: int = 3) -> str:
-    """Return the first names, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 

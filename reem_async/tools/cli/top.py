@@ -85,7 +85,6 @@ class Window:
         return self.received[-1] - self.received[0] if self.received else 0.0
 
     def rate(self) -> float | None:
-        """Updates a second; None of fewer than two."""
         # n updates have n - 1 intervals between them.
         return (len(self.received) - 1) / self._duration if self._duration > 0 else None
 

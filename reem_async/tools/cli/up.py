@@ -44,7 +44,6 @@ class Stop:
 
 
 def fail(message: str) -> NoReturn:
-    """Print the reason on standard error and exit with code 1."""
     sys.stderr.write("reem up: " + "\n".join(map(clean, message.split("\n"))) + "\n")
     raise typer.Exit(1)
 
@@ -213,7 +212,6 @@ def _describe(server: EmbeddedServer, directory: Path | None, password: str | No
 
 
 def _summary(path: Path) -> str:
-    """What the server has begun with, and when that was."""
     from reem_async.tools.snapshots import described
 
     it = described(path)

@@ -108,7 +108,6 @@ def get(
 
 
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
-    """Return a value for people; fetches it only if it is one array."""
     # For scripts: the text as it is, without quotes. A terminal is not sent what it would obey.
     if raw and node.kind == "str":
         text = str(node.value)

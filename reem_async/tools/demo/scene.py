@@ -36,7 +36,6 @@ def angles_to(place: Sequence[float]) -> Array:
 
 
 def points_of(angles: Sequence[float]) -> Array:
-    """Return the places of foot, shoulder, elbow, wrist and hand."""
     base, *pitches = angles
     points, pitch = [np.zeros(3), np.array([0.0, 0.0, SHOULDER])], 0.0
     for length, bend in zip((UPPER, FORE, HAND), pitches, strict=True):
