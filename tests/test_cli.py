@@ -261,10 +261,6 @@ def test_get_for_programs(cli, kvs, tmp_path):
         "deep": {"tiles": [{"a": [0.0, 1.0, 2.0]}, None]},
     }
     assert cli.result("get", "cam_right", "--json") == '"AP8="\n'
-    kvs["large"] = {"map": np.zeros(300_000, np.uint8)}
-    said = cli.error(1, "get", "large", "--json")
-    assert "300.0 kB of arrays" in said
-    assert "-o FILE.npz" in said
     for options in ((), ("--json",), ("--raw",), ("-o", tmp_path / "nix.json")):
         for path in ("nix", "nix.x", "foo.nix"):
             assert f"nothing is stored at {path}" in cli.error(3, "get", path, *options)

@@ -113,13 +113,12 @@ def test_ctrl_c_in_a_terminal_and_colours():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "what"), [("a.zip", ", 2 keys"), ("b.rdb", "")])
-def test_from_a_snapshot(snapshots, name, what):
+@pytest.mark.parametrize("name", ["a.zip", "b.rdb"])
+def test_from_a_snapshot(snapshots, name):
     file = snapshots / name
     before = file.read_bytes()
     with up("--from", str(file)) as (process, said):
-        assert re.search(rf"snapshot  {re.escape(str(file))}, taken \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d{what}", said)
-        assert ("under the namespace r1:" in said) == (name == "a.zip")
+        assert f"snapshot  {file}\n" in said
         assert port_in(said) != 6379
         with reem.RedisInterface(f"redis://127.0.0.1:{port_in(said)}", namespace="r1:") as interface:
             kvs = reem.KeyValueStore(interface)

@@ -9,7 +9,7 @@ from enum import StrEnum
 from statistics import median
 from typing import NamedTuple
 
-from reem_async.tools.cli.output import counted, named, size_text
+from reem_async.tools.cli.output import named, size_text
 
 
 class CheckStatus(StrEnum):
@@ -62,11 +62,9 @@ def version(facts: Facts, address: str, *, sharded: bool) -> Finding:
         return Finding("server", OK, f"answers at {address}; this user may not ask for its version")
     name = facts.info.get("server_name", "redis")
     number = facts.info.get(f"{name}_version") or facts.info.get("redis_version", "?")
-    seconds = facts.number("uptime_in_seconds")
-    age = f"{seconds / 3600:.1f} hours" if seconds >= 3600 else counted(seconds // 60, "minute")
     # Valkey reports its own version beside the version of Redis that it is compatible with.
     mode = facts.info.get("redis_mode") or facts.info.get("server_mode", "standalone")
-    text = f"{name} {number} at {address}, {mode}, up for {age}"
+    text = f"{name} {number} at {address}, {mode}"
     if mode == "cluster" and not sharded:
         return Finding("server", WARN, text, f"this is one node of several; reach all: redis+cluster://{address}")
     return Finding("server", OK, text)

@@ -229,10 +229,3 @@ def outline_json(node: Outline, depth: int | None) -> dict[str, Any]:
     else:
         entry["summary"] = node.summary
     return entry
-
-
-def below_arrays(node: Outline) -> int:
-    """Return the bytes of all that is not JSON at a path and below: arrays, bytes, custom types."""
-    if node.kind in ("dict", "list"):
-        return sum([below_arrays(child) for child in node.children])
-    return 0 if node.plain else node.size

@@ -198,7 +198,7 @@ def _describe(server: EmbeddedServer, directory: Path | None, password: str | No
     emit(styled("REEM's server is up.", "green") + f" (process {server.pid})")
     facts_lines(
         [
-            *((("snapshot", _summary(snapshot)),) if snapshot else ()),
+            *((("snapshot", str(snapshot)),) if snapshot else ()),
             ("address", url),
             ("socket", f"unix://{server.socket_path}"),
             (
@@ -209,16 +209,6 @@ def _describe(server: EmbeddedServer, directory: Path | None, password: str | No
     )
     data = f"{server.directory}, kept" if directory else "in memory, gone when the server stops"
     facts_lines(_use(url, password, json=server.json, data=data))
-
-
-def _summary(path: Path) -> str:
-    from reem_async.tools.snapshots import described
-
-    it = described(path)
-    taken = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(it.time))
-    count = "" if it.count is None else f", {it.count} keys"
-    under = f", under the namespace {it.namespace}" if it.namespace else ""
-    return f"{path}, taken {taken}{count}{under}"
 
 
 def _log_end(server: EmbeddedServer) -> str:

@@ -21,7 +21,7 @@ from reem_async.store.accessor import Accessor
 from reem_async.store.catalog import Outline, outline
 from reem_async.store.space import PublishSpace
 from reem_async.store.store import KeyValueStore
-from reem_async.tools.cli.listing import as_data, below_arrays
+from reem_async.tools.cli.listing import as_data
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import (
     clean,
@@ -36,9 +36,6 @@ from reem_async.tools.cli.output import (
 )
 from reem_async.tools.cli.running import USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
-
-_MOST_AS_TEXT = 200_000
-"""Bytes of arrays that are printed as JSON: one of uint8 is up to four of text."""
 
 _MOST_FOR_PREVIEW = 256_000_000
 """Bytes of an array that is fetched only to show its corners."""
@@ -75,7 +72,7 @@ def get(
     Plain values are printed as JSON. An array is shown as its type and range with its first and last
     numbers; inside a dict, arrays are named and not fetched.
 
-    Exit code 3 if nothing is there. With --json, not more than 200 kB of arrays; use -o for more.
+    Exit code 3 if nothing is there.
 
     Examples:
         reem get foo.bar.subkey
@@ -101,7 +98,6 @@ def get(
         if not as_json:
             emit(await _shown(lambda: store.get(path), node, raw=raw))
             return
-        _check_size(node)
         emit(json_text(await store.get(path)))
 
     run("get", work, url, namespace)
@@ -117,15 +113,6 @@ async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: boo
     if node.size > _MOST_FOR_PREVIEW:
         return f"{clean(node.summary)}, {size_text(node.size)}; too large to fetch only to show it: use -o FILE"
     return preview(await fetch(), width() if is_terminal() else 100)
-
-
-def _check_size(node: Outline) -> None:
-    size = below_arrays(node)
-    if size > _MOST_AS_TEXT:
-        raise CommandFailed(
-            f"{typed(node.path)} has {size_text(size)} of arrays, too much to print as JSON; write it to a file: "
-            f"reem get '{typed(node.path)}' -o FILE.npz, or .json"
-        )
 
 
 def set_(
@@ -248,7 +235,7 @@ def pub(
 
 async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, said: str) -> None:
     """Publish `count` times, or until Ctrl-C; `said` is printed once the first one was taken."""
-    start, done, late = time.monotonic(), 0, 0
+    start, done = time.monotonic(), 0
     due = start
     try:
         while done != count:
@@ -261,14 +248,13 @@ async def _repeat(place: Accessor, value: Any, rate: float, count: int | None, s
             # By the plan and not from now on, so that the rate is kept however long each call takes.
             due += 1 / rate
             now = time.monotonic()
-            if now > due + 1 / rate:  # more than one behind: go on from here
-                late, due = late + 1, now
+            due = now if now > due + 1 / rate else due  # more than one behind: go on from here
             await asyncio.sleep(max(due - now, 0))
     except asyncio.CancelledError:  # Ctrl-C
         pass
     seconds = time.monotonic() - start
     reached = f", {(done - 1) / seconds:.1f} Hz" if done > 1 and seconds > 0 else ""
-    note(f"published {done} times in {seconds:.1f} s{reached}" + (f", {late} times late" if late else ""))
+    note(f"published {done} times in {seconds:.1f} s{reached}")
 
 
 def parse_value(text: str, *, is_text: bool) -> Any:
