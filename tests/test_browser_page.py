@@ -6,10 +6,8 @@ import time
 
 import numpy as np
 import pytest
-from conftest import eventually, sized
+from conftest import eventually
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
-
-import reem
 
 expect = playwright.expect
 
@@ -123,43 +121,6 @@ def test_after_an_answer_that_breaks_off_the_page_goes_on(visit, pspace, key, wh
     pspace[name]["x"] = 3
     expect(row(page, f"{name}.x")).to_contain_text("3")
     expect(page.locator("#banner")).to_be_hidden()
-
-
-@pytest.mark.parametrize("label", sized(["__proto__"], ["constructor", "toString", "__proto__"]))
-def test_a_ship_may_be_called_as_what_every_object_has(visit, server_url, key, label):
-    """The page looked its name up in a plain object, found a function, and showed nothing new for ever."""
-
-    class Odd(reem.BytesShip):
-        def check_fit(self, value):
-            return isinstance(value, bytes)
-
-        def get_label(self):
-            return label
-
-    name = key("odd")
-    with reem.RedisInterface(server_url, ships=[Odd()]) as interface:
-        reem.KeyValueStore(interface)[name] = {"blob": b"12345", "n": 1}
-        page = visit.open(f"/view/{name}.blob")
-        expect(page.locator("#view .head .what")).to_contain_text(label)
-        expect(page.locator("#view .big")).to_have_text("bytes")
-        expect(row(page, f"{name}.blob").locator(".value")).to_have_attribute("title", re.compile(f"^{label}  "))
-        reem.PublishSpace(interface)[name]["n"] = 2
-        expect(row(page, f"{name}.n")).to_contain_text("2")
-
-
-@pytest.mark.long
-def test_a_key_may_be_called_as_what_turns_the_pages_of_another(visit, kvs, key):
-    """Both were kept under `more:` and the key: the tree was not drawn any more."""
-    name = key("long")
-    kvs[name] = dict.fromkeys([f"n{number:03}" for number in range(120)], 1)
-    kvs[f"more:{name}"] = 7
-    try:
-        page = visit.open()
-        row(page, name).locator(".twist").click()
-        expect(page.locator("#tree .pager.more")).to_contain_text("of 120")
-        expect(row(page, f"more:{name}")).to_contain_text("7")
-    finally:
-        del kvs[f"more:{name}"]
 
 
 @pytest.mark.long

@@ -45,18 +45,6 @@ _HEADERS = {
 }
 
 
-def new_token() -> str:
-    return secrets.token_urlsafe(24)
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether only programs of this machine can reach what is bound to `host`."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def own_names() -> frozenset[str]:
     """Return the names of this machine, beside its addresses, that a browser elsewhere may use."""
     name = socket.gethostname().lower()

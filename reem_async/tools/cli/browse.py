@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import typer
 from reem_async.connection import RedisInterface
 from reem_async.errors import ServerFailed
 from reem_async.server.embedded import EmbeddedServer
+from reem_async.tools.cli.checks import is_loopback
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import USAGE, CommandFailed, interface_to, run_local
@@ -106,12 +108,12 @@ def _source(url: str, namespace: str, log: Path | None, buffer: float, memory: i
 
 async def _serve(source: Source, host: str, port: int, allow_write: bool, open_: bool) -> None:
     from reem_async.tools.browser import PageServer, create_app, listen
-    from reem_async.tools.browser.app import LOOPBACK, is_loopback, new_token, own_names
+    from reem_async.tools.browser.app import LOOPBACK, own_names
 
     # Reachable from this machine only: then the name in the request is checked, and no token is needed. From others
     # a token is, and the name may be any of this machine's.
     alone = is_loopback(host)
-    token = None if alone else new_token()
+    token = None if alone else secrets.token_urlsafe(24)
     hosts: Any = LOOPBACK if alone else own_names() | {host.lower()}
     app = create_app(source, allow_write=allow_write, token=token, hosts=hosts, any_address=not alone)
     # Before the source starts: that the port is taken is said at once, whatever the server does.
