@@ -217,14 +217,15 @@ def test_tree(cli, kvs):
         "        │   └── a  float64[3]  24 B",
         "        └── [1]  null",
     ]
-    assert cli.result("tree", "foo.deep.tiles[-2]", "--depth", "0") == "foo.deep.tiles[0]  1 key  24 B\n"
-    (line,) = cli.result("tree", "foo.deep", "--depth", "1", "--json").splitlines()
+    assert cli.result("tree", "foo.deep.tiles[-2]").startswith("foo.deep.tiles[0]  1 key  24 B\n")
+    (line,) = cli.result("tree", "foo.deep.tiles[0]", "--json").splitlines()
+    array = {"path": "foo.deep.tiles[0].a", "type": "numpy", "size": 24, "summary": "float64[3]"}
     assert json.loads(line) == {
-        "path": "foo.deep",
+        "path": "foo.deep.tiles[0]",
         "type": "dict",
-        "size": 32,
+        "size": 24,
         "length": 1,
-        "children": [{"path": "foo.deep.tiles", "type": "list", "size": 32, "length": 2}],
+        "children": [array],
     }
 
 

@@ -67,7 +67,7 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
         rows = []
         async for node in found(interface, pattern):
             if as_json:
-                emit_json(outline_json(node, 0))
+                emit_json(outline_json(node, whole=False))
             rows.append((typed(node.path), node.kind, describe(node, 48), size_text(node.size)))
         if not as_json:
             columns(rows, ("bold", "cyan", "", "green"), right=frozenset({3}), shrink=(2, 0))
@@ -78,9 +78,6 @@ def ls(pattern: OnePattern = "*", as_json: AsJson = False, url: Url = DEFAULT_UR
 
 def tree(
     pattern: OnePattern = "*",
-    depth: Annotated[
-        int | None, typer.Option("--depth", "-d", min=0, metavar="N", help="Only so many levels below each.")
-    ] = None,
     whole: Annotated[
         bool, typer.Option("--all", help=f"Also what comes after the first {_MOST_CHILDREN} entries of a dict or list.")
     ] = False,
@@ -94,7 +91,7 @@ def tree(
 
     Examples:
         reem tree
-        reem tree robot.arm --depth 1
+        reem tree robot.arm
         reem tree 'cam_*'
     """
 
@@ -104,9 +101,9 @@ def tree(
         async for node in found(interface, pattern):
             count += 1
             if as_json:
-                emit_json(outline_json(node, depth))
+                emit_json(outline_json(node, whole=True))
                 continue
-            for line in _drawn(node, typed(node.path), "", "", depth, None if whole else _MOST_CHILDREN):
+            for line in _drawn(node, typed(node.path), "", "", None if whole else _MOST_CHILDREN):
                 emit(line)
         return 0 if count else _nothing(pattern, interface)
 
@@ -121,7 +118,7 @@ def _nothing(pattern: str, interface: RedisInterface) -> int:
     return NOTHING
 
 
-def _drawn(node: Outline, name: str, lead: str, below: str, depth: int | None, most: int | None) -> Iterator[str]:
+def _drawn(node: Outline, name: str, lead: str, below: str, most: int | None) -> Iterator[str]:
     """Yield the lines of a tree: `lead` stands before the first one, `below` before those of its children."""
     # A list of plain values is one line, as people write it.
     inline = node.kind == "list" and all(child.plain for child in node.children)
@@ -132,14 +129,14 @@ def _drawn(node: Outline, name: str, lead: str, below: str, depth: int | None, m
     text = cut(name, max(width() - len(lead) - 1, 8)) if is_terminal() else name
     parts = [styled(text, "bold"), styled(what, colour), styled(size, "green")]
     yield styled(lead, "dim") + "  ".join(part for part in parts if part)
-    if inline or not node.children or depth == 0:
+    if inline or not node.children:
         return
     children = node.children[:most]
     left = len(node.children) - len(children)
     for place, child in enumerate(children):
         last = place == len(children) - 1 and not left
         lead, deeper = below + ("└── " if last else "├── "), below + ("    " if last else "│   ")
-        yield from _drawn(child, _key(child), lead, deeper, None if depth is None else depth - 1, most)
+        yield from _drawn(child, _key(child), lead, deeper, most)
     if left:
         yield styled(below + "└── ", "dim") + f"… {left} more (--all)"
 
@@ -218,14 +215,14 @@ def as_data(node: Outline) -> Any:
     return f"<{node.summary or node.kind}, {size_text(node.size)}>"
 
 
-def outline_json(node: Outline, depth: int | None) -> dict[str, Any]:
+def outline_json(node: Outline, *, whole: bool) -> dict[str, Any]:
     entry: dict[str, Any] = {"path": typed(node.path), "type": node.kind, "size": node.size}
     if node.plain:
         entry["value"] = node.value
     elif node.kind in ("dict", "list"):
         entry["length"] = len(node.children)
-        if depth is None or depth > 0:
-            entry["children"] = [outline_json(child, None if depth is None else depth - 1) for child in node.children]
+        if whole:
+            entry["children"] = [outline_json(child, whole=True) for child in node.children]
     else:
         entry["summary"] = node.summary
     return entry
