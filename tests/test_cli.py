@@ -336,7 +336,6 @@ def test_delete(cli, kvs):
     cli.result("del", "foo")
     assert kvs.get("foo", "gone") == "gone"
     assert "nothing is stored at foo" in cli.error(3, "del", "foo")
-    assert cli.in_terminal("del", "cam_right", "--yes") == ("", 0), "a terminal is asked otherwise: test_cli_odd.py"
 
 
 def test_subscribers_are_told_if_wanted(cli, kvs):

@@ -3,11 +3,8 @@
 import base64
 import json
 import os
-import pty
 import shlex
-import signal
 import subprocess
-import time
 import zipfile
 
 import numpy as np
@@ -37,30 +34,6 @@ from reem_async.tools.snapshots.plans import KeyContent, Value
 def kvs(cli):
     with blocking.RedisInterface(cli.url, namespace=cli.namespace) as interface:
         yield blocking.KeyValueStore(interface)
-
-
-@pytest.mark.parametrize(
-    ("press", "code", "left"), [("^C", 130, ["a"]), ("n\n", 1, ["a"]), ("\x04", 1, ["a"]), ("y\n", 0, [])]
-)
-def test_before_a_whole_key_goes_it_is_asked(cli, kvs, press, code, left):
-    kvs["a"] = 1
-    mine, its = pty.openpty()
-    pipes = {"stdin": its, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(cli.words("del", "a"), env=cli.environment(), **pipes) as process:
-        said = b""
-        while b"[y/N]" not in said:
-            said += process.stderr.read(1)
-        assert b"Delete a with all" in said
-        time.sleep(0.1)
-        if press == "^C":
-            process.send_signal(signal.SIGINT)
-        else:
-            os.write(mine, press.encode())
-        assert process.wait(10) == code
-        assert b"Traceback" not in process.stderr.read()
-    os.close(mine)
-    os.close(its)
-    assert kvs.keys() == left
 
 
 def test_no_name_of_an_array_is_special_to_a_file(tmp_path):

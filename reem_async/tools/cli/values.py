@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import signal
 import sys
 import time
 import zipfile
@@ -148,9 +147,6 @@ def set_(
 def delete(
     path: PathArgument,
     publish: Publish = False,
-    yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask; a terminal asks before all of a top-level key goes.")
-    ] = False,
     url: Url = DEFAULT_URL,
     namespace: Namespace = "",
 ) -> None:
@@ -161,35 +157,17 @@ def delete(
     Examples:
         reem del robot.name
         reem del robot.joints[-1] --publish
-        reem del robot --yes
+        reem del robot
     """
 
     async def work(interface: RedisInterface) -> None:
-        place = _place(interface, path, publish)
-        # Only for a whole top-level key, and only on a terminal: a script cannot answer.
-        if len(place.full_path) == 1 and not yes and sys.stdin.isatty():
-            _ask(f"Delete {clean(path)} with all that is below it at {interface.hostname}?")
-        await place.delete()
+        await _place(interface, path, publish).delete()
 
     run("del", work, url, namespace)
 
 
 def _place(interface: RedisInterface, path: str, publish: bool) -> Accessor:
     return (PublishSpace if publish else KeyValueStore)(interface).at(path)
-
-
-def _ask(question: str) -> None:
-    """Ask before a whole key goes; raises CommandFailed if the answer is no."""
-    # asyncio's handler would only set a flag for the event loop, which stands still while it is asked.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        sys.stderr.write(f"{question} [y/N]: ")
-        sys.stderr.flush()
-        # The end of the input is no answer.
-        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
-            raise CommandFailed("nothing was deleted")
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def pub(
