@@ -12,14 +12,12 @@ import time
 import numpy as np
 import pytest
 from clikit import begins, finished, invoked, is_recording, started
-from conftest import PLAIN, ROOT, assert_same, eventually
+from conftest import ROOT, assert_same, eventually
 from test_recording import IMAGE
 from test_recording_file import middle_chunk
 from test_unreadable import Pose
 
 from reem import KeyValueStore, NumpyShip, RedisInterface
-from reem.recording import Recorder
-from reem.server import EmbeddedServer
 from reem_async.tools.recording import open_log
 
 
@@ -229,20 +227,3 @@ def test_a_ship_of_the_users_own_is_named_on_the_command_line(server_url, key, r
     assert found["pose"] == 1 + 2j if ships else "which this interface lacks" in found["pose"].reason
     played = reem("play", "run.mcap", "--rate", "1000")
     assert (played.returncode, "left out" in played.stdout + played.stderr) == (1, True)  # without the ship
-
-
-def test_a_key_that_may_not_be_read_does_not_keep_a_recording_from_ending(tmp_path):
-    """It went on for 9 s; the others are recorded."""
-    with EmbeddedServer() as server, RedisInterface(server) as other:
-        for name in ("mine", "other"):
-            KeyValueStore(other)[name] = {"n": 0}
-        rights = ["~mine", "~{mine}*"]
-        other.client.execute_command("ACL", "SETUSER", "u", "reset", "on", ">pw", "&*", "+@all", *rights)
-        with RedisInterface(f"redis://u:pw@127.0.0.1:{server.port}") as interface:
-            begun = time.monotonic()
-            with Recorder(interface, ["*"], tmp_path / "run.mcap") as recorder:
-                recorder.wait(0.5)
-            assert time.monotonic() - begun < 4
-            assert recorder.status.lost == (0 if PLAIN else 1)
-    with open_log(tmp_path / "run.mcap") as log:
-        assert log["mine"].at(log.end) == {"n": 0}

@@ -106,29 +106,6 @@ async def test_what_is_published_and_dropped_before_it_is_taken_is_no_stored_cha
     assert told[-1] == (key(), "kvs", {"x": 1, "y": 2, "z": 3})
 
 
-@pytest.mark.parametrize("published", [False, True])
-async def test_after_an_overload_stored_changes_are_told_again(key, akvs, apspace, binterface, file, published):
-    await akvs[key()].write({"n": 0, "p": ""})
-    async with recording(binterface, [key()], file) as recorder:
-        await aeventually(lambda: is_followed(recorder, key()))
-        thread = recorder.writer_thread
-        with thread._changed:  # so it writes nothing for a moment
-            thread._limit, before = 1, thread.counts.dropped
-            thread._size += 1
-        await (apspace if published else akvs)[key()]["p"].write("x")
-        await aeventually(lambda: thread.counts.dropped > before)
-        with thread._changed:
-            thread._limit = 1 << 20
-            thread._size -= 1
-        await aeventually(lambda: thread._trees.get(key()) == {"n": 0, "p": "x"})
-        await aeventually(lambda: is_followed(recorder, key()) and not thread.behind)
-        await akvs[key()]["n"].write(1)
-        await recorder.written(key())
-    told = news(file)
-    assert (f"{key()}.n", "stored", 1) in told
-    assert not [each for each in told if each[1] == "stored" and "p" in each[0].removeprefix(key())]
-
-
 async def test_what_turns_out_at_the_end_not_to_be_written_is_read_once_more(
     key, apspace, binterface, file, monkeypatch
 ):

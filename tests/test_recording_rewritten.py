@@ -302,7 +302,7 @@ def test_made_up_messages_are_left_out(file, tmp_path):
                 log.gaps(), log.skipped(), log.verify()
                 contents(log, [log.start, log.end])
                 for instant in np.linspace(log.start, log.end, 7):
-                    for ask in (log.tree_at, log.outline_at, lambda it, log=log: log.value_at("k", it)):
+                    for ask in (log.tree_at, lambda it, log=log: log.value_at("k", it)):
                         with contextlib.suppress(BadData, MissingKey):
                             ask(instant)
                 for kind in ("csv", "npz"):
@@ -352,9 +352,9 @@ def test_records_that_mcap_does_not_know_are_skipped(original, recorded, file):
 
 
 def test_messages_outside_of_chunks(file):
-    """What is before a cut is read; damage is found by the checksum of all data, if there is one."""
+    """What is before a cut is read."""
     stream = io.BytesIO()
-    writer = mcap.writer.Writer(stream, use_chunking=False, enable_data_crcs=True)
+    writer = mcap.writer.Writer(stream, use_chunking=False)
     writer.start("", "")
     metadata = {"reem.path": '["k"]', "reem.role": "update", "reem.kind": "pub"}
     channel = writer.register_channel("/k", "json", writer.register_schema("s", "jsonschema", b"{}"), metadata)
@@ -364,8 +364,7 @@ def test_messages_outside_of_chunks(file):
     writer.finish()
     data = stream.getvalue()
     cut = data[: data.index(b'{"n": 3}') + 3]
-    changed = data.replace(b'"n": 1', b'"n": 4')
-    for content, numbers, damaged in ((data, [1, 2, 3], 0), (cut, [1, 2], 1), (changed, [4, 2, 3], 1)):
+    for content, numbers, damaged in ((data, [1, 2, 3], 0), (cut, [1, 2], 1)):
         file.write_bytes(content)
         with open_log(file) as log:
             assert [it.value["n"] for it in log.updates()] == numbers

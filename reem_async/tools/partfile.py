@@ -3,39 +3,23 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 import errno
 import fcntl
 import os
 import re
 import secrets
 import stat
-import time
 from pathlib import Path
 
 _NAME = re.compile(r"\..*\.[0-9a-f]{8}\.reem\.part", re.DOTALL)
 _LONGEST = 200
 """Bytes of a target's name in that of the hidden file: file systems take 255 in all."""
-_ABANDONED_SECONDS = 3600.0
-"""Where there are no locks: a file that was not written to for so long is nobody's."""
-_AT_WORK_SECONDS = 10.0
-"""Where there are no locks: a file that was written to since then has a writer. A recording has a keyframe each 5 s."""
 # Anybody may put a FIFO or a link into a shared directory: neither waits here, nor leads elsewhere.
 _OTHERS = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
 
 
-class Lock(enum.Enum):
-    """What became of asking for the lock of a file."""
-
-    HELD = enum.auto()
-    TAKEN = enum.auto()
-    """By another program, or elsewhere in this one."""
-    NONE = enum.auto()
-    """The file system has no locks."""
-
-
-def lock(descriptor: int, *, shared: bool = False) -> Lock:
-    """Lock an open file until it is closed, also by the end of the program.
+def _lock(descriptor: int, *, shared: bool = False) -> bool | None:
+    """Lock an open file until it is closed, also by the end of the program; None if the file system has no locks.
 
     Other programs may read and write it nevertheless. A `shared` lock, with which one only looks whether a writer has
     it, is for a file that is open for reading: NFS refuses other locks of such a file.
@@ -43,19 +27,18 @@ def lock(descriptor: int, *, shared: bool = False) -> Lock:
     try:
         fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except OSError as error:  # CIFS says EACCES of what is locked
-        return Lock.TAKEN if error.errno in (errno.EAGAIN, errno.EACCES) else Lock.NONE
-    return Lock.HELD
+        return False if error.errno in (errno.EAGAIN, errno.EACCES) else None
+    return True
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether some program, this one included, has locked a file; without locks, whether it is written to."""
+    """Return whether some program, this one included, has locked a file."""
     try:
         descriptor = os.open(path, _OTHERS)
     except OSError:
         return False
     try:
-        found = lock(descriptor, shared=True)
-        return found is Lock.TAKEN or (found is Lock.NONE and _age(descriptor) < _AT_WORK_SECONDS)
+        return _lock(descriptor, shared=True) is False
     finally:
         os.close(descriptor)
 
@@ -89,7 +72,7 @@ class PartFile:
             self.path = target.with_name(f".{name}.{secrets.token_hex(4)}.reem.part")
             descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600 if old else 0o666)
             # Before it was locked, another program may have taken it for abandoned.
-            if lock(descriptor) is not Lock.TAKEN and os.fstat(descriptor).st_nlink:
+            if _lock(descriptor) is not False and os.fstat(descriptor).st_nlink:
                 self.descriptor = descriptor
             else:
                 os.close(descriptor)
@@ -167,10 +150,6 @@ def _rename(part: Path, target: Path) -> None:
             part.unlink()
 
 
-def _age(descriptor: int) -> float:
-    return time.time() - os.fstat(descriptor).st_mtime
-
-
 def _remove_abandoned(directory: Path) -> None:
     """Remove what programs have left that were killed."""
     for part in directory.glob(".*.reem.part"):
@@ -182,9 +161,7 @@ def _remove_abandoned(directory: Path) -> None:
 def _remove_if_abandoned(part: Path) -> None:
     descriptor = os.open(part, _OTHERS | os.O_NOFOLLOW)
     try:
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):
-            found = lock(descriptor, shared=True)
-            if found is Lock.HELD or (found is Lock.NONE and _age(descriptor) > _ABANDONED_SECONDS):
-                part.unlink()
+        if stat.S_ISREG(os.fstat(descriptor).st_mode) and _lock(descriptor, shared=True):
+            part.unlink()
     finally:
         os.close(descriptor)

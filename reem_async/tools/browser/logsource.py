@@ -15,8 +15,9 @@ import numpy as np
 from ...coordination.parameters import StoredParameter
 from ...errors import MissingKey, ReadOnly
 from ...plan.paths import Path, show
-from ...plan.trees import MISSING, get
-from ..recording.log import Log, open_log
+from ...plan.placeholders import Unfetched
+from ...plan.trees import MISSING, get, mapped
+from ..recording.log import ArrayHandle, Log, open_log
 from .source import (
     Node,
     Page,
@@ -30,7 +31,7 @@ from .source import (
     numbers_in,
     rate_span,
 )
-from .trees import differing, tree_of_outline
+from .trees import differing, strip
 
 Result = TypeVar("Result")
 
@@ -88,7 +89,8 @@ class LogSource:
         return await anyio.to_thread.run_sync(work, limiter=self._turns)
 
     def _read_state(self, at: float) -> dict[str, Any]:
-        return {name: tree_of_outline(it) for name, it in self.log.outline_at(at).items()}
+        trees = self.log.tree_at(at)
+        return {name: strip(mapped(tree, _unfetched)) for name, tree in trees.items()}
 
     def _rate(self, name: str, at: float) -> float | None:
         # The same span as of a live server, so that both show the same rate.
@@ -174,3 +176,7 @@ class LogSource:
 
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")
+
+
+def _unfetched(it: Any) -> Any:
+    return Unfetched(it.label, it.size, it.summary) if type(it) is ArrayHandle else it

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -127,25 +126,12 @@ def record(
 
 
 def _progress(recorder: Recorder, as_json: bool) -> AbstractAsyncContextManager[None]:
-    before, then = recorder.status, time.monotonic()
-
-    def looked() -> tuple[RecorderStatus, float, float]:
-        """Return the status, and messages and bytes a second since the last look."""
-        nonlocal before, then
-        old, since = before, then
-        before, then = recorder.status, time.monotonic()
-        return before, (before.messages - old.messages) / (then - since), (before.bytes - old.bytes) / (then - since)
-
     def text() -> str:
-        status, messages, size = looked()
-        line = f"{_clock(status.seconds)}  {status.messages} messages  {messages:.0f}/s  {size_text(size)}/s"
+        status = recorder.status
+        line = f"{_clock(status.seconds)}  {status.messages} messages  {status.rate:.0f}/s"
         return f"{line}  {size_text(status.file_bytes)} in the file  {_missing(status)}"
 
-    def data() -> dict[str, Any]:
-        status, messages, _ = looked()
-        return figures(status, 3) | {"rate": round(messages, 1)}
-
-    return progress(text, data, _SHOWN_EVERY, as_json=as_json)
+    return progress(text, lambda: figures(recorder.status, 3), _SHOWN_EVERY, as_json=as_json)
 
 
 def _begin(recorder: Recorder, duration: float | None, as_json: bool) -> None:

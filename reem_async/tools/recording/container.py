@@ -11,7 +11,6 @@ import heapq
 import io
 import struct
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -52,8 +51,6 @@ _SMALLEST_CHUNK, _LARGEST_CHUNK = 40, 1 << 31
 """Bytes. REEM closes a chunk with the message that takes it over a megabyte."""
 _BARE_BYTES = 1 << 20
 """Bytes of messages outside of chunks that are read as one chunk."""
-# Head of the record, checksum of all before it.
-_DATA_END = struct.Struct("<BQI")
 # What other records of these kinds would hide: all that follows.
 _END_LENGTHS = {Opcode.DATA_END: 4, Opcode.FOOTER: 20}
 
@@ -159,7 +156,6 @@ class _Scan:
         self.damaged += position < self._size
 
     def _take_bare(self, start: int, end: int) -> None:
-        """Take messages that are outside of chunks as one chunk."""
         info = ChunkInfo(0, 0, 0, start, end - start, end, 0, np.empty(0, np.uint16), bare=True)
         if end > start:
             self._take_content(info)
@@ -263,7 +259,6 @@ class Container:
 
     @property
     def chunks(self) -> list[ChunkInfo]:
-        """All chunks but those found to be damaged, in order of their first log times."""
         return [info for info in self.every_chunk if info.number not in self.lost] if self.lost else self.every_chunk
 
     def content(self, info: ChunkInfo) -> bytes | None:
@@ -284,7 +279,6 @@ class Container:
             return content
 
     def _discard(self, info: ChunkInfo) -> None:
-        """Leave out a chunk that is damaged, and count it."""
         with self._lock:
             self.damaged += info.number not in self.lost
             self.lost.add(info.number)
@@ -349,24 +343,8 @@ class Container:
             messages += 0 if made is None else len(made.times)
             if progress is not None:
                 progress(info.number + 1, len(self.every_chunk))
-        # What is outside of chunks has no checksum but that of all data, if its writer has made one.
-        if not self.damaged and (self._messages not in (None, messages) or not self._is_sound()):
-            self.damaged += 1
+        self.damaged += not self.damaged and self._messages not in (None, messages)
         return self.damaged
-
-    def _is_sound(self) -> bool:
-        """Return whether the data section has the checksum that its end names."""
-        footer = read_footer(self._source)
-        if footer is None:
-            return True
-        end = footer.data_end - _DATA_END.size
-        opcode, _, checksum = _DATA_END.unpack(self._source.read(end, _DATA_END.size))
-        if opcode != Opcode.DATA_END or checksum == 0:
-            return True
-        found = 0
-        for start in range(0, end, _BARE_BYTES):
-            found = zlib.crc32(self._source.read(start, min(_BARE_BYTES, end - start)), found)
-        return bool(found == checksum)
 
 
 # Finding messages by channel and time, reading as few chunks as possible.
@@ -469,7 +447,6 @@ class Timeline:
                 yield info
 
     def times(self, channels: Iterable[int]) -> Numbers:
-        """Return the log times of all messages of some channels, in ns, sorted: uint64."""
         wanted, found = _mask(channels), [np.empty(0, np.uint64)]
         for info in self._with(wanted, -1, _END):
             index = self._container.index(info)
@@ -524,7 +501,6 @@ def _mask(channels: Iterable[int]) -> Numbers:
 
 
 def _between(times: Numbers, after: int, until: int) -> Numbers:
-    """Return of each time whether it is later than `after` and not later than `until`."""
     begun = times > np.uint64(after) if after >= 0 else np.ones(len(times), bool)
     return begun & (times <= np.uint64(until)) if until >= 0 else np.zeros(len(times), bool)
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import shutil
+import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Sequence
 from importlib import import_module
 from pathlib import Path as FilePath
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -18,7 +20,7 @@ from ...plan.paths import Path, suffix
 from ...plan.trees import MISSING
 from ..partfile import PartFile, there_already
 from .format import Kind
-from .log import EXACT, Log, numbers
+from .log import EXACT, Log, stacked
 from .stored import Reference, is_inline
 
 # Rows of a group in a Parquet file, and those that are in memory at once.
@@ -217,43 +219,34 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
     result.unreadable = log.unreadable
     with zipfile.ZipFile(target, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
         for path in paths:
-            before, knew = log.unreadable, log.is_damaged
-            try:
-                times, form, count = _shape(log, path)
-                if log.is_damaged != knew:  # found on the way: from now on more is read of keyframes
-                    before = log.unreadable
-                    times, form, count = _shape(log, path)
-            except BadData as error:
-                result.left_out[_name(path)] = str(error)
-                continue
-            finally:
-                lost += log.unreadable - before
-            if form is None:
-                result.left_out[_name(path)] = "its type or shape changes, or no dtype holds it exactly"
-                continue
-            result.rows += count
-            result.columns.append(_name(path))
-            _write(archive, f"{_name(path)}.time", times)
-            # The header says how many there are, so they were counted first; then each is written as it is read.
-            dtype, shape = form
-            with archive.open(f"{_name(path)}.npy", "w", force_zip64=True) as file:
-                header = {
-                    "descr": np.lib.format.dtype_to_descr(dtype),
-                    "fortran_order": False,
-                    "shape": (count, *shape),
-                }
-                np.lib.format.write_array_header_2_0(file, header)
-                for _, value in itertools.islice(log[path].values(), count):
-                    file.write(np.ascontiguousarray(np.asarray(value, dtype)).tobytes())
+            before = log.unreadable
+            # The header says how many values there are, so they wait in a file until they are counted.
+            with tempfile.TemporaryFile(dir=target.parent) as values:
+                try:
+                    times, form = _spooled(log, path, values)
+                except BadData as error:
+                    result.left_out[_name(path)] = str(error)
+                    continue
+                finally:
+                    lost += log.unreadable - before
+                if form is None:
+                    result.left_out[_name(path)] = "its type or shape changes, or no dtype holds it exactly"
+                    continue
+                result.rows += len(times)
+                result.columns.append(_name(path))
+                _write(archive, f"{_name(path)}.time", np.dtype(np.float64), times.shape, io.BytesIO(times.tobytes()))
+                values.seek(0)
+                _write(archive, _name(path), form[0], (len(times), *form[1]), values)
     # What each path lacks is in the updates, which were counted, but for arrays, which were not read then.
     result.unreadable = result.unreadable or lost
     result.begin(result.columns)
 
 
-def _write(archive: zipfile.ZipFile, name: str, array: np.ndarray[Any, Any]) -> None:
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, array, allow_pickle=False)
-    archive.writestr(f"{name}.npy", buffer.getvalue())
+def _write(archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], data: IO[bytes]) -> None:
+    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+        np.lib.format.write_array_header_2_0(file, header)
+        shutil.copyfileobj(data, file)
 
 
 def _array_paths(log: Log, patterns: Sequence[str], result: Export) -> list[Path]:
@@ -285,37 +278,24 @@ def _places(path: Path, value: Any, result: Export) -> Iterator[Path]:
 Form = tuple[np.dtype[Any], tuple[int, ...]]
 
 
-def _shape(log: Log, path: Path) -> tuple[np.ndarray[Any, Any], Form | None, int]:
-    """Return the times of a path's values, the dtype and shape that fit all (None if none does), and how many."""
+def _spooled(log: Log, path: Path, file: IO[bytes]) -> tuple[np.ndarray[Any, Any], Form | None]:
+    """Write a path's values into a file; return their times, and the dtype and shape of all, None if they differ."""
     times: list[float] = []
-    forms: set[Form] = set()
-    largest = 0
+    forms: set[Form | None] = set()
+    others: list[Any] = []
     for time, value in log[path].values():
         times.append(time)
-        array = _array(value)
-        if array is None or array.dtype.hasobject:
-            return np.array(times), None, 0
-        forms.add((array.dtype, array.shape))
-        if array.dtype.kind in "iu" and array.size:
-            largest = max(largest, int(array.max()), -int(array.min()))
-    # Numbers may be mixed if a wider type holds them all; texts of different lengths too.
-    kinds = {dtype.kind for dtype, _ in forms}
-    if len({shape for _, shape in forms}) != 1 or not (len(forms) == 1 or kinds <= set("iuf") or kinds == {"U"}):
-        return np.array(times), None, 0
-    dtype = np.result_type(*[dtype for dtype, _ in forms])
-    # Integers beside floats, too large to be floats without loss.
-    if dtype.kind == "f" and largest > EXACT:
-        return np.array(times), None, 0
-    return np.array(times), (dtype, next(iter(forms))[1]), len(times)
-
-
-def _array(value: Any) -> np.ndarray[Any, Any] | None:
-    """Return one value as an array that holds it exactly, None if there is none."""
-    if isinstance(value, list):
-        return numbers(value) if value else np.empty(0)
-    if isinstance(value, str) and value.endswith("\0"):  # numpy would take that for padding
-        return None
-    return np.asarray(value) if isinstance(value, bool | int | float | str | np.ndarray) else None
+        if isinstance(value, np.ndarray):
+            forms.add((value.dtype, value.shape))
+            file.write(value.tobytes())
+        else:
+            others.append(value)
+    if others:
+        is_text = all(isinstance(it, str) and not it.endswith("\0") for it in others)  # numpy takes that for padding
+        array = np.array(others) if is_text else stacked(others)
+        forms.add((array.dtype, array.shape[1:]) if isinstance(array, np.ndarray) else None)
+        file.write(array.tobytes() if isinstance(array, np.ndarray) else b"")
+    return np.array(times), forms.pop() if len(forms) == 1 else None
 
 
 FORMATS: dict[str, Callable[[Log, FilePath, Sequence[str], Export], None]] = {

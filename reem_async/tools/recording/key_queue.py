@@ -190,7 +190,6 @@ class KeyQueue:
         return skipped(head) if head.role == Role.UPDATE else head
 
     def asked(self) -> None:
-        """The read for the first item begins."""
         self._line = self.order
         self.division.asked(in_order=False)
 

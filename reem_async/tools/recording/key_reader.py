@@ -27,8 +27,6 @@ _SUFFIX = "", ".", "["
 
 
 class Fetched(NamedTuple):
-    """What was read."""
-
     value: Any  # MISSING if nothing is there
     size: int
     note: Reply  # the server's note of the last update that is in it

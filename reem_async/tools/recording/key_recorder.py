@@ -60,8 +60,6 @@ class Collector(Protocol):
 
 
 class KeyRecorder:
-    """The updates of one top-level key."""
-
     def __init__(self, collector: Collector, name: str) -> None:
         self._collector = collector
         self._name = name
@@ -99,7 +97,6 @@ class KeyRecorder:
             self._add(Item(role, event.path, event.value, stamp, self._queue.order, event.size))
 
     def lost(self, missed: int | None) -> None:
-        """Note that updates were lost, and read the key again."""
         self._reader.forget()
         self._queue.order += 1
         self._add(self._item(Role.GAP, missed))
@@ -131,7 +128,6 @@ class KeyRecorder:
             self._add(Item(Role.STORED, (self._name,), ANNOUNCED, (now, now, 0), self._queue.order))
 
     def keyframe(self, number: int) -> None:
-        """Write the whole key as the recording has it."""
         self._add(self._item(Role.KEYFRAME, None, number))
 
     def sampled(self, path: Path, value: Any, size: int) -> None:
@@ -267,22 +263,15 @@ class RecordedKeys:
             if self.concerns(name):
                 self.of(name).follow()
 
-    def be_due(self) -> None:
-        """Let the next look read every key, whatever was read of it of late."""
-        for recorder in self._recorders.values():
-            recorder.looks.earliest = 0.0
-
     def look_at_once(self) -> None:
         for recorder in self._recorders.values():
             recorder.looks.now()
 
     def lost(self) -> None:
-        """Note that updates of any key may be lost, and read all keys again."""
         for recorder in self._recorders.values():
             recorder.lost(None)
 
     async def settled(self, patience: float) -> None:
-        """Wait until no key is being fetched, at most so many seconds."""
         deadline = time.monotonic() + patience
         while (
             busy := [recorder.busy for recorder in self._recorders.values() if recorder.busy]

@@ -54,7 +54,6 @@ class JsonMessage(NamedTuple):
 
 
 def topic_of(path: Path) -> str:
-    """Return the topic of a path: `/arm/q`."""
     return "/" + "/".join([str(key) for key in path])
 
 

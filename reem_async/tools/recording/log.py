@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path as FilePath
 from types import TracebackType
 from typing import Any, Self
@@ -17,12 +16,10 @@ from ...plan.paths import Path, parse, parse_pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
-from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships, default_ships
-from ...store.catalog import Outline
 from ...transport.packing import CommandRecorder
-from .container import Container, Ref
-from .format import Role
+from .container import Container, Ref, Totals
+from .format import NEWS, Role
 from .log_reader import RecordedPast, RecordedStream
 from .stored import LOST, Reference, pruned, resolve
 from .times import Instant, nanoseconds, seconds
@@ -148,15 +145,10 @@ def open_log(
 
 
 class Log:
-    """A recording. `log["foo.bar"].at(t)` is what was at foo.bar at the instant t.
+    """A recording, as `open_log` opens it. `log["foo.bar"].at(t)` is what was at foo.bar at the instant t.
 
     Instants are seconds since 1970 as float, on the clock of the recorder, or numpy datetime64.
     Any thread may use it; nothing here waits for a server.
-
-    Args:
-        path: The file.
-        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
-        progress: See `open_log`.
     """
 
     def __init__(
@@ -169,14 +161,14 @@ class Log:
         self.path = FilePath(path)
         self._container = Container(self.path, progress)
         try:
-            self._past = RecordedPast(
+            self._past = past = RecordedPast(
                 self._container, Ships(default_ships() if ships is None else ships, CommandRecorder)
             )
         except BaseException:
             self._container.close()
             raise
-        self._trees: OrderedDict[tuple[str, int], Any] = OrderedDict()
-        self._lock = threading.RLock()
+        keeping = lru_cache(max(_CACHED_TREES, 2 * len(past.names)))
+        self._tree = keeping(lambda name, changed: past.tree((name,), changed))
 
     @property
     def start(self) -> float:
@@ -202,11 +194,6 @@ class Log:
     def damaged(self) -> int:
         """How many records of the file were found to be damaged, cut off or missing until now; they are left out."""
         return self._container.damaged
-
-    @property
-    def is_damaged(self) -> bool:
-        """Whether anything that was read until now turned out to be damaged."""
-        return self._past.is_damaged
 
     @property
     def unreadable(self) -> int:
@@ -284,46 +271,33 @@ class Log:
     def _handle(self, it: Reference) -> ArrayHandle:
         return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._past)
 
-    def outline_at(self, instant: Instant) -> dict[str, Outline]:
-        """Return what there was at an instant by top-level key: types and sizes; arrays are not read."""
-        return {name: outlined(tree, (name,)) for name, tree in self._trees_at(nanoseconds(instant)).items()}
-
     def _trees_at(self, ns: int) -> dict[str, Any]:
-        found = [(name, self._tree(name, ns)) for name in self.names()]
+        found = [(name, self._tree(name, self._past.changed(name, ns))) for name in self.names()]
         return {name: tree for name, tree in found if tree is not MISSING}
-
-    def _tree(self, name: str, ns: int) -> Any:
-        """Return a whole key; the last few hundred are kept, as neighbours in time share them."""
-        with self._lock:
-            changed = self._past.changed(name, ns)
-            tree = self._trees.pop((name, changed), None)
-            tree = self._past.tree((name,), ns) if tree is None else tree
-            self._trees[name, changed] = tree
-            while len(self._trees) > max(_CACHED_TREES, 2 * len(self._past.names)):
-                self._trees.popitem(last=False)
-            return tree
 
     def changes(self, after: Instant, until: Instant) -> set[Path]:
         """Return the paths that were updated after one instant and not after another."""
-        return self._past.changes(nanoseconds(after), nanoseconds(until))
+        numbers = self._past.timeline.channels_between(nanoseconds(after), nanoseconds(until))
+        return {it.path for number, it in self._past.of_channel.items() if number in numbers and it.role in NEWS}
 
     def news_times(self, path: Path) -> np.ndarray[Any, Any]:
         """Return when there was an update of a path, or of what is above or below it, in seconds, sorted: float64."""
-        times: np.ndarray[Any, Any] = self._past.news_times(path).astype(np.float64) / 1e9
+        times: np.ndarray[Any, Any] = self._past.timeline.times(self._past.news_channels(path)).astype(np.float64) / 1e9
         return times
 
     def news_count(self, path: Path, after: Instant, until: Instant) -> int:
         """Return how many such updates there were after one instant and not after another."""
-        return self._past.news_count(path, nanoseconds(after), nanoseconds(until))
+        span = nanoseconds(after), nanoseconds(until)
+        return sum(1 for _ in self._past.timeline.between(self._past.news_channels(path), *span))
 
     def last_news(self, path: Path, instant: Instant) -> float | None:
         """Return when the last such update before an instant was, None if there was none."""
-        found = self._past.last_news(path, nanoseconds(instant))
-        return None if found is None else seconds(found)
+        newest = self._past.newest(self._past.concerning(path), nanoseconds(instant), -1)
+        return None if newest is None else seconds(newest[0].time)
 
     def gaps(self) -> list[tuple[float, str, int | None]]:
         """Return where updates were lost: when this was noticed, of which path, and how many (None: unknown)."""
-        return [(seconds(ref.time), show(stream.path), missed) for ref, stream, missed in self._past.gaps()]
+        return [(seconds(ref.time), show(it.path), self._past.missed(ref)) for ref, it in self._past.of_role(Role.GAP)]
 
     def skipped(self) -> list[tuple[float, str, int]]:
         """Return which updates could not be recorded: when they came, their paths, and their publishers' numbers.
@@ -390,11 +364,13 @@ class Log:
         The indexes of all chunks are read: about a second for half an hour of 1,000 keys. `progress` is called with the
         chunks done and all of them.
         """
-        found = []
-        for channel, stream, schema, (messages, size, first, last) in self._past.channels(progress):
-            path, role, kind = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
-            times = seconds(first), seconds(last)
-            found.append(ChannelSummary(channel.topic, path, role, kind, schema, messages, size, *times))
+        totals, found = self._past.timeline.totals(progress), []
+        for channel in list(self._container.channels.values()):  # reading an index may find more of them
+            stream, schema = self._past.of_channel.get(channel.id), self._container.schemas.get(channel.schema_id)
+            place = (show(stream.path), stream.role.value, stream.kind.value) if stream else ("", "", "")
+            messages, size, first, last = totals.get(channel.id, Totals())
+            title, span = schema.name if schema else "", (seconds(first), seconds(last))
+            found.append(ChannelSummary(channel.topic, *place, title, messages, size, *span))
         return sorted(found, key=lambda it: (it.topic, it.role, it.path))
 
     def verify(self, progress: Callable[[int, int], None] | None = None) -> int:
@@ -465,22 +441,6 @@ class LogPath:
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"
-
-
-def outlined(tree: Any, path: Path) -> Outline:
-    """Return the outline of a tree at the full `path`."""
-    kind = type(tree)
-    if kind is dict or kind is list:
-        pairs = tree.items() if kind is dict else enumerate(tree)
-        children = tuple([outlined(item, (*path, key)) for key, item in pairs])
-        return Outline(path, kind.__name__, "", None, sum([child.size for child in children]), children)
-    if kind is Reference:
-        return Outline(path, tree.label, tree.summary, None, tree.size)
-    if kind is np.ndarray:
-        size, summary = NumpyShip().describe(tree)
-        return Outline(path, "numpy", summary, None, size)
-    size = len(tree.encode()) if kind is str else 8
-    return Outline(path, kind.__name__, "", tree, size)
 
 
 def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:

@@ -18,10 +18,9 @@ from ...plan.paths import Path, Pattern, below, related
 from ...plan.trees import MISSING, get, same
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
-from .container import Container, Progress, Ref, Timeline, Totals
+from .container import Container, Ref, Timeline
 from .format import NEWS, DamagedRecording, Kind, Role
 from .layout import decode, from_json
-from .mcap_reader import Numbers
 from .sink import CHANNELS
 from .stored import LOST, Reference, applied, opened
 
@@ -50,18 +49,18 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def __init__(self, container: Container, ships: Ships) -> None:
         self._container = container
         self._ships = ships
-        self._timeline = Timeline(container)
+        self.timeline = Timeline(container)
         self.unreadable = 0  # values that were left out, since they are damaged or were not recorded
         self._has_skipped = False
         by_place: dict[tuple[Path, str, str], RecordedStream] = {}
-        self._of_channel: dict[int, RecordedStream] = {}
+        self.of_channel: dict[int, RecordedStream] = {}
         # A path has several channels in one role if its type changed: for users they are one stream.
         for channel in container.channels.values():
             place = _place(channel.metadata)
             if place is not None:
                 stream = by_place.setdefault(place, RecordedStream(*place, []))
                 stream.channels.append(channel.id)
-                self._of_channel[channel.id] = stream
+                self.of_channel[channel.id] = stream
         is_described = any(record.name == "reem" for record in container.metadata)
         if not by_place and not is_described:
             raise DamagedRecording(f"{container.path} is an MCAP file, but not a recording of REEM")
@@ -84,7 +83,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         channels = self._container.channels.values()
         if not is_described:  # nor are the notes on channels there; but each recording has topics of its own
             return int(not any(channel.topic.startswith("/_reem/") for channel in channels))
-        names = {stream.path[0] for stream in self._of_channel.values()}
+        names = {stream.path[0] for stream in self.of_channel.values()}
         listed = Counter(_listed(self._container.metadata, names))
         listed.subtract(str(sorted(channel.metadata.items())) for channel in channels)
         return sum(count for count in listed.values() if count > 0)
@@ -122,7 +121,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def _newest_whole(self, path: Path, until: int) -> tuple[int, tuple[Ref, RecordedStream]] | None:
         roles = (*NEWS, Role.KEYFRAME)
         bases = [it for it in self._streams_of(path) if it.role in roles and below(path, it.path)]
-        newest = self._newest(bases, until, -1)
+        newest = self.newest(bases, until, -1)
         return None if newest is None else (newest[0].time, newest)
 
     def _streams_inside(self, path: Path) -> list[RecordedStream]:
@@ -136,10 +135,10 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def _inner(self, path: Path, after: int, until: int) -> Iterable[tuple[Ref, RecordedStream]]:
         channels = [channel for stream in self._streams_inside(path) for channel in stream.channels]
         refs = itertools.chain.from_iterable(self._instants(channels, after, until))
-        return [(ref, self._of_channel[ref.channel]) for ref in refs]
+        return [(ref, self.of_channel[ref.channel]) for ref in refs]
 
     def _inner_lasts(self, path: Path, after: int, until: int) -> Iterable[tuple[int, tuple[Ref, RecordedStream]]]:
-        lasts = [self._newest([stream], until, after) for stream in self._streams_inside(path)]
+        lasts = [self.newest([stream], until, after) for stream in self._streams_inside(path)]
         return [(it[0].time, it) for it in lasts if it is not None]
 
     def _applied(self, tree: Any, path: Path, change: tuple[Ref, RecordedStream], value: Any) -> Any:
@@ -156,20 +155,20 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         except BadData:
             return it
 
-    def _newest(self, streams: Iterable[RecordedStream], until: int, after: int) -> tuple[Ref, RecordedStream] | None:
+    def newest(self, streams: Iterable[RecordedStream], until: int, after: int) -> tuple[Ref, RecordedStream] | None:
         best: tuple[Ref, RecordedStream] | None = None
         for stream in streams:
             # What is older than the best one so far is not even looked for.
             for channel in stream.channels:
-                ref = self._timeline.latest(channel, until, best[0].time if best else after)
+                ref = self.timeline.latest(channel, until, best[0].time if best else after)
                 if ref is not None:
                     best = ref, stream
         return best
 
     def _instants(self, channels: Iterable[int], after: int, until: int) -> Iterator[list[Ref]]:
         """Yield the messages of each instant: what was published comes before what a read found behind it."""
-        for _, refs in itertools.groupby(self._timeline.between(channels, after, until), key=lambda ref: ref.time):
-            yield sorted(refs, key=lambda ref: self._of_channel[ref.channel].kind != Kind.PUBLISHED)
+        for _, refs in itertools.groupby(self.timeline.between(channels, after, until), key=lambda ref: ref.time):
+            yield sorted(refs, key=lambda ref: self.of_channel[ref.channel].kind != Kind.PUBLISHED)
 
     def _load(self, ref: Ref, stream: RecordedStream) -> Any:
         """Return the value of a message, MISSING for a deletion; raises _FoundDamage, BadData."""
@@ -211,7 +210,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
         for channel in self._parts.get(it.path, ()):
-            ref = self._timeline.latest(channel, it.at, it.at - 1)
+            ref = self.timeline.latest(channel, it.at, it.at - 1)
             message = None if ref is None else self._container.message(ref)
             if message is not None and self._container.channels[channel].message_encoding == "protobuf":
                 return self._decoded(self._container.channels[channel], message.data)
@@ -219,31 +218,16 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
 
     def changed(self, name: str, until: int) -> int:
         """Return the log time of the last message on a key until an instant, -1 if there is none."""
-        newest = self._newest(self.names.get(name, []), until, -1)
+        newest = self.newest(self.names.get(name, []), until, -1)
         return -1 if newest is None else newest[0].time
 
-    def changes(self, after: int, until: int) -> set[Path]:
-        found = self._timeline.channels_between(after, until)
-        streams = [self._of_channel[channel] for channel in found if channel in self._of_channel]
-        return {stream.path for stream in streams if stream.role in NEWS}
-
-    def news_times(self, path: Path) -> Numbers:
-        return self._timeline.times(self._news_channels(path))
-
-    def news_count(self, path: Path, after: int, until: int) -> int:
-        return sum(1 for _ in self._timeline.between(self._news_channels(path), after, until))
-
-    def last_news(self, path: Path, until: int) -> int | None:
-        newest = self._newest(self._concerning(path), until, -1)
-        return None if newest is None else newest[0].time
-
-    def _news_channels(self, path: Path) -> list[int]:
-        return [channel for stream in self._concerning(path) for channel in stream.channels]
-
-    def _concerning(self, path: Path) -> list[RecordedStream]:
+    def concerning(self, path: Path) -> list[RecordedStream]:
         """Return the streams with news on what is at, above or below a path."""
         streams = self.names.get(str(path[0]), []) if path else self.streams
         return [it for it in streams if it.role in NEWS and related(it.path, path)]
+
+    def news_channels(self, path: Path) -> list[int]:
+        return [channel for stream in self.concerning(path) for channel in stream.channels]
 
     def updates(self, after: int, until: int, patterns: Sequence[Pattern]) -> Iterator[tuple[Ref, RecordedStream, Any]]:
         """Yield all news that patterns name between two instants; what is damaged is skipped."""
@@ -252,14 +236,10 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         ]
         channels = [channel for stream in streams for channel in stream.channels]
         for ref in itertools.chain.from_iterable(self._instants(channels, after, until)):
-            stream = self._of_channel[ref.channel]
+            stream = self.of_channel[ref.channel]
             value = self._readable(ref, stream)
             if value is not _DAMAGED:
                 yield ref, stream, value
-
-    @property
-    def is_damaged(self) -> bool:
-        return bool(self._container.damaged) or self._has_skipped
 
     def following(self, path: Path, after: int, until: int) -> Iterator[tuple[int, bool, Any]]:
         """Yield what was at a full path after each instant with news on it, and whether that only repeats.
@@ -274,9 +254,9 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
         for refs in self._instants([each for it in chosen for each in it.channels], after, until):
             is_read, is_whole = False, True
             for ref in refs:
-                stream = self._of_channel[ref.channel]
+                stream = self.of_channel[ref.channel]
                 # Keyframes repeat what is known, unless something is damaged: then they bring what is missing.
-                if stream.role == Role.KEYFRAME and not self.is_damaged:
+                if stream.role == Role.KEYFRAME and not (self._container.damaged or self._has_skipped):
                     continue
                 value = self._readable(ref, stream)
                 if value is _DAMAGED:
@@ -289,35 +269,22 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 last = value
                 yield refs[0].time, repeats, value
 
-    def gaps(self) -> Iterator[tuple[Ref, RecordedStream, int | None]]:
-        # A gap says how many were lost if their publisher's numbers told it.
-        for ref, stream in self.of_role(Role.GAP):
-            message, missed = self._container.message(ref), None
-            with contextlib.suppress(ValueError, TypeError, KeyError):
-                missed = orjson.loads(message.data)["missed"] if message is not None else None
-            yield ref, stream, missed if type(missed) is int else None
+    def missed(self, ref: Ref) -> int | None:
+        """Return how many updates were lost in a gap, None if their publisher's numbers did not tell."""
+        message, missed = self._container.message(ref), None
+        with contextlib.suppress(ValueError, TypeError, KeyError):
+            missed = orjson.loads(message.data)["missed"] if message is not None else None
+        return missed if type(missed) is int else None
 
     def of_role(self, role: Role) -> Iterator[tuple[Ref, RecordedStream]]:
-        channels = [channel for channel, stream in self._of_channel.items() if stream.role == role]
-        for ref in self._timeline.between(channels, -1, 2**63 - 1):
-            yield ref, self._of_channel[ref.channel]
+        channels = [channel for channel, stream in self.of_channel.items() if stream.role == role]
+        for ref in self.timeline.between(channels, -1, 2**63 - 1):
+            yield ref, self.of_channel[ref.channel]
 
     def stamp(self, ref: Ref) -> tuple[int, int]:
         """Return when a message was published (ns), and its number."""
         message = self._container.message(ref)
         return (message.publish_time, message.sequence) if message is not None else (0, 0)
-
-    def channels(self, progress: Progress | None) -> Iterator[tuple[Channel, RecordedStream | None, str, Totals]]:
-        """Yield the channels, what they are for (None for none of REEM's), their schemas' names, and what they have."""
-        totals = self._timeline.totals(progress)
-        for channel in list(self._container.channels.values()):  # reading an index may find more of them
-            schema = self._container.schemas.get(channel.schema_id)
-            yield (
-                channel,
-                self._of_channel.get(channel.id),
-                schema.name if schema else "",
-                totals.get(channel.id, Totals()),
-            )
 
 
 def _listed(metadata: Iterable[Metadata], names: set[str | int]) -> Iterator[str]:

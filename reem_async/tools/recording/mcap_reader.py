@@ -114,7 +114,6 @@ class Index(NamedTuple):
         return all(np.array_equal(one, two) for one, two in zip(*pair, strict=True))
 
     def span(self) -> tuple[int, int]:
-        """Return the first and the last log time."""
         return (int(self.times.min()), int(self.times.max())) if len(self.times) else (0, 0)
 
 

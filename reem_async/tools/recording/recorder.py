@@ -155,7 +155,6 @@ class Recorder:
         self._dropped = 0
         self._failure: Exception | None = None
         self._done = asyncio.Event()
-        # Last, so that whatever goes wrong leaves no file.
         described = description(self.session, patterns, self._samples, keyframe)
         self._sink = Sink(self.path, compression, described, overwrite=overwrite)
         self.writer_thread = WriterThread(self._sink, self.session.ships, queue_bytes, self.patterns)
@@ -290,7 +289,6 @@ class Recorder:
                 give_way()
 
     def _pump(self) -> None:
-        """Take the updates that have arrived already."""
         for event in arrived(self._monitor) if self._monitor is not None else ():
             self._keys.of(event.name).on_event(event)
 
@@ -303,11 +301,9 @@ class Recorder:
 
     @property
     def hears_of_changes(self) -> bool:
-        """Whether the server tells which keys are changed."""
         return manager_of(self.session).hears_of_changes
 
     def failed(self, error: Exception) -> None:
-        """End the recording for an unexpected error."""
         self._failure = error
         self._done.set()
 
@@ -368,7 +364,6 @@ class Recorder:
 
     async def _look_once_more(self) -> None:
         """Read what is there at the end: keys may have been stored since the last keyframe."""
-        self._keys.be_due()
         if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
                 if self.hears_of_changes:
@@ -391,7 +386,6 @@ class Recorder:
 def description(
     session: Session, patterns: Sequence[str], samples: Sequence[Sample], keyframe: float
 ) -> dict[str, str]:
-    """Return the metadata of a recording that begins now."""
     return {
         "version": __version__,
         "format": "1",

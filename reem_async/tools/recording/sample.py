@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import csv
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path as FilePath
@@ -53,12 +52,11 @@ def read_key_file(file: str | FilePath) -> list[Sample]:
 
 def _sample(file: str | FilePath, number: int, line: str) -> Sample:
     try:
-        cells = [cell.strip() for cell in next(csv.reader([line.split("#")[0]], skipinitialspace=True))]
-        name, period = cells
-        return sample(name, float(period))
+        name, period = line.split("#")[0].split(",")
+        return sample(name.strip().strip('"'), float(period))
     except BadInput as error:
         raise BadValue(f"{file}, line {number}: {error}") from None
-    except (ValueError, csv.Error):
+    except ValueError:
         raise BadValue(f"{file}, line {number}: {line.strip()[:60]!r} is not of the form: foo.bar, 0.1") from None
 
 

@@ -176,7 +176,6 @@ OPEN: Signature = ()
 
 
 def signature(value: Any) -> Signature:
-    """Return the types in a JSON value."""
     kind = type(value)
     if kind is float or kind is int:
         return "number"

@@ -111,7 +111,6 @@ class WriterThread:
 
     @property
     def waiting(self) -> int:
-        """Bytes that wait to be written."""
         return self._size
 
     def put(self, operation: Operation, size: int) -> bool:
