@@ -405,7 +405,11 @@ def test_ctrl_c_ends_what_is_not_live_with_130(cli):
     assert (process.returncode, said, errors) == (130, "", "")
 
 
-def test_elements_of_arrays_are_not_set(cli, kvs):
+def test_elements_of_arrays_are_read_and_not_set(cli, kvs):
+    assert cli.result("get", "cam_left[1][0]") == cli.result("get", "cam_left[1][0]", "--json")
+    assert float(cli.result("get", "cam_left[39][49]")) == 1.0
+    assert cli.result("get", "foo.image[-1]").startswith("uint8[4,3], 12 B")
+    assert "index 40 is out of bounds" in cli.error(3, "get", "cam_left[40]")
     assert "nothing is stored at foo.number[1]" in cli.error(3, "get", "foo.number[1]")
     assert "write an array as a whole" in cli.error(1, "set", "cam_left[1]", "5")
 

@@ -49,6 +49,21 @@ def test_a_notebook_shows_an_array_as_a_picture(shell):
     assert "text/html" not in shell.display_formatter.format(image)[0]
 
 
+def test_a_notebook_shows_the_pictures_in_a_dict(shell):
+    value = {"t": 1.5, "cam": {"rgb": np.zeros((20, 30, 3), np.uint8), "<b>": np.eye(4)}}
+    shell.run_line_magic("load_ext", "reem_async")
+    shown = shell.display_formatter.format(value)[0]["text/html"]
+    assert shown.count("data:image/png") == 1
+    assert "[&#x27;cam&#x27;][&#x27;rgb&#x27;]" in shown
+    assert "&#x27;rgb&#x27;: &lt;uint8[20, 30, 3]&gt;" in shown
+    assert "&lt;b&gt;" in shown
+    many = {str(number): value["cam"] for number in range(10)}
+    assert shell.display_formatter.format(many)[0]["text/html"].count("data:image/png") == 4
+    assert "text/html" not in shell.display_formatter.format({"a": [1, 2]})[0]
+    shell.run_line_magic("unload_ext", "reem_async")
+    assert "text/html" not in shell.display_formatter.format(value)[0]
+
+
 @pytest.mark.parametrize(
     ("array", "caption"),
     [

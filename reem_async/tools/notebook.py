@@ -5,8 +5,10 @@ from __future__ import annotations
 import sys
 from base64 import b64encode
 from contextlib import suppress
+from html import escape
 from importlib import import_module
 from importlib.util import find_spec
+from pprint import pformat
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +21,9 @@ __all__ = ["complete_below", "load_ipython_extension", "picture_of", "unload_ipy
 _LEAST_SIDE = 16
 """Rows and columns: smaller arrays, such as matrices of a pose, are read as numbers."""
 
+_MOST_PICTURES = 4
+"""Pictures of one dict: a notebook keeps them in its file."""
+
 _SIDE = 640
 """Pixels of the longer side at most: it is a preview, and a notebook keeps it in its file."""
 
@@ -30,11 +35,13 @@ def load_ipython_extension(shell: Any) -> None:
         return
     html = shell.display_formatter.formatters["text/html"]
     html.for_type(np.ndarray, picture_of)
+    html.for_type(dict, pictures_in)
 
 
 def unload_ipython_extension(shell: Any) -> None:
     """Have IPython show arrays as numbers again: `%unload_ext reem`."""
-    shell.display_formatter.formatters["text/html"].pop(np.ndarray, None)
+    for kind in (np.ndarray, dict):
+        shell.display_formatter.formatters["text/html"].pop(kind, None)
 
 
 def complete_below(*kinds: type) -> None:
@@ -64,6 +71,30 @@ def picture_of(array: np.ndarray[Any, Any]) -> str | None:
         f'<img src="data:image/png;base64,{b64encode(found.png).decode()}" style="image-rendering: pixelated">'
         f"<div>{_caption(array, found)}</div>"
     )
+
+
+def pictures_in(value: dict[Any, Any]) -> str | None:
+    """Return HTML with a dict as text, and below it the first pictures in it; None if there is none."""
+    pictures: list[str] = []
+
+    def shown(item: Any, path: str) -> Any:
+        if isinstance(item, dict):
+            return {key: shown(each, f"{path}[{key!r}]") for key, each in item.items()}
+        picture = picture_of(item) if isinstance(item, np.ndarray) and len(pictures) < _MOST_PICTURES else None
+        if picture is None:
+            return item
+        pictures.append(f"<div>{escape(path)}</div>{picture}")
+        return _Shape(f"<{item.dtype}{list(item.shape)}>")
+
+    text = pformat(shown(value, ""), width=100, sort_dicts=False)
+    return f"<pre>{escape(text)}</pre>{''.join(pictures)}" if pictures else None
+
+
+class _Shape(str):
+    """Stands for an array in a dict; printed without quotes."""
+
+    __slots__ = ()
+    __repr__ = str.__str__
 
 
 def _caption(array: np.ndarray[Any, Any], found: RenderedPicture) -> str:

@@ -8,6 +8,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Annotated, Any, NoReturn
 
@@ -15,9 +16,13 @@ import numpy as np
 import typer
 
 from reem_async.connection import RedisInterface
+from reem_async.errors import MissingKey
+from reem_async.plan.paths import Path as KeyPath
+from reem_async.plan.paths import show
 from reem_async.plan.trees import walk
 from reem_async.store.accessor import Accessor
 from reem_async.store.catalog import Outline, outline
+from reem_async.store.reader import DocumentReader
 from reem_async.store.space import PublishSpace
 from reem_async.store.store import KeyValueStore
 from reem_async.tools.cli.listing import as_data
@@ -33,7 +38,7 @@ from reem_async.tools.cli.output import (
     typed,
     width,
 )
-from reem_async.tools.cli.running import USAGE, CommandFailed, guarded, run
+from reem_async.tools.cli.running import NOTHING, USAGE, CommandFailed, guarded, run
 from reem_async.tools.partfile import PartFile, there_already
 
 _MOST_FOR_PREVIEW = 256_000_000
@@ -75,7 +80,7 @@ def get(
 
     Examples:
         reem get foo.bar.subkey
-        reem get robot.joints[0]     an element of a list
+        reem get robot.joints[0]     an element of a list or of an array
         reem get robot.name --raw
         reem get cam.image -o image.png
         reem get pose --json | jq .x
@@ -90,7 +95,16 @@ def get(
             raise there_already(output)
         store = KeyValueStore(interface)
         # First what it is, without arrays: then what is too large to be shown is not fetched.
-        node = await outline(interface, store.at(path).full_path)
+        try:
+            node = await outline(interface, store.at(path).full_path)
+        except MissingKey as missing:
+            item = await _item(interface, store.at(path).full_path, missing)
+            if output is not None:
+                note(save(item, output, path, replace=force))
+            else:
+                shown = isinstance(item, np.ndarray) and not as_json
+                emit(preview(item, width() if is_terminal() else 100) if shown else json_text(item))
+            return
         if output is not None:
             note(save(await store.get(path), output, path, replace=force))
             return
@@ -100,6 +114,22 @@ def get(
         emit(json_text(await store.get(path)))
 
     run("get", work, url, namespace)
+
+
+async def _item(interface: RedisInterface, path: KeyPath, missing: MissingKey) -> Any:
+    """Return the item of an array that a path leads into; raises `missing` if it leads into none."""
+    for end in range(len(path) - 1, 0, -1):
+        if not isinstance(path[end], int):
+            break
+        with suppress(MissingKey):
+            if (await outline(interface, path[:end])).kind != "numpy":
+                break
+            array = await DocumentReader(interface.session, path[0]).read(path[1:end])
+            try:
+                return array[path[end:]]
+            except IndexError as error:
+                raise CommandFailed(f"{show(path)}: {error}", NOTHING) from None
+    raise missing
 
 
 async def _shown(fetch: Callable[[], Awaitable[Any]], node: Outline, *, raw: bool) -> str:
