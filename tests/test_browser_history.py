@@ -170,16 +170,11 @@ def test_what_is_beside_a_change_is_as_it_was(history):
     assert history.unchanged(("k",), 3.0)
 
 
-def test_steps_and_series(history):
+def test_series(history):
     history.begin("k", b'{"x": 0, "q": [1, 2]}')
     for when, path, value in ((1, "x", 1.5), (2, "q", [3, 4]), (3, "x", 2.5), (4, "x", "text"), (5, "x", 3)):
         history.add(("k", path), value, 8, float(when))
     history.add(("k", "q", 0), 9, 8, 6.0)
-    assert history.step(2.0, True, ()) == 3.0
-    assert history.step(2.0, False, ()) == 1.0
-    assert history.step(1.0, True, ("k", "q")) == 2.0
-    assert history.step(0.5, False, ()) is None
-    assert history.step(6.0, True, ()) is None
     series = numbers_in(history.values(("k", "x"), 0.0, 9.0))
     assert (series.times, series.lines) == ([0, 1, 3, 4, 5], [[0, 1.5, 2.5, None, 3]])
     series = numbers_in(history.values(("k", "q"), 0.0, 9.0))
@@ -204,6 +199,3 @@ def test_what_was_announced_and_then_found_is_one_change(history):
     assert history.times(("cam", "image")) == [9.0, 10.0, 10.5]
     assert history.times(()) == [9.0, 10.0, 10.5]
     assert history.rate("cam", 11.0, over=1.5) == pytest.approx(2 / 1.5)
-    assert history.step(11.0, False, ("cam", "image")) == 10.6, "from then on there was something else to be seen"
-    assert history.step(10.6, False, ("cam", "image")) == 10.1
-    assert history.step(10.6, False, ()) == 10.1

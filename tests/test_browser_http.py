@@ -133,7 +133,6 @@ def test_arrays_as_pictures_tables_lines_and_histograms(ask, robot):
         ("node", {"path": "x" * 5000}, 400),
         ("node", {"path": "{}", "at": "later"}, 400),
         ("tree", {"open": "many:0:"}, 400),
-        ("step", {}, 400),
         ("picture", {"path": "{}.raw"}, 400),
         ("nothing", {}, 404),
         *(
@@ -219,8 +218,6 @@ def test_the_past_is_as_it_was(ask, page, pspace, key):
     marks = ask.rows(name, at=times[2], since=times[1])
     assert (marks["q"]["mark"], marks["mode"]["mark"]) == ("changed", "")
     assert ask.rows(at=times[2], since=times[1])[name]["mark"] == "inside"
-    assert ask.json("step", at=times[1], forward=1, path=f"{name}.q")["at"] > times[1]
-    assert ask.json("step", at=times[1], forward=0, path=f"{name}.q")["at"] < times[1]
     assert name not in ask.rows(at=before - 0.001)
     assert "missing" in ask.json("node", path=name, at=before - 0.001)
     assert sum(ask.json("activity", bins=50, path=name)["counts"]) == 7

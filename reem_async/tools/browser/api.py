@@ -183,7 +183,7 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        asked = self.tree, self.series, self.step, self.activity, self.search, self.parameters
+        asked = self.tree, self.series, self.activity, self.search, self.parameters
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         routes.append(Route("/json", answered(self.json), methods=["GET"]))
@@ -250,13 +250,6 @@ class Api:
         start = status.start if start is None else start
         found = await self._source.series(value_path_in(request), start, status.end if end is None else end)
         return reply({"start": start, "end": status.end if end is None else end, **_thinned(found)._asdict()})
-
-    async def step(self, request: Request) -> Response:
-        at = number_of(request, "at")
-        if at is None:
-            raise BadValue("at= is missing")
-        forward = request.query_params.get("forward", "1") == "1"
-        return reply({"at": await self._source.step(at, forward, path_in(request))})
 
     async def activity(self, request: Request) -> Response:
         status = self._source.status()

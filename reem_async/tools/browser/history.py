@@ -16,7 +16,7 @@ from ...plan.paths import Path, related
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, difference, walk
 from .source import rate_span
-from .timeline import PENDING, UNKNOWN, BufferedChange, BufferedPast, Kept
+from .timeline import UNKNOWN, BufferedChange, BufferedPast, Kept
 from .trees import Frame, same, weight
 
 # One clock for everything in the buffer, which is never set back.
@@ -355,21 +355,6 @@ class History:
             return [change.time for change in self._all if not change.answer]
         line = self._lines.get(str(path[0]))
         return line.times(path) if line else []
-
-    def _seen(self, path: Path) -> list[float]:
-        if not path:
-            return [change.time for change in self._all if change.value is not PENDING]
-        line = self._lines.get(str(path[0]))
-        return line.seen(path) if line else []
-
-    def step(self, at: float, forward: bool, path: Path) -> float | None:
-        """Return the next instant after `at`, or the last one before it, from which on something else is to be seen."""
-        times = self._seen(path)
-        if forward:
-            index = bisect_right(times, at + 1e-6)
-            return times[index] if index < len(times) else None
-        earlier = [when for when in times if when < at - 1e-6]
-        return earlier[-1] if earlier else None
 
     def trees(self, at: float) -> Iterator[tuple[str, Any]]:
         """Yield the keys, and what they held, as far as it is known."""

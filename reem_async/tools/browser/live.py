@@ -263,9 +263,6 @@ class LiveSource:
         before, after = (lambda name, at=at: self.history.tree((name,), at) for at in (since, until))
         return differing(await self.changes(since, until, most), before, after, most)
 
-    async def step(self, at: float, forward: bool, path: Path) -> float | None:
-        return self.history.step(at, forward, path)
-
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
         return counted(self.history.times(path), start, end, bins)
 

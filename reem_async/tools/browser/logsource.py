@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path as FilePath
@@ -137,16 +136,6 @@ class LogSource:
         before, after = self._state(since), self._state(until)
         paths = self.log.changes(since, until)
         return differing(paths, lambda name: before.get(name, MISSING), lambda name: after.get(name, MISSING), most)
-
-    async def step(self, at: float, forward: bool, path: Path) -> float | None:
-        return await self._do(lambda: self._step(at, forward, path))
-
-    def _step(self, at: float, forward: bool, path: Path) -> float | None:
-        times = self._times(path)
-        place = (
-            bisect.bisect_right(times, at + _ROUNDING) if forward else bisect.bisect_left(times, at - 3 * _ROUNDING) - 1
-        )
-        return float(times[place]) + _ROUNDING if 0 <= place < len(times) else None
 
     async def activity(self, start: float, end: float, bins: int, path: Path) -> list[int]:
         return await self._do(lambda: counted(self._times(path), start, end, bins))

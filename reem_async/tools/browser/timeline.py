@@ -220,9 +220,6 @@ class BufferedPast(Past[int]):
         answers = {number for number in numbers if self.changes[number - self._gone].answer}
         return sorted([self._times[number - self._gone] for number in numbers if number not in answers])
 
-    def seen(self, path: Path) -> list[float]:
-        return [self._times[number - self._gone] for number in self._known.of(path)]
-
     def values(self, path: Path, start: float, end: float) -> Iterator[tuple[float, Any]]:
         first = self._gone + self.upto(start)
         value = self.at(path, first - 1)

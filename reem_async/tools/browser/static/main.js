@@ -1,6 +1,6 @@
 // The page: which path and which instant are shown, what keeps them up to date, and the keyboard.
 import { Pins } from "./panes.js";
-import { TimeBar } from "./slider.js";
+import { STEP, TimeBar } from "./slider.js";
 import { makeSplitter } from "./splitter.js";
 import { Tree } from "./tree.js";
 import { View } from "./view.js";
@@ -36,10 +36,9 @@ const app = {
     if (config.live && this.at !== null && this.at < said.start - 0.5) this.seek(said.start); // it has left the buffer
   },
 
-  // previous: from when on changes are marked; the instant shown before if it is not given.
-  seek(at, previous = null) {
+  seek(at) {
     if (at !== null) at = Math.min(Math.max(at, this.span.start), this.span.end);
-    this.previous = previous ?? this.at ?? this.span.end;
+    this.previous = this.at ?? this.span.end; // from when on changes are marked
     this.at = at;
     time.show();
     this.refresh();
@@ -230,8 +229,8 @@ function onKey(event) {
   if (event.key === "/") { finder.box.focus(); finder.box.select(); }
   else if (event.key === "Escape" && finder.shown) finder.clear();
   else if (event.key === "?") document.getElementById("help").showModal();
-  else if (event.key === "ArrowLeft") time.step(false, event.shiftKey);
-  else if (event.key === "ArrowRight") time.step(true, event.shiftKey);
+  else if (event.key === "ArrowLeft") time.step(event.shiftKey ? -1 : -STEP);
+  else if (event.key === "ArrowRight") time.step(event.shiftKey ? 1 : STEP);
   else if (event.key === " " && !pressed) time.toggle();
   else if (event.key === "l" || event.key === "End") { time.pause(); app.seek(null); }
   else if (event.key === "Home") { time.pause(); app.seek(app.span.start); }

@@ -2,6 +2,7 @@
 import { clockText, getJson } from "./util.js";
 
 const FRAME = 100; // ms between frames when playing
+export const STEP = 0.1; // s
 
 export class TimeBar {
   constructor(app) {
@@ -21,8 +22,8 @@ export class TimeBar {
     this.slider.addEventListener("input", () => this.onInput());
     this.live.addEventListener("click", () => { this.pause(); app.seek(null); });
     this.play.addEventListener("click", () => this.toggle());
-    find("back").addEventListener("click", (event) => this.step(false, event.shiftKey));
-    find("forth").addEventListener("click", (event) => this.step(true, event.shiftKey));
+    find("back").addEventListener("click", () => this.step(-STEP));
+    find("forth").addEventListener("click", () => this.step(STEP));
     new ResizeObserver(() => this.drawActivity()).observe(this.canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawActivity());
   }
@@ -84,17 +85,10 @@ export class TimeBar {
     app.seek(null);
   }
 
-  async step(forward, ofValue) {
+  step(seconds) {
     this.pause();
-    const { app } = this;
-    try {
-      const found = await getJson("step", { at: app.at ?? app.span.end, forward: forward ? 1 : 0, path: ofValue ? app.path : "" });
-      if (found.at !== null) app.seek(Math.max(found.at, app.span.start), found.at - 1e-4); // marks just this change
-      else if (forward) app.seek(null);
-      else if (app.at === null || app.at > app.span.start) app.seek(app.span.start);
-    } catch (error) {
-      app.failed(error);
-    }
+    const { app } = this, at = (app.at ?? app.span.end) + seconds;
+    app.seek(at < app.span.end ? at : null);
   }
 
   async loadActivity() {
