@@ -310,7 +310,7 @@ async def test_who_may_not_track_has_at_the_end_what_was_stored_last_and_keeps_n
         await kvs["a"].write({"n": 1, "large": large})
         async with recording(other, ["*"], file) as recorder:
             await aeventually(lambda: not recorder._keys.of("a").busy)
-            assert recorder._keys.of("a")._reader.feed.attachments._raw is None
+            assert recorder._keys.of("a")._reader.feed.attachments.raw is None
             await kvs["a"]["n"].write(2)
     with open_log(file) as log:
         assert_same(log["a"].at(log.end), {"n": 2, "large": large})

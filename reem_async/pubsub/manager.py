@@ -234,7 +234,7 @@ class SubscriptionManager:
         if wire is None or not wire.alive:
             wire = await cast("AsyncTransport", node).listen(self._inbox.take, self._on_lost)
             if self._closed:  # meanwhile: nothing else would close it
-                await wire.close()
+                await wire.discard()
                 raise InterfaceClosed("this RedisInterface was closed during the call")
             self._wires[node], wire.pace = wire, self._pace
             self._heartbeats.start(wire)

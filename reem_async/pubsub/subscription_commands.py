@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from ..errors import ServerNotReady, is_of_command
@@ -35,9 +35,11 @@ class Subscribing:
         self._on_joined = joined
         self._invited: set[Topic] = set()  # publishers of this host know of a listener
 
-    async def subscribe(self, wire: Wire, topics: Iterable[Topic]) -> None:
+    async def subscribe(self, wire: Wire, topics: Sequence[Topic]) -> None:
         """Subscribe and wait until the server has confirmed each topic; raise the first refusal."""
         answers: list[asyncio.Future[None]] = []
+        if len(topics) > 1:
+            wire.send([("PING",)], lambda _: None)  # what is sent behind it in this turn is confirmed in one turn, too
         for topic in topics:
             answer = asyncio.get_running_loop().create_future()
             answers.append(answer)
