@@ -231,18 +231,6 @@ async def test_of_a_pattern_only_what_it_names(key, akvs, apspace, binterface, f
     )
 
 
-async def test_samples_stay_beside_two_places_that_are_stored_at_once(key, akvs, binterface, file):
-    await akvs[key()].write({"a": 0, "b": 0, "in": {"c": 0, "temp": 2.0}, "temp": 1.0})
-    patterns = [f"{key()}.{place}" for place in ("a", "b", "in.c")]
-    samples = {f"{key()}.{place}": 600.0 for place in ("temp", "in.temp")}
-    async with recording(binterface, patterns, file, sample=samples) as recorder:
-        await aeventually(lambda: {"temp", "in"} <= set(recorder.writer_thread._trees.get(key(), {})))
-        await akvs[key()].update({"a": 1, "b": 1, "in": {"c": 1, "temp": 2.0}})
-        await recorder.written(key())
-    with open_log(file) as log:
-        assert log[key()].at(log.end) == {"a": 1, "b": 1, "in": {"c": 1, "temp": 2.0}, "temp": 1.0}
-
-
 async def test_nothing_is_read_at_rest(key, akvs, raw, binterface, file):
     if isinstance(raw, RawCluster):
         pytest.skip("counts the commands of one server")

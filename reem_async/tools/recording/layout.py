@@ -175,7 +175,7 @@ def _array(shown: Any, dtype: str, shape: list[int], data: str | None) -> np.nda
 
 # Arrays and bytes as protobuf messages, and back, bit for bit.
 #
-# Pictures become `foxglove.RawImage` and JPEG, PNG, WebP or AVIF bytes `foxglove.CompressedImage`, so that
+# Pictures become `foxglove.RawImage` and JPEG or PNG bytes `foxglove.CompressedImage`, so that
 # viewers show them. Any other array is a `reem.NdArray`, which holds an .npy file and a few figures to plot;
 # other bytes are a `reem.Blob`. `frame_id` of a picture is its path.
 
@@ -337,13 +337,7 @@ _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
 
 def _compressed(data: bytes) -> str:
     """Return the format of a compressed picture, "" for anything else."""
-    for magic, name in _MAGIC.items():
-        if data.startswith(magic):
-            return name
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return "webp"
-    # After the length of its first box (4 bytes).
-    return "avif" if data[4:12] == b"ftypavif" else ""
+    return next((name for magic, name in _MAGIC.items() if data.startswith(magic)), "")
 
 
 def decode(schema: str, channels: str, label: str, data: bytes, ships: Ships) -> Any:

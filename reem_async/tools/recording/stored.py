@@ -14,7 +14,7 @@ import numpy as np
 
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING, changed, difference, get, is_addressable, mapped, removed, replaced, same
+from ...plan.trees import MISSING, changed, get, mapped, removed, replaced
 from .contents import Content
 from .format import Kind, Role
 
@@ -189,28 +189,6 @@ def without(tree: Any, path: Path, kind: Kind) -> Any:
         return removed(tree, path)
     items = get(tree, path[:-1])
     return replaced(tree, path[:-1], items[: path[-1]]) if type(items) is list else tree
-
-
-def differing(known: Any, tree: Any, whole: Any) -> list[Path]:
-    """Return the deepest places that hold all that differs between what is known and a tree.
-
-    One, unless `whole` has more there than is compared, as a dict has with samples in it that no pattern names. These
-    are to stay, so it is a place for each entry that differs.
-    """
-    inner = difference(known, tree)
-    if inner is None:
-        return []
-    here, now, all_of_it = get(known, inner), get(tree, inner), get(whole, inner)
-    if type(here) is not dict or type(now) is not dict or type(all_of_it) is not dict or same(here, all_of_it):
-        return [inner]
-    names = {**here, **now}
-    if not all(map(is_addressable, names)):
-        return [inner]
-    return [
-        (*inner, key, *rest)
-        for key in names
-        for rest in differing(here.get(key, MISSING), now.get(key, MISSING), all_of_it.get(key, MISSING))
-    ]
 
 
 def pruned(tree: Any, path: Path, patterns: Iterable[Pattern]) -> Any:

@@ -19,14 +19,14 @@ import numpy as np
 from ...concurrency.scheduling import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING, CannotApply, get, replaced, same, walk
+from ...plan.trees import MISSING, CannotApply, difference, get, replaced, same, walk
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content
 from .format import Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
 from .sink import FullError, Sink
-from .stored import LOST, NotWritten, Reference, Unchanged, differing, extract, opened, planted, pruned, without
+from .stored import LOST, NotWritten, Reference, Unchanged, extract, opened, planted, pruned, without
 
 logger = logging.getLogger("reem.recording")
 
@@ -296,13 +296,15 @@ class WriterThread:
         before = self._settled(it, self._trees.get(name, MISSING))
         tree = it.value if it.value is MISSING else self._extracted(it, before)
         known = pruned(before, it.path, self._patterns)  # without what is sampled
-        for inner in differing(known, tree, before):
-            self.stored.add(name)
-            value, place = get(tree, inner), it.path + inner
-            if value is MISSING:
-                self._write_delete(it._replace(role=Role.DELETE, path=place))
-            else:
-                self._write_update(it._replace(role=Role.UPDATE, path=place, value=value))
+        inner = difference(known, tree)
+        if inner is None:
+            return
+        self.stored.add(name)
+        value, place = get(tree, inner), it.path + inner
+        if value is MISSING:
+            self._write_delete(it._replace(role=Role.DELETE, path=place))
+        else:
+            self._write_update(it._replace(role=Role.UPDATE, path=place, value=value))
 
     def _write_keyframe(self, it: Operation) -> None:
         tree = self._settled(it, self._trees.get(str(it.path[0]), MISSING))
