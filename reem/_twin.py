@@ -99,3 +99,15 @@ def shares(attribute: Callable[[Any], Result], inner: Callable[[Any], Any] = _CO
     """Return a property that is that of the core; its type is that of the value, as for a dataclass's field."""
     get: Any = attribute.fget  # type: ignore[attr-defined]
     return property(lambda self: get(inner(self)), doc=get.__doc__)  # type: ignore[return-value]
+
+
+def takes(method: Method[Arguments, None]) -> Callable[[Callable[..., None]], Method[Arguments, None]]:
+    """Return a decorator for an `__init__` that hands its arguments on to that of the core, whose signature it gets."""
+    return functools.wraps(method, assigned=())
+
+
+def takes_interface(
+    method: Callable[Concatenate[Any, Any, Arguments], None],
+) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, Any, Arguments], None]]:
+    """Return what `takes` does, for an `__init__` whose first argument is the interface of either front."""
+    return functools.wraps(method, assigned=())

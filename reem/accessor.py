@@ -79,13 +79,7 @@ def known_keys(self: Any) -> list[str]:
 
 @documented_by(core.Accessor)
 class Accessor(Handle):
-    """One place in the dictionary: `kvs["foo"]["bar"]`, `kvs["foo"]["tiles"][0]`.
-
-    It is only a path, immutable and cheap; nothing is sent before a method is called, or it is
-    assigned to, deleted from, or changed with `+=`, `-=`, `*=`, `/=`. Every call is atomic and raises
-    `redis.exceptions.RedisError` if the server or the connection fails. It is not its value: comparing it with one,
-    its truth, arithmetic and the like raise a TypeError that says how to read.
-    """
+    """One place in the dictionary: `kvs["foo"]["bar"]`, `kvs["foo"]["tiles"][0]`."""
 
     __slots__ = ("_core", "_edits", "_interface")
 
@@ -148,6 +142,7 @@ class Accessor(Handle):
     watch = makes(core.Accessor.watch, Watch, FOLLOWER)
     mirror = makes(core.Accessor.mirror, Mirror, FOLLOWER)
     call = waits(core.Accessor.call, FOLLOWER)
+    own = makes(core.Accessor.own, lambda interface, inner: OwnedAccessor(interface, inner))
     # The arguments are checked here, and declared on the background loop.
     parameter = makes(core.Accessor.parameter, declared, lambda self: SimpleNamespace(parameter=self._prepared))
     _ipython_key_completions_ = known_keys
@@ -201,10 +196,6 @@ class Accessor(Handle):
         if function is None:
             return partial(self.serve, concurrency=concurrency, queue=queue)
         return Service(self._interface, self._follower()._service(function, concurrency, queue))
-
-    def own(self, *, ttl: float = 0.2, name: str | None = None, take: bool = False) -> OwnedAccessor:
-        """Return this top-level key for its one owner: `with kvs["cmd"].own(name="joystick") as cmd:`."""
-        return OwnedAccessor(self._interface, self._core.own(ttl=ttl, name=name, take=take))
 
     def __enter__(self) -> Any:
         edit = self.edit()

@@ -8,26 +8,24 @@ import functools
 import os
 import sys
 import weakref
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator
 from importlib import import_module
 from operator import attrgetter
 from threading import Thread, current_thread, main_thread
-from typing import Any, Concatenate, Literal, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import reem_async
-from reem_async.concurrency.queues import Ended
-from reem_async.concurrency.streams import next_on_thread
+from reem_async.concurrency.queues import BoundedQueue
+from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
-from reem_async.local.path import MEMORY
-from reem_async.ships.base import SpecialDatatypeShip
+from reem_async.pubsub.callbacks import Caller
 from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
 from reem_async.transport.composite import NewTransport
-from reem_async.transport.state import StateChange, StateChanges
 
 from ._portal import LastPortal, Portal, Threads, finish
-from ._twin import calls, documented_by, runs, shares
-from .following import NodeWatch
+from ._twin import calls, documented_by, makes, runs, shares, takes
+from .following import NodeWatch, StateIterator
 
 __all__ = [  # noqa: F822 - all but RedisInterface stood here in REEM 0.1.x, and old programs import it from here
     "ROOT_PATH", "ROOT_VALUE_SEQUENCE", "SEPARATOR_CHARACTER", "CallbackSubscriber", "KeyValueStore",
@@ -172,56 +170,16 @@ def quiet_at_exit() -> Iterator[None]:
         raise
 
 
-class StateIterator:
-    """Yields the state of an interface as it is, then each change; ends when the interface is closed."""
-
-    def __init__(self, changes: StateChanges) -> None:
-        self._core = changes
-
-    def next(self, timeout: float | None = None) -> StateChange:
-        """Return the next change: as the loop does, but with a time limit in seconds; see `next` of a watch."""
-        return next_on_thread(self._core.queue, timeout)  # type: ignore[no-any-return]
-
-    def __iter__(self) -> Self:
-        return self
-
-    def __next__(self) -> StateChange:
-        try:
-            return self._core.queue.take_waiting()  # type: ignore[no-any-return]
-        except Ended:
-            raise StopIteration from None
-
-
 _DIRECT = attrgetter("_direct")
 
 
 @documented_by(reem_async.RedisInterface)
 class RedisInterface:
-    """A connection to one server; everything else is made from it.
+    """A connection to one server; everything else is made from it."""
 
-    Nothing is connected before the first call that needs it. Any number of threads may share it:
-    reads and writes run on the caller's thread over a connection of their own. Subscriptions and
-    ships with `async def` methods run on a background event loop, one daemon thread per interface,
-    started when first needed and ended by `close()` or at exit. Calls work until the process ends, in functions of
-    `atexit`, log handlers and `__del__` too.
-    """
-
-    def __init__(
-        self,
-        host: Any = None,
-        ships: Sequence[SpecialDatatypeShip] | int | None = None,
-        *,
-        namespace: str = "",
-        timeout: float = 1.0,
-        local: Literal["auto", "off", "early"] = "auto",
-        local_memory: int = MEMORY,
-        wait: float = 0.0,
-        name: str | None = None,
-        **options: Any,
-    ) -> None:
-        settings = {"namespace": namespace, "timeout": timeout, **options}
-        settings |= {"local": local, "local_memory": local_memory, "wait": wait, "name": name}
-        self._direct = _OnThread(host, ships, **settings)
+    @takes(reem_async.RedisInterface.__init__)  # type: ignore[arg-type]  # no option has the name `self`
+    def __init__(self, *given: Any, **options: Any) -> None:
+        self._direct = _OnThread(*given, **options)
         self._direct.session.tasks = Threads()
         self._background = _Background(self._direct)
         self._closing = weakref.finalize(self, self._background.close)
@@ -233,17 +191,11 @@ class RedisInterface:
     client = shares(reem_async.RedisInterface.client, _DIRECT)
     state = shares(reem_async.RedisInterface.state, _DIRECT)
     unreadable = shares(reem_async.RedisInterface.unreadable, _DIRECT)
+    states = makes(reem_async.RedisInterface.states, StateIterator, _DIRECT)
     on_state = calls(reem_async.RedisInterface.on_state, _DIRECT)
     nodes = runs(reem_async.RedisInterface.nodes)
+    watch_nodes = makes(reem_async.RedisInterface.watch_nodes, NodeWatch, attrgetter("_followers"))
     initialize = runs(reem_async.RedisInterface.initialize)
-
-    def states(self) -> StateIterator:
-        """Return an iterator over the state and its changes."""
-        return StateIterator(self._direct.states())
-
-    def watch_nodes(self) -> NodeWatch:
-        """Return an iterator over the programs that join and leave, those that are there first."""
-        return NodeWatch(self)
 
     @property
     def _interface(self) -> RedisInterface:
@@ -294,6 +246,22 @@ class RedisInterface:
             if _is_left_over():
                 raise SystemExit from None  # the thread is about to be stopped anyway, without a word
             raise
+
+    def _calling(self, name: str, caller: Caller, queue: BoundedQueue, owner: object = None) -> Thread:
+        """Start a thread that calls a function of the program for each update in a queue. It keeps the `owner`."""
+
+        def call_all(_: object) -> None:
+            take_short_turns()  # the event loop's thread has had its wake-up before: waiting once in line is enough
+            try:
+                while True:
+                    caller.call_on_thread(queue.take_waiting(), queue.dropped)
+            except Exception as reason:
+                caller.ended(reason)
+
+        thread = Thread(target=call_all, args=[owner], name=f"reem {name}", daemon=True)
+        thread.start()
+        self._background.callers.add(thread)
+        return thread
 
     def _end(self, coroutine: Coroutine[Any, Any, None]) -> None:
         """Do what `_wait` does, or nothing: whatever closed the interface has ended this too."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Self
 
 from reem_async.concurrency.queues import EMPTY, Ended
@@ -9,6 +10,7 @@ from reem_async.concurrency.streams import next_on_thread
 from reem_async.coordination.presence import NodeWatch as NodeWatchCore
 from reem_async.errors import InterfaceClosed
 from reem_async.pubsub import subscribers as core
+from reem_async.transport.state import StateChanges
 
 from ._twin import documented_by, shares, waits
 
@@ -16,13 +18,8 @@ from ._twin import documented_by, shares, waits
 class Following:
     """What begins to follow in `listen` and ends in `close`; `with` calls both."""
 
-    def listen(self) -> None:
-        """Begin to follow."""
-        raise NotImplementedError
-
-    def close(self) -> None:
-        """Stop following."""
-        raise NotImplementedError
+    listen: Callable[[], None]
+    close: Callable[[], None]
 
     def __enter__(self) -> Self:
         self.listen()
@@ -34,16 +31,7 @@ class Following:
 
 @documented_by(core.Watch)
 class Watch(Following):
-    """Follows one path and yields its updates, one by one: an iterator.
-
-    Follows from the first `for` or `with` on. The first update is the value that is already there,
-    if any (`initial`). Leaving a loop with `break` keeps following until the watch is closed or
-    dropped.
-
-    Args:
-        interface: The server.
-        watch: The core's, which lives on the background loop.
-    """
+    """Follows one path and yields its updates, one by one: an iterator."""
 
     def __init__(self, interface: Any, watch: Any) -> None:
         self._interface = interface
@@ -82,17 +70,11 @@ class Watch(Following):
             raise StopIteration from None
 
 
+@documented_by(StateChanges)
+class StateIterator(Watch):
+    """Yields the state as it is, then each change: an iterator; ends when the interface is closed."""
+
+
 @documented_by(NodeWatchCore)
 class NodeWatch(Watch):
-    """Yields an event for each program that joins or leaves: an iterator.
-
-    Those that are there come first (`initial`). A program that closes its interface, ends, is killed, stands still or
-    loses its network has left within a second. One that comes back joins again, with the same `id` if it is the same
-    process.
-
-    Args:
-        interface: The server.
-    """
-
-    def __init__(self, interface: Any) -> None:
-        super().__init__(interface, NodeWatchCore(interface._followers.session))
+    """Yields an event for each program that joins or leaves: an iterator."""

@@ -20,19 +20,7 @@ if TYPE_CHECKING:
 
 @documented_by(core.Mirror)
 class Mirror(Following):
-    """A local copy of a place in the store that follows every change by any client, published or only stored.
-
-    `value()` and `mirror["joint"].read()` answer from memory, without a trip to the server: what they say is usually
-    one round trip behind (on a key that is also published, up to 20 ms), and `age` says how old it may be. Where the
-    connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
-    `stale="keep"` they return the last known value through an outage. With `ttl` they raise Silent once no update has
-    been published for that long, whatever the reason.
-    Use it with `with`, or `listen()` and `close()`. `mirror` of an accessor makes one, and explains the arguments.
-
-    Args:
-        interface: The server.
-        mirror: The core's, which lives on the background loop.
-    """
+    """A local copy of a place in the store that follows every change by any client, published or only stored."""
 
     def __init__(self, interface: RedisInterface, mirror: core.Mirror) -> None:
         self._interface = interface

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import inspect
-import threading
 from typing import TYPE_CHECKING, Any
 
 from reem_async.coordination import parameters as core
 from reem_async.errors import BadType
-from reem_async.pubsub.callbacks import Caller
 
 from ._twin import documented_by
 from .connection import quiet_at_exit
@@ -18,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @documented_by(core.Parameter)
-class Parameter(core.ParameterHandle):
+class Parameter(core.Parameter):
     """A value that is declared with type and bounds, kept current, and read without a round trip."""
 
     __slots__ = ("_interface",)
@@ -27,7 +25,7 @@ class Parameter(core.ParameterHandle):
         super().__init__(live, declaration)
         self._interface = interface
 
-    def write(self, value: Any) -> None:
+    def write(self, value: Any) -> None:  # type: ignore[override]  # which does not wait in plain code
         """Publish a value."""
         self._interface._wait(self._live.write(value))
 
@@ -46,16 +44,5 @@ def declared(interface: RedisInterface, declaration: core.Declaration) -> Parame
         raise BadType("on_change is a coroutine function, which a thread cannot call; use reem_async")
     live = interface._wait(core.declare(interface._followers.session, declaration))
     if declaration.on_change is not None:
-        caller, queue = core.changes_of(live, declaration)
-        thread = threading.Thread(target=_call_all, args=(caller, queue), name=f"reem {live.name}", daemon=True)
-        thread.start()
-        interface._background.callers.add(thread)
+        interface._calling(live.name, *core.changes_of(live, declaration))
     return Parameter(interface, live, declaration)
-
-
-def _call_all(caller: Caller, queue: core.ChangeQueue) -> None:
-    try:
-        while True:
-            caller.call_on_thread(queue.take_waiting(), 0)
-    except Exception as reason:
-        caller.ended(reason)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -21,9 +19,8 @@ from reem_async.tools.recording import (
     ReplayStatus,
     open_log,
 )
-from reem_async.tools.recording.times import Instant
 
-from ._twin import documented_by, shares, waits
+from ._twin import documented_by, shares, takes_interface, waits
 from .connection import RedisInterface
 
 __all__ = [
@@ -50,29 +47,10 @@ class Recorder:
     `reem_async.recording.Recorder`; the arguments are the same.
     """
 
-    def __init__(
-        self,
-        interface: RedisInterface,
-        patterns: Sequence[str] = ("*",),
-        path: str | Path = "run.mcap",
-        *,
-        sample: dict[str, float] | str | Path | None = None,
-        keyframe: float = 5.0,
-        overwrite: bool = False,
-        compression: str = "zstd",
-        queue_bytes: int = 256 << 20,
-    ) -> None:
+    @takes_interface(core.Recorder.__init__)
+    def __init__(self, interface: RedisInterface, *given: Any, **options: Any) -> None:
         self._interface = interface
-        self._core = core.Recorder(
-            interface._followers,
-            patterns,
-            path,
-            sample=sample,
-            keyframe=keyframe,
-            overwrite=overwrite,
-            compression=compression,
-            queue_bytes=queue_bytes,
-        )
+        self._core = core.Recorder(interface._followers, *given, **options)
 
     status = shares(core.Recorder.status)
     start = waits(core.Recorder.start)
@@ -86,16 +64,11 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # The block's own error is what its reader has to know; that the recording failed too is a note on it.
-        if error is None:
-            self.stop()
-            return
         try:
-            self.stop()
+            self._interface._wait(self._core.__aexit__(kind, error, trace))
         except InterfaceClosed:
-            pass
-        except RecordingFailed as failure:
-            error.add_note(str(failure))
+            if error is None:  # else the block's own error is what its reader has to know
+                raise
 
 
 @documented_by(core.Replayer)
@@ -105,22 +78,10 @@ class Replayer:
     See `reem_async.recording.Replayer`; the arguments are the same.
     """
 
-    def __init__(
-        self,
-        interface: RedisInterface,
-        log: Log,
-        *,
-        rate: float = 1.0,
-        start: Instant | None = None,
-        end: Instant | None = None,
-        loop: bool = False,
-        patterns: Sequence[str] = ("*",),
-        remap: Mapping[str, str] | None = None,
-    ) -> None:
+    @takes_interface(core.Replayer.__init__)
+    def __init__(self, interface: RedisInterface, *given: Any, **options: Any) -> None:
         self._interface = interface
-        # Checked by the core, which has the same names.
-        settings: dict[str, Any] = {"start": start, "end": end, "loop": loop, "patterns": patterns, "remap": remap}
-        self._core = core.Replayer(interface._followers, log, rate=rate, **settings)
+        self._core = core.Replayer(interface._followers, *given, **options)
         self.start, self.end = self._core.start, self._core.end
 
     status = shares(core.Replayer.status)

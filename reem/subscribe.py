@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import inspect
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
-from reem_async.concurrency.queues import Policy
-from reem_async.concurrency.scheduling import take_short_turns
 from reem_async.errors import BadType
 from reem_async.pubsub import subscribers as core
 from reem_async.pubsub.pattern_watch import PatternWatch as PatternWatchCore
 
-from ._twin import documented_by, ends, makes, shares, waits
+from ._twin import documented_by, ends, makes, shares, takes, waits
 from .connection import RedisInterface
 from .following import Following, Watch
 
 
 @documented_by(PatternWatchCore)
 class PatternWatch(Watch):
-    """Follows all keys that some patterns name and yields their changes: an iterator.
-
-    What is there when following begins comes first, an update for each key (`initial`). Then every change, published or
-    only stored, by any client; new keys, and keys that go (`deleted`). A key that is only stored is found
-    within a second of its making.
-
-    Args:
-        interface: The server.
-        watch: The core's, which lives on the background loop.
-    """
+    """Follows all keys that some patterns name and yields their changes: an iterator."""
 
     def __init__(self, interface: RedisInterface, watch: PatternWatchCore) -> None:
         super().__init__(interface, watch)
@@ -40,14 +29,15 @@ class PatternWatch(Watch):
 class SilentSubscriber(Following):
     """A local variable that follows what is published at a path."""
 
-    def __init__(
-        self, channel: str, interface: Any = None, policy: Policy | None = None, *, stored: bool = False
-    ) -> None:
+    _kind: Callable[..., Any] = core.SilentSubscriber
+    _core: core.SilentSubscriber
+
+    @takes(core.SilentSubscriber.__init__)
+    def __init__(self, channel: str, interface: Any = None, *given: Any, **options: Any) -> None:
         self.interface = interface if isinstance(interface, RedisInterface) else RedisInterface(interface)
         self._interface = self.interface
-        self.channel = channel
-        self.stored = stored
-        self._core = core.SilentSubscriber(channel, self.interface._followers, policy, stored=stored)
+        self._core = self._kind(channel, self.interface._followers, *given, **options)
+        self.channel, self.stored = channel, self._core.stored
 
     listen = waits(core.SilentSubscriber.listen)
     close = ends(core.SilentSubscriber.close)
@@ -78,79 +68,31 @@ class SilentSubscriber(Following):
         return f"<reem.{type(self).__name__} {self.channel}>"
 
 
+@documented_by(core.CallbackSubscriber)
 class CallbackSubscriber(SilentSubscriber):
-    """Calls a function for each update of what is published at a path.
+    """Calls a function for each update of what is published at a path."""
 
-    Called as `callback(data, updated_path, **kwargs)`, the first two by name where it has these
-    names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
-    which path was updated, such as "callback_channel.number". Calls are made one after the other,
-    in order, on a thread of the subscriber's own; they may use REEM. An exception in one is logged
-    and does not end the subscription. So is SystemExit, since `sys.exit()` cannot end the program from a
-    thread, and KeyboardInterrupt, which is also raised in the main thread. If calls are slower than
-    updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
-    `data` may have later ones in it already, which are called for too.
+    _kind = core.CallbackSubscriber
+    _core: core.CallbackSubscriber
 
-    A callback with a parameter `update`, or that takes `**kwargs`, gets the `Update` by that name. It says how the call
-    came about: after an outage the callback is called with what was found (`update.origin`), which may be old.
-
-    Args:
-        channel: The path to follow.
-        interface: The server: a RedisInterface, or what it takes as host.
-        callback_function: The function.
-        kwargs: Keyword arguments for each call.
-        policy: What to keep when calls are slower than updates.
-        stored: Call for plain writes too, by any client.
-        ttl: Seconds without a published update after which there is silence. The callback is only called for published
-            updates that are not older than that when the call begins; `value()` is the last known one all the same. See
-            `Accessor.watch`.
-        on_silent: Called with `kwargs` once when silence begins, on the same thread.
-    """
-
-    def __init__(
-        self,
-        channel: str,
-        interface: Any,
-        callback_function: Callable[..., Any],
-        kwargs: Mapping[str, Any] | None = None,
-        policy: Policy | None = None,
-        *,
-        stored: bool = False,
-        ttl: float | None = None,
-        on_silent: Callable[..., Any] | None = None,
-    ) -> None:
-        super().__init__(channel, interface, policy, stored=stored)
-        options: dict[str, Any] = {"stored": stored, "ttl": ttl, "on_silent": on_silent}
-        followers = self.interface._followers
-        self._calls = core.CallbackSubscriber(channel, followers, callback_function, kwargs, policy, **options)
-        # What answers `value()` is what calls are made of, so a callback never sees a copy older than its update.
-        self._core = self._calls
+    @takes(core.CallbackSubscriber.__init__)
+    def __init__(self, channel: str, interface: Any, *given: Any, **options: Any) -> None:
+        super().__init__(channel, interface, *given, **options)
         self._thread: threading.Thread | None = None
         self._starting = threading.RLock()
-        for name, function in (("callback_function", callback_function), ("on_silent", on_silent)):
-            if inspect.iscoroutinefunction(function):
+        for name in ("callback_function", "on_silent"):
+            if inspect.iscoroutinefunction(getattr(self._core, name)):
                 raise BadType(f"{name} is a coroutine function, which a thread cannot call; use reem_async")
 
     def listen(self) -> None:
         """Begin to follow and to call. When this returns, no later publish is missed. Idempotent."""
-        self.interface._wait(self._calls._updates.listen())
-        self._start()
-
-    def _start(self) -> None:
+        self.interface._wait(self._core._updates.listen())
         with self._starting:
             # Again after a fork, which leaves the child without it.
             if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._call_all, name=f"reem {self.channel}", daemon=True)
-                self._thread.start()
-                self.interface._background.callers.add(self._thread)
-
-    def _call_all(self) -> None:
-        caller, queue = self._calls._caller(), self._calls._updates.queue
-        take_short_turns()  # the event loop's thread has had its wake-up before: waiting once in line is enough
-        try:
-            while True:
-                caller.call_on_thread(queue.take_waiting(), queue.dropped)
-        except Exception as reason:
-            caller.ended(reason)
+                self._thread = self.interface._calling(
+                    self.channel, self._core._caller(), self._core._updates.queue, owner=self
+                )
 
     def close(self) -> None:
         """Stop following and calling; waits for a call being made, in the blocking front up to 1 s. Idempotent."""

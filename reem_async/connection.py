@@ -21,16 +21,18 @@ __all__ = ["RedisInterface"]
 class RedisInterface:
     """A connection to one server; everything else is made from it.
 
-    Nothing is connected before the first call that needs it. One interface belongs to one event
-    loop; any number of tasks may share it, and their calls are pipelined.
+    Nothing is connected before the first call that needs it. In asyncio an interface belongs to one event loop; any
+    number of tasks may share it, and their calls are pipelined. In plain programs any number of threads may share it:
+    reads and writes run on the caller's thread over a connection of their own. Subscriptions, and ships with coroutine
+    functions, run on a background event loop, one daemon thread per interface, started when first needed and ended by
+    `close()` or at exit. Calls work until the process ends, in functions of `atexit`, log handlers and `__del__` too.
 
     Args:
         host: A host name, `host:port`, a URL (`redis://`, `rediss://`, `unix://`) or an `EmbeddedServer`; if none is
-            given, the URL in the environment variable REEM_URL, else `localhost`. `localhost` means the
-            server's Unix socket where it has one (on Linux), which is quicker; `127.0.0.1` means TCP. Several servers:
-            `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an
-            `EmbeddedCluster`; `redis+sentinel://host:26379,host:26380/mymaster` for the primary that
-            sentinels name. With TLS they begin with `rediss+`. See docs/fleet.md.
+            given, the URL in the environment variable REEM_URL, else `localhost`. `localhost` means the server's Unix
+            socket where it has one (on Linux); `127.0.0.1` means TCP. Several servers, see docs/fleet.md:
+            `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an `EmbeddedCluster`;
+            `redis+sentinel://host:26379,host:26380/mymaster`. With TLS they begin with `rediss+`.
         ships: What carries values that are not JSON, first fit first; replaces the default list of
             `NumpyShip` and `BytesShip`. A number in its place is the port.
         namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
@@ -38,24 +40,19 @@ class RedisInterface:
         timeout: Seconds without a byte moving after which a call times out; `reem_async.timeout` sets
             another limit for some calls.
         local: How updates get to subscribers of the same host and user. "auto": those with arrays or bytes of 64 KB and
-            more through shared memory, if available; the server stores every update too, and a subscriber that cannot
-            read the memory fetches it there. "off": always from the server. "early": updates of this interface reach
-            subscribers on this host directly, before the server has stored them (`update.early`); if the server never
-            gets an update, they get the server's value, with `gap`. See docs/guarantees.md. Its calls of services reach
-            programs on this host directly, too.
+            more through shared memory, after the server has stored them. "off": always from the server. "early": all
+            updates of this interface directly, before the server has stored them (`update.early`); promise 19 of
+            docs/guarantees.md says what that weakens. Its calls of services reach programs on this host directly, too.
         local_memory: Bytes of shared memory that this interface's publishers may take, in all: six times the bytes
             of an update for each top-level key. Beyond that, values go through the server.
         wait: Seconds for which the first connection is tried again if the server is not up yet, for programs that start
-            at boot. Each call waits up to this long, counted from the first one that found no server; then it raises
-            NotConnected. A warning in the log says why it waits. A wrong password or a missing right is raised at once.
-            Once connected, calls to a lost server raise at once.
-        name: What other programs call this one: `nodes` lists it, with host, process id and what it publishes, serves
-            and owns. It costs four small round trips a second, from the first connection on, until the interface is
-            closed. Several programs may have one name. Without a name nothing is sent.
+            at boot, counted from the first call that found no server; then NotConnected is raised. A wrong password or
+            certificate, a missing right and the like are raised at once, as is the loss of a server later.
+        name: What other programs call this one: `nodes` lists it. It costs four small round trips a second, from the
+            first connection on, until the interface is closed. Several programs may have one name.
         options: redis-py's connection options: `port`, `db`, `username`, `password`, `ssl`, ... Its `socket_timeout`
-            is another name of `timeout`. Besides, `largest_value`: the bytes that a string in a reply may have
-            (an array, or the text of a document); 512 MB if not given, as a server's own `proto-max-bulk-len`. What is
-            larger, or over eight times that in one reply, closes the connection: ConnectionLost.
+            is another name of `timeout`. Besides, `largest_value`: the bytes that a string in a reply may have, 512 MB
+            if not given. What is larger, or over eight times that in one reply, closes the connection: ConnectionLost.
 
     Raises:
         BadType, BadValue: An option or URL that means nothing, a `wait` that is no number of seconds, or a `name` that
@@ -167,7 +164,7 @@ class RedisInterface:
         Raises:
             NotAllowed: The user lacks a right; says which.
         """
-        return in_order(await listed(self.session))
+        return in_order((await listed(self.session)).values())
 
     def watch_nodes(self) -> NodeWatch:
         """Return an async iterator over the programs that join and leave, those that are there first.

@@ -121,6 +121,16 @@ def server():
         yield own
 
 
+@contextlib.contextmanager
+def stopped(server):
+    """The server stands still inside the block."""
+    os.kill(server.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(server.pid, signal.SIGCONT)
+
+
 @pytest.fixture(scope="module")
 def watched(tmp_path_factory):
     """A primary and a replica that sentinels watch."""
@@ -132,7 +142,6 @@ def watched(tmp_path_factory):
 
 ONE_SERVER = {
     "test_a_forked_childs_loop_does_not_wait_for_its_parents_tasks": "in a cluster it takes a second",
-    "test_the_host_may_be_positional_a_keyword_or_a_url": "takes the URL of one server apart",
     "test_all_subscribers_of_an_interface_share_one_connection": "counts connections: in a cluster, one for each node",
     "test_connections_of_redis_py_have_the_attributes": "takes the URL of one server apart",
     "test_a_plain_client_of_the_same_server": "the plain client is for one server",
@@ -365,6 +374,18 @@ async def apspace(ainterface):
     return reem_async.PublishSpace(ainterface)
 
 
+def _of_place(name):
+    return lambda self, path, *given: self.wait(getattr(self.at(path), name)(*given))
+
+
+def _of_store(name):
+    return lambda self, *given: self.wait(getattr(self.kvs, name)(*given))
+
+
+def _with_syntax(operation):
+    return lambda self, path, value: operation(self.at(path), value)
+
+
 class Front:
     """The few calls that tests of both fronts need; a path begins with the top-level key."""
 
@@ -374,44 +395,10 @@ class Front:
             handle = handle[element]
         return handle
 
-    def write(self, path, value):
-        self.wait(self.at(path).write(value))
-
-    def read(self, path):
-        return self.wait(self.at(path).read())
-
-    def delete(self, path):
-        self.wait(self.at(path).delete())
-
-    def length(self, path):
-        return self.wait(self.at(path).length())
-
-    def type(self, path):
-        return self.wait(self.at(path).type())
-
-    def append(self, path, value):
-        self.wait(self.at(path).append(value))
-
-    def extend(self, path, values):
-        self.wait(self.at(path).extend(values))
-
-    def increment(self, path, number):
-        self.wait(self.at(path).increment(number))
-
-    def multiply(self, path, number):
-        self.wait(self.at(path).multiply(number))
-
-    def divide(self, path, number):
-        self.wait(self.at(path).divide(number))
-
-    def set(self, dotted, value):
-        self.wait(self.kvs.set(dotted, value))
-
-    def get(self, dotted, *default):
-        return self.wait(self.kvs.get(dotted, *default))
-
-    def contains(self, name):
-        return self.wait(self.kvs.contains(name))
+    read, write, delete, length, type = map(_of_place, ("read", "write", "delete", "length", "type"))
+    append, extend, increment = map(_of_place, ("append", "extend", "increment"))
+    multiply, divide = map(_of_place, ("multiply", "divide"))
+    set, get, contains = map(_of_store, ("set", "get", "contains"))
 
 
 class BlockingFront(Front):
@@ -443,17 +430,8 @@ class BlockingFront(Front):
     def length(self, path):
         return len(self.at(path))
 
-    def extend(self, path, values):
-        operator.iadd(self.at(path), values)
-
-    def increment(self, path, number):
-        operator.iadd(self.at(path), number)
-
-    def multiply(self, path, number):
-        operator.imul(self.at(path), number)
-
-    def divide(self, path, number):
-        operator.itruediv(self.at(path), number)
+    extend = increment = _with_syntax(operator.iadd)
+    multiply, divide = map(_with_syntax, (operator.imul, operator.itruediv))
 
     def contains(self, name):
         return name in self.kvs

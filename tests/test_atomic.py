@@ -14,7 +14,6 @@ import pytest
 from conftest import EXAMPLES, PATIENCE, assert_no_orphans, assert_same, commands_run, keys_of, nothing_sent
 
 import reem
-import reem_async
 from reem_async.errors import BadType, MissingKey, PathRefused
 
 READS = max(200, EXAMPLES // 5)
@@ -107,51 +106,6 @@ def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
                 readers.start(read, 2)
                 readers.start(read, 3)
         assert min(written) >= 3, "a run counts only if there was load"
-
-
-@pytest.mark.parametrize("shape", [SMALL, FULL], ids=["small", "full size"])
-async def test_image_and_stamp_are_never_seen_apart_by_a_subscriber(ainterface, key, server_url, shape):
-    """Neither by a loop, nor by a mirror, nor by a callback, with two publishers at work."""
-    seen = [0, 0]
-
-    def callback(data, updated_path):
-        assert_not_torn(data)
-        seen[1] += 1
-
-    failures = []
-
-    async def callback_and_tell(data, updated_path):
-        try:
-            callback(data, updated_path)
-        except AssertionError as failure:
-            failures.append(failure)
-
-    async with reem_async.RedisInterface(server_url) as other:
-        spaces = [reem_async.PublishSpace(ainterface), reem_async.PublishSpace(other)]
-        await spaces[0][key()].write(frame(0, shape))
-        mirror = reem_async.SilentSubscriber(key(), ainterface)
-        calls = reem_async.CallbackSubscriber(key(), ainterface, callback_and_tell, {})
-        async with mirror, calls:
-            updates = reem_async.KeyValueStore(ainterface)[key()].watch()
-
-            async def publish(me):
-                for stamp in range(1 + me, 10**9, 2):
-                    await spaces[me][key()].write(frame(stamp, shape))
-                    await asyncio.sleep(0)
-
-            publishers = [asyncio.create_task(publish(me)) for me in range(2)]
-            enough = max(10, READS // 10) if shape == SMALL else 10
-            async with asyncio.timeout(60 + READS / 50):
-                async for update in updates:
-                    assert_not_torn(update.data)
-                    assert_not_torn(mirror.value())
-                    seen[0] += 1
-                    if seen[0] >= enough and seen[1] >= 3:
-                        break
-            for task in publishers:
-                task.cancel()
-            await asyncio.gather(*publishers, return_exceptions=True)
-    assert not failures, failures[0]
 
 
 # --- how many commands -----------------------------------------------------------------------------
@@ -297,34 +251,6 @@ def test_eight_clients_that_change_shapes_lose_nothing_and_leave_no_orphans(serv
             del kvs[top]
             assert keys_of(raw, top) == set()
     assert len(failed) < 8 * CHANGES, "every operation failed"
-
-
-async def test_concurrent_tasks_that_change_shapes_leave_no_orphans(akvs, key, raw):
-    """The same on one shared async interface, where calls interleave at every await."""
-    rng = random.Random(5)
-    await akvs[key()].write({"shared": 0})
-
-    async def work(me):
-        for step in range(CHANGES):
-            n = me * 1_000_000 + step
-            with contextlib.suppress(PathRefused, MissingKey):
-                if rng.random() < 0.5:
-                    await akvs[key()]["shared"].write(_shape(rng, n))
-                elif rng.random() < 0.5:
-                    await akvs[key()]["shared"]["a"].write(_shape(rng, n))
-                else:
-                    await akvs[key()]["shared"]["a"].delete()
-            await akvs[key()][f"mine{me}"].write(last := _shape(rng, n))
-        return last
-
-    async with asyncio.timeout(PATIENCE * 6):
-        lasts = await asyncio.gather(*(work(me) for me in range(8)))
-    value = await akvs[key()].read()
-    assert_same(
-        {f"mine{me}": value[f"mine{me}"] for me in range(8)},
-        {f"mine{me}": last for me, last in enumerate(lasts)},
-    )
-    assert_no_orphans(raw, key())
 
 
 async def test_a_cancelled_write_is_whole_or_absent(akvs, key, raw):

@@ -10,7 +10,7 @@ import time
 import weakref
 
 import pytest
-from conftest import PATIENCE, aeventually, eventually, python
+from conftest import FRONTS, PATIENCE, aeventually, eventually, python
 
 import reem
 import reem_async
@@ -173,23 +173,23 @@ async def test_a_function_that_returns_something_to_await_is_awaited(ainterface,
         await aeventually(lambda: told == list(range(6)))
 
 
-async def test_a_subscriber_that_nobody_holds_works_until_its_interface_is_closed(server_url, apspace, key):
-    told = []
+def test_a_subscriber_that_nobody_holds_works_until_its_interface_is_closed(open_front, pspace, key):
+    front, told = open_front(), []
+    package = reem_async if isinstance(front, FRONTS["asyncio"]) else reem
 
     class Told:
         def __call__(self, data, updated_path):
             told.append(data)
 
-    async with RedisInterface(server_url) as interface:
-        callback = Told()
-        kept = weakref.ref(callback)
-        await CallbackSubscriber(key(), interface, callback).listen()
-        del callback
-        gc.collect()
-        await apspace[key()].write(1)
-        await aeventually(lambda: told == [1])
+    callback = Told()
+    kept = weakref.ref(callback)
+    front.wait(package.CallbackSubscriber(key(), front.interface, callback).listen())
+    del callback
     gc.collect()
-    assert kept() is None
+    pspace[key()] = 1
+    front.until(lambda: told == [1])
+    front.wait(front.interface.close())
+    front.until(lambda: gc.collect() >= 0 and kept() is None)
 
 
 async def test_a_callback_sees_mirrors_of_the_same_key_as_they_are_after_the_update(ainterface, apspace, key):

@@ -149,18 +149,6 @@ def test_a_task_that_is_slow_to_end_keeps_no_connection_open(server_url, key):
     assert followers.local._off  # the last of what closing does
 
 
-def test_closing_a_subscriber_ends_loops_over_it(interface, pspace, key):
-    """In other threads, one over a subscriber with callbacks too."""
-    pspace[key()] = 1
-    silent = reem.SilentSubscriber(key(), interface)
-    called = reem.CallbackSubscriber(key(), interface, lambda data, updated_path: None)
-    for subscriber in (silent, called):
-        loops = [Waiting(subscriber), Waiting(subscriber.watch(reem.Last(10)))]
-        eventually(lambda loops=loops: all(loop.taken for loop in loops))
-        subscriber.close()
-        assert all(loop.ends() for loop in loops)
-
-
 @pytest.fixture
 def short_turns():
     """Threads take turns as often as can be."""

@@ -1,17 +1,14 @@
 """The connection: its state, calls that stand still, what a stopped or restarted server does."""
 
 import asyncio
-import contextlib
-import os
-import signal
-import threading
 import time
 
 import numpy as np
 import pytest
 import redis
 from chaos.proxy import CHUNK, Proxy
-from conftest import PATIENCE, PLAIN, aeventually, eventually, subscribed
+from chaos.servers import PrivateServer
+from conftest import PATIENCE, PLAIN, aeventually, eventually, stopped, subscribed
 
 import reem
 import reem_async
@@ -23,16 +20,6 @@ from reem_async.plan.notices import note_of
 from reem_async.pubsub import manager as manager_module
 from reem_async.pubsub.manager import manager_of
 from reem_async.server import EmbeddedServer
-
-
-@contextlib.contextmanager
-def stopped(server):
-    """The server stands still inside the block."""
-    os.kill(server.pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(server.pid, signal.SIGCONT)
 
 
 @pytest.mark.alone
@@ -159,44 +146,22 @@ async def test_states_are_told_in_order_and_to_callbacks(server):
     assert [change.state async for change in interface.states()] == ["closed"]
 
 
-def test_states_of_a_blocking_interface(server):
-    interface = reem.RedisInterface(server)
-    changes = interface.states()
-    seen = []
-    thread = threading.Thread(target=lambda: seen.extend(changes))
-    thread.start()
-    interface.initialize()
-    interface.close()
-    thread.join(PATIENCE)
-    assert [change.state for change in seen] == ["idle", "connected", "closed"]
-
-
-def killed(server):
-    os.kill(server.pid, signal.SIGKILL)
-    eventually(lambda: not server.running)
-
-
-async def test_a_restarted_server_is_told_apart(tmp_path):
-    async with contextlib.AsyncExitStack() as stack:
-        first = EmbeddedServer(directory=tmp_path).__enter__()
-        port = first.port
-        interface = await stack.enter_async_context(reem_async.RedisInterface(f"redis://127.0.0.1:{port}"))
-        store = reem_async.KeyValueStore(interface)
-        changes = interface.states()
-        await store["foo"].write(1)
-        async with store["foo"].watch() as updates:
-            assert (await anext(updates)).initial
-            killed(first)
-            await aeventually(lambda: interface.state == "reconnecting")
-            with pytest.raises(NotConnected):
-                await store["foo"].read()
-            with contextlib.suppress(Exception):
-                first.__exit__(None, None, None)
-            with EmbeddedServer(port=port, directory=tmp_path):
+async def test_a_restarted_server_is_told_apart():
+    with PrivateServer(keep=True) as server:
+        async with reem_async.RedisInterface(server.url) as interface:
+            store = reem_async.KeyValueStore(interface)
+            changes = interface.states()
+            await store["foo"].write(1)
+            async with store["foo"].watch() as updates:
+                assert (await anext(updates)).initial
+                server.kill()
+                await aeventually(lambda: interface.state == "reconnecting")
+                with pytest.raises(NotConnected):
+                    await store["foo"].read()
+                server.start()
                 update = await asyncio.wait_for(anext(updates), PATIENCE)
                 assert (update.gap, update.missed) == (True, None)
                 await aeventually(lambda: interface.state == "connected")
-                await interface.close()
     told = [change async for change in changes]
     assert [change.state for change in told] == ["connected", "lost", "reconnecting", "connected", "closed"]
     assert [change.restarted for change in told] == [False, False, False, True, False]
@@ -383,20 +348,16 @@ async def test_updates_missed_in_between_are_counted(server):
                 assert (update.gap, update.missed) == (False, 0)
 
 
-def test_an_idle_blocking_connection_survives_a_restart(tmp_path):
+def test_an_idle_blocking_connection_survives_a_restart():
     """No call fails for a connection that the server had closed before."""
-    first = EmbeddedServer(directory=tmp_path).__enter__()
-    port = first.port
-    with reem.RedisInterface(f"redis://127.0.0.1:{port}") as interface:
+    with PrivateServer() as server, reem.RedisInterface(server.url) as interface:
         store = reem.KeyValueStore(interface)
         store["foo"] = 1
-        killed(first)
-        with contextlib.suppress(Exception):
-            first.__exit__(None, None, None)
-        with EmbeddedServer(port=port, directory=tmp_path):
-            store["bar"] = 2
-            assert store["bar"].read() == 2
-            assert interface.states().__next__().restarted
+        server.kill()
+        server.start()
+        store["bar"] = 2
+        assert store["bar"].read() == 2
+        assert interface.states().__next__().restarted
 
 
 @pytest.mark.alone

@@ -12,9 +12,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import redis
-from conftest import FRONTS, aeventually
+from conftest import FRONTS, aeventually, stopped
 from own_servers import caller, liar
-from test_connection import stopped
 
 import reem
 import reem_async

@@ -151,14 +151,6 @@ async def test_a_connection_that_breaks_costs_only_the_call_that_it_was_lent_to(
     assert len(failed) <= 1
 
 
-def test_the_limit_of_one_call_is_its_own(server, raw, monkeypatch):
-    with contextlib.closing(reem.RedisInterface(server, timeout=30)) as interface:
-        kvs = reem.KeyValueStore(interface)
-        kvs["robot"] = VALUE
-        with overtaken(monkeypatch, touching(raw, server, "robot")), reem.timeout(LIMIT), pytest.raises(reem.Conflict):
-            kvs["robot"]["l"][-1] = 7
-
-
 @pytest.mark.parametrize("outage", ["raise", "newest"])
 @pytest.mark.parametrize("index", [0, -1])
 async def test_an_update_that_others_are_always_faster_than_is_neither_outage_nor_gap(

@@ -8,7 +8,6 @@ import pickle
 import signal
 import threading
 import time
-import urllib.parse
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -16,19 +15,9 @@ import pytest
 from conftest import PATIENCE, SLOW_MACHINE, assert_no_orphans, assert_same, eventually, python
 
 import reem
-from reem import CallbackSubscriber, Conflict, KeyValueStore, PublishSpace, RedisInterface, SilentSubscriber
+from reem import CallbackSubscriber, Conflict, KeyValueStore, RedisInterface, SilentSubscriber
 
 # --- Python's own syntax ---------------------------------------------------------------------------
-
-
-def test_an_accessor_keeps_its_path(kvs, key):
-    kvs[key()] = {"x": {"foo": 3}}
-    a = kvs[key()]
-    b = a["x"]
-    b["foo"] = 4
-    assert a.read() == {"x": {"foo": 4}}
-    assert b.read() == {"foo": 4}
-    assert a["x"]["foo"].read() == 4
 
 
 def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, server_url):
@@ -44,32 +33,6 @@ def test_a_with_block_that_raises_or_is_overtaken_writes_nothing(kvs, key, serve
 
 
 # --- connecting ------------------------------------------------------------------------------------
-
-
-def test_the_host_may_be_positional_a_keyword_or_a_url(server_url, key):
-    """And further options go to redis-py; `interface=` is a keyword too."""
-    parts = urllib.parse.urlsplit(server_url)
-    options = {"port": parts.port or 6379, "password": parts.password, "username": parts.username}
-    opened = [
-        RedisInterface(server_url),
-        RedisInterface(host=server_url),
-        RedisInterface(parts.hostname, **options),
-        RedisInterface(host=parts.hostname, socket_connect_timeout=2, **options),
-    ]
-    for number, interface in enumerate(opened):
-        interface.initialize()
-        kvs = KeyValueStore(interface=interface)
-        kvs[key()] = number
-        assert kvs[key()].read() == number
-        interface.close()
-
-
-def test_leaving_a_with_block_closes_the_interface(server_url, key):
-    with RedisInterface(server_url) as interface:
-        kvs = KeyValueStore(interface)
-        kvs[key()] = 1
-    with pytest.raises(reem.InterfaceClosed):
-        kvs[key()].read()
 
 
 # --- threads and visibility ------------------------------------------------------------------------
@@ -338,28 +301,6 @@ def test_callbacks_run_on_a_thread_of_their_own_and_may_use_reem(interface, kvs,
     assert threading.main_thread() not in threads
 
 
-@pytest.mark.alone
-def test_a_slow_callback_holds_up_nobody_else(interface, kvs, pspace, key):
-    """Neither other subscribers nor calls, and it still sees the newest in the end."""
-    release = threading.Event()
-    seen = []
-
-    def slow(data, updated_path):
-        release.wait(PATIENCE)
-        seen.append(data)
-
-    with CallbackSubscriber(key(), interface, slow, {}), SilentSubscriber(key(), interface) as mirror:
-        for n in range(50):
-            pspace[key()] = n
-        began = time.monotonic()
-        eventually(lambda: mirror.value() == 49)
-        assert kvs[key()].read() == 49
-        assert time.monotonic() - began < 5
-        release.set()
-        eventually(lambda: seen and seen[-1] == 49)
-        assert seen == sorted(seen)
-
-
 def test_a_callback_that_always_raises_is_logged_once_and_then_counted(interface, pspace, key, caplog):
     """At 200 Hz a traceback for each would fill the log; another kind is another matter."""
     seen = []
@@ -379,38 +320,6 @@ def test_a_callback_that_always_raises_is_logged_once_and_then_counted(interface
     assert "has raised ZeroDivisionError 10 times by now" in caplog.text
 
 
-def test_a_callback_may_close_its_own_subscriber(interface, pspace, key):
-    """After the first update it wanted; no deadlock, and nothing that is published afterwards is seen."""
-    seen, closed = [], threading.Event()
-
-    def once(data, updated_path):
-        seen.append(data)
-        subscriber.close()
-        closed.set()
-
-    subscriber = CallbackSubscriber(key(), interface, once, {})
-    subscriber.listen()
-    pspace[key()] = 1
-    assert closed.wait(PATIENCE)
-    pspace[key()] = 2
-    time.sleep(0.2)
-    assert seen == [1]
-
-
-def test_leaving_the_with_block_ends_the_callbacks(interface, pspace, key):
-    heard = []
-    before = set(threading.enumerate())
-    with SilentSubscriber(key("warm"), interface):
-        running = set(threading.enumerate())
-        with CallbackSubscriber(key(), interface, lambda data, updated_path: heard.append(data), {}):
-            pspace[key()] = 1
-            eventually(lambda: heard == [1])
-        pspace[key()] = 2
-        time.sleep(0.2)
-        assert heard == [1]
-        eventually(lambda: set(threading.enumerate()) <= running | before)
-
-
 def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):
     kvs[key()] = 1
     with SilentSubscriber(key(), interface) as mirror:
@@ -421,21 +330,3 @@ def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):
         copy.close()
         with contextlib.suppress(AttributeError):
             copy.interface.close()
-
-
-def test_callbacks_run_beside_a_running_event_loop(server_url, key):
-    """In a program, or a notebook, that has one of its own."""
-    seen = []
-
-    async def main():
-        with RedisInterface(server_url) as interface:
-            subscriber = CallbackSubscriber(key(), interface, lambda data, updated_path: seen.append(data), {})
-            subscriber.listen()
-            PublishSpace(interface)[key()] = 1
-            async with asyncio.timeout(PATIENCE):
-                while not seen:
-                    await asyncio.sleep(0.01)
-            subscriber.close()
-
-    asyncio.run(main())
-    assert seen == [1]

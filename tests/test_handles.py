@@ -259,18 +259,24 @@ def test_a_store_is_updated_key_by_key_after_all_was_looked_at(kvs, pspace, key)
     assert kvs[key()].read() == 3
 
 
-def test_a_publish_space_refuses_what_would_read(pspace, key):
-    for call in (
-        pspace[key()].keys,
-        lambda: "x" in pspace[key()],
-        lambda: list(pspace[key()]),
-        lambda: pspace[key()].pop("x"),
-        lambda: pspace[key()].setdefault("x", 1),
-        lambda: pspace.pop(key()),
-        lambda: pspace.setdefault(key(), 1),
-    ):
-        with pytest.raises(WriteOnly):
-            call()
+def test_a_publish_space_refuses_what_would_read(open_front, key):
+    front = open_front("PublishSpace")
+    space, at = front.kvs, front.kvs[key()]["n"]
+    calls = (
+        *(at.read, at.get, at.length, at.type, at.keys, at.outline, at.edit, at.mirror, at.watch, at.pop),
+        lambda: at.contains("x"),
+        lambda: at.setdefault("x", 1),
+        lambda: at.parameter("p", 1),
+        lambda: at.reader,
+        lambda: space.get(f"{key()}.n"),
+        lambda: space.pop(key()),
+        lambda: space.setdefault(key(), 1),
+        space.watch,
+    )
+    for call in calls:
+        with pytest.raises(WriteOnly) as caught:
+            front.wait(call())
+        assert isinstance(caught.value, NotImplementedError)
 
 
 async def test_what_cannot_wait_says_what_to_await(akvs, key):

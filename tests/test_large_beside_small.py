@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import redis
-from conftest import assert_same, url_of_user
+from conftest import assert_same
 
 import reem_async
 from reem_async.errors import BadValue
-from reem_async.plan.sizes import USUAL, Limits, check_sizes, limits
-from reem_async.server import EmbeddedServer
+from reem_async.plan.sizes import LONGEST, check_sizes
 from reem_async.transport.wire import BUFFER
 
 
@@ -106,7 +104,7 @@ def untouched(size):
 
 @pytest.mark.parametrize("space", ["KeyValueStore", "PublishSpace"])
 def test_an_array_that_no_server_takes_is_refused(open_front, front, key, space):
-    writer, too_large = open_front(space), untouched(USUAL.argument - 100)  # its header has 128 bytes
+    writer, too_large = open_front(space), untouched(LONGEST - 100)  # its header has 128 bytes
     front.write([key()], {"keep": [1]})
     for call in (
         lambda: writer.write([key(), "image"], too_large),
@@ -148,20 +146,8 @@ async def test_an_edit_that_no_server_takes_is_refused(akvs, key):
     assert await akvs[key()].read() == {"keep": 1}
 
 
-async def test_the_servers_own_limits_count():
-    with EmbeddedServer() as server, redis.Redis(unix_socket_path=server.socket_path) as raw:
-        raw.config_set("proto-max-bulk-len", 3 << 29)
-        raw.config_set("client-query-buffer-limit", 5 << 29)
-        raw.execute_command("ACL", "SETUSER", "guest", "on", ">word", "~*", "&*", "+@all", "-config")
-        async with reem_async.RedisInterface(server) as interface:
-            assert await interface.session.run(limits()) == Limits(3 << 29, 5 << 29)
-        async with reem_async.RedisInterface(url_of_user(server.url, "guest", "word")) as interface:
-            assert await interface.session.run(limits()) == USUAL
-
-
 def test_both_limits_are_kept_to():
-    check_sizes([("a", 512 << 20), ("b", 511 << 20)], USUAL)
+    check_sizes([("a", 512 << 20), ("b", 511 << 20)])
     for sizes in ([("a", (512 << 20) + 1)], [("a", 512 << 20), ("b", 512 << 20)]):
         with pytest.raises(BadValue, match=r"^a: "):
-            check_sizes(sizes, USUAL)
-        check_sizes(sizes, Limits(2 << 30, 2 << 30))
+            check_sizes(sizes)

@@ -387,20 +387,8 @@ async def test_a_reader_with_a_ttl_ignores_what_is_not_of_the_owner(akvs, apspac
 
 def test_a_reader_judges_updates_by_their_fencing_numbers():
     judge = FenceFilter(0.2)
-    said = [
-        (0, 0.0),
-        (5, 1.0),
-        (4, 1.1),
-        (0, 1.1),
-        (5, 1.15),
-        (0, 1.3),
-        (6, 1.3),
-        (5, 1.4),
-        (0, 1.49),
-        (0, 1.6),
-        (1, 1.6),
-    ]
-    admitted = [judge.admits(lease, now) for lease, now in said]
+    leases, times = (0, 5, 4, 0, 5, 0, 6, 5, 0, 0, 1), (0, 1, 1.1, 1.1, 1.15, 1.3, 1.3, 1.4, 1.49, 1.6, 1.6)
+    admitted = [judge.admits(lease, now) for lease, now in zip(leases, times, strict=True)]
     assert admitted == [True, True, False, False, True, False, True, False, False, True, True]
 
 

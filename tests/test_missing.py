@@ -10,7 +10,6 @@ from conftest import assert_no_orphans, assert_same, eventually
 import reem
 import reem_async
 from reem_async.errors import BadType, MissingKey, NotFinite, Overflow, PathRefused, TooDeep, WrongType
-from reem_async.store.catalog import outline
 
 
 def test_a_program_that_must_know_asks(front, key, raw):
@@ -60,11 +59,6 @@ def test_accessors_get_with_a_default(kvs, key):
     assert kvs[key()].get("element", 5) == 5
     with pytest.raises(MissingKey), kvs[key()]:
         pytest.fail("the block ran")
-
-
-async def test_tools_still_say_that_nothing_is_there(ainterface, key):
-    with pytest.raises(MissingKey):
-        await outline(ainterface, key())
 
 
 @pytest.mark.parametrize("value", [np.arange(3.0), np.zeros(20_000), b"bytes"], ids=["small", "large", "bytes"])

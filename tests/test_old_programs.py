@@ -1,6 +1,5 @@
 """What programs of REEM 0.0.x and 0.1.x import, and the ways in which they call it."""
 
-import asyncio
 import enum
 import functools
 import importlib
@@ -361,17 +360,6 @@ def _telling(function, told):
         told.append(function(*values, **names))
 
     return tell
-
-
-async def test_a_coroutine_function_too(ainterface, apspace, key):
-    told = asyncio.get_running_loop().create_future()
-
-    async def callback(updated_path, data):
-        told.set_result((updated_path, data))
-
-    async with reem_async.CallbackSubscriber(key(), ainterface, callback):
-        await apspace[key()].write(1)
-        assert await asyncio.wait_for(told, 10) == (key(), 1)
 
 
 @pytest.mark.parametrize("package", [reem, reem_async])

@@ -5,7 +5,6 @@ import contextlib
 import os
 import pickle
 import random
-import signal
 import threading
 import time
 
@@ -13,41 +12,22 @@ import numpy as np
 import orjson
 import pytest
 from chaos.proxy import Proxy
-from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually, sized
+from chaos.servers import PrivateServer
+from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually, sized, stopped
 
 import reem
 import reem_async
 from reem_async.concurrency.queues import Every
 from reem_async.errors import BadValue, ConnectionLost, NotConnected
 from reem_async.plan.trees import MISSING, CannotApply, removed, replaced
-from reem_async.server.embedded import EmbeddedServer
 from reem_async.store import outage
-from reem_async.store.document import Assignment, DocumentWriter
-
-
-class Server:
-    """A private server that can be ended and started again on its port, with its data."""
-
-    def __init__(self, directory, stack):
-        self._directory = directory
-        self._stack = stack
-        self.port = 0
-        self.start()
-
-    def start(self):
-        self._running = self._stack.enter_context(EmbeddedServer(port=self.port, directory=self._directory))
-        self.port = self._running.port
-        self.url = f"redis://127.0.0.1:{self.port}"
-        self.pid = self._running.pid
-
-    def stop(self):
-        self._running.__exit__(None, None, None)
+from reem_async.store.document import Assignment
 
 
 @pytest.fixture
-def server(tmp_path):
-    with contextlib.ExitStack() as stack:
-        yield Server(tmp_path, stack)
+def server():
+    with PrivateServer(keep=True) as running:
+        yield running
 
 
 @pytest.fixture(params=list(FRONTS))
@@ -74,7 +54,7 @@ def reader(server):
 def lose(front, server):
     """End the server, and have the publisher notice by an update that may be lost."""
     front.write(["lost"], 0)
-    server.stop()
+    server.kill()
     front.write(["lost"], 1)
 
 
@@ -87,7 +67,7 @@ def test_what_is_no_policy_is_refused():
 def test_a_publisher_raises_unless_it_says_otherwise(publisher, server):
     front = publisher("raise")
     front.write(["a"], 1)
-    server.stop()
+    server.kill()
     with pytest.raises((NotConnected, ConnectionLost)):
         front.write(["a"], 2)
     with pytest.raises(NotConnected):
@@ -207,15 +187,12 @@ def test_a_server_that_hangs_is_waited_for_once(publisher, server, reader):
     front = publisher("newest", timeout=0.3)
     for name in "abc":
         front.write([name], 0)
-    os.kill(server.pid, signal.SIGSTOP)
-    try:
+    with stopped(server):
         front.write(["a"], 1)
         for name in "bc" * 50:
             front.write([name], 1)
         assert front.kvs.waiting == 2
         assert front.kvs.dropped == 1 + 98
-    finally:
-        os.kill(server.pid, signal.SIGCONT)
     front.until(lambda: front.kvs.waiting == 0)
     assert {name: reader()[name].read() for name in "bc"} == {"b": 1, "c": 1}
 
@@ -234,7 +211,7 @@ def test_an_outage_ends_for_several_keys_that_are_published_all_the_time(publish
             for name in names:
                 front.write([name], number)
 
-        server.stop()
+        server.kill()
         publish()
         publish()
         proxy.delay = 0.01
@@ -256,13 +233,10 @@ async def test_what_is_kept_has_the_time_of_its_call(server):
         told, arm = subscriber.watch(Every(100)), reem_async.PublishSpace(interface, outage="newest")["arm"]
         await reem_async.KeyValueStore(other)["arm"].write({})
         await anext(told)
-        os.kill(server.pid, signal.SIGSTOP)
-        try:
+        with stopped(server):
             called = time.time()
             await asyncio.gather(arm["a"].write(1), arm["b"].write(2))  # the second waits for the first, which is lost
             assert time.time() - called > 0.4
-        finally:
-            os.kill(server.pid, signal.SIGCONT)
         while (update := await asyncio.wait_for(anext(told), PATIENCE)).path != "arm.b":
             assert update.path == "arm.a"
         assert abs(update.time - called) < 0.2
@@ -282,14 +256,14 @@ def test_what_depends_on_what_is_there_raises_and_comes_behind_what_is_kept(publ
     assert reader()["l"].read() == [3, 4]
 
 
-def test_what_is_refused_afterwards_is_logged_and_counted(publisher, server, tmp_path, caplog):
+def test_what_is_refused_afterwards_is_logged_and_counted(publisher, server, caplog):
     """As where the server has lost what the place was in. A deletion of what is not there is no loss."""
     front = publisher("newest")
     front.write(["a"], {"b": {}})
     front.write(["lost"], 0)
     lose(front, server)
     before = front.kvs.dropped
-    for file in tmp_path.rglob("*"):
+    for file in server.directory.rglob("*"):
         if file.is_file():
             file.unlink()
     front.write(["a", "b", "c"], 1)
@@ -333,43 +307,6 @@ def test_closing_gives_up_what_is_kept(publisher, server, caplog):
     assert "reem outage" not in [thread.name for thread in threading.enumerate()]
     with pytest.raises(reem_async.InterfaceClosed):
         front.write(["a"], 1)
-
-
-def test_a_number_is_not_used_again_if_the_server_goes_away_between_two_kept_updates(server, reader, monkeypatch):
-    """Before the second of them has one; and no update is held in memory once it is sent."""
-    held, started, gone = [], threading.Event(), threading.Event()
-    with reem.RedisInterface(server.url) as interface, reem.RedisInterface(server.url) as near:
-        space = reem.PublishSpace(interface, outage="newest")
-        space["a"] = {"x": 0}
-        server.stop()
-        space["a"]["x"] = 0  # may have been under way
-        space["a"]["x"] = 1
-        space["a"]["image"] = np.ones(5)
-        assert space.waiting == 2
-        look, send = DocumentWriter._check_place, DocumentWriter.send
-
-        async def look_without_server(self, *what):
-            if not gone.is_set():
-                assert started.wait(PATIENCE)
-                server.stop()
-                gone.set()
-            await look(self, *what)
-
-        async def send_noting(self, turn, assignments):
-            held.append(len(turn._announcements))
-            await send(self, turn, assignments)
-
-        monkeypatch.setattr(DocumentWriter, "_check_place", look_without_server)
-        monkeypatch.setattr(DocumentWriter, "send", send_noting)
-        server.start()
-        started.set()
-        eventually(lambda: gone.is_set() and space.waiting == 1)  # it was kept again
-        server.start()
-        eventually(lambda: not space.waiting and not space._core._outages._asking)
-        assert_same(reader()["a"].read(), {"x": 1, "image": np.ones(5)})
-        assert space.dropped == 1
-        assert int(near.client.get("{a}:last").split()[1]) == 4
-        assert held == [0, 0, 0]  # before each is sent, the second twice
 
 
 def test_an_update_of_several_is_kept_by_its_entries(publisher, server, reader):
@@ -421,7 +358,7 @@ def test_pickled_spaces_and_handles_keep_the_policy(publisher, server):
     front = publisher("drop")
     space, handle = pickle.loads(pickle.dumps((front.kvs, front.kvs["a"]["b"])))
     assert space.outage == "drop"
-    server.stop()
+    server.kill()
     for call in (lambda: space["a"].write(1), lambda: handle.write(1)):
         front.wait(call())
     assert space.dropped == 1
@@ -443,7 +380,7 @@ def test_whatever_a_child_calls_first_what_is_kept_is_not_its_own(server, reader
     with reem.RedisInterface(server.url) as interface:
         space = reem.PublishSpace(interface, outage="newest")
         space["a"] = [0]
-        server.stop()
+        server.kill()
         space["a"] = [1]
         space["a"] = [2]
         go, tell = os.pipe()

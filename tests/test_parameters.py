@@ -4,7 +4,6 @@ import contextlib
 import json
 import logging
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -28,7 +27,7 @@ import reem
 import reem_async
 from reem_async.coordination.parameters import SPECIFICATIONS, prepared, stored_parameters
 from reem_async.coordination.specification import as_json, equal, from_stored, specified
-from reem_async.errors import BadData, BadInput, ConnectionLost, NotAllowed, NotConnected, PathRefused, WriteOnly
+from reem_async.errors import BadData, BadInput, ConnectionLost, NotAllowed, NotConnected, PathRefused
 
 GOOD = [
     (True, {}, [False, np.bool_(True)], [1, 0.0, "true", None]),
@@ -170,11 +169,6 @@ def test_a_parameter_is_read_from_memory_and_follows_every_program(declared, sto
         assert kp == 6.5
     with pytest.raises(TypeError, match="pickled"):
         kp.__reduce__()
-
-
-def test_a_publish_space_has_no_parameters(open_front):
-    with pytest.raises(WriteOnly):
-        Declared(open_front("PublishSpace")).kp()
 
 
 def test_a_value_is_assigned_in_plain_programs_alone(declared):
@@ -412,18 +406,3 @@ def test_a_coroutine_function_needs_an_event_loop(kvs, key):
     with pytest.raises(TypeError, match="reem_async"):
         kvs[key()].parameter("kp", 2.0, on_change=on_change)
     assert prepared(("a",), "b", 1, on_change=on_change).path == ("a", "b")
-
-
-def test_parameters_that_are_not_closed_keep_no_program(server_url, namespace):
-    code = """
-        import sys, reem
-        control = reem.KeyValueStore(sys.argv[1], namespace=sys.argv[2])["control"]
-        seen = []
-        kp = control.parameter("kp", 2.0, on_change=seen.append)
-        kp.value = 3.0
-        print(kp)
-    """
-    start = time.monotonic()
-    done = python(code, server_url, namespace["namespace"])
-    assert (done.stdout, done.stderr) == ("3.0\n", "")
-    assert time.monotonic() - start < 20

@@ -124,28 +124,10 @@ def test_twins_promise_the_same(name):
             assert "await " not in said, f"{name}.{method}"
 
 
-def test_what_waits_is_a_coroutine_in_one_front_and_never_in_the_other():
-    waiting = {
-        "RedisInterface": {"initialize", "close"},
-        "KeyValueStore": {"get", "set"},
-        "accessor": {"read", "write", "get", "delete", "length", "type", "increment", "multiply", "divide"}
-        | {"append", "extend", "parameter"},
-        "SilentSubscriber": {"listen", "close"},
-        "CallbackSubscriber": {"listen", "close"},
-        "mirror": {"listen", "close", "wait_until"},
-        "Parameter": {"write"},
-        "Writer": {"send_to_redis"},
-        "Reader": {"read_from_redis"},
-        "Publisher": {"send_to_redis"},
-    }
-    for name, methods in waiting.items():
-        kind = made(reem_async, name)
-        assert {each for each in public(kind) if inspect.iscoroutinefunction(getattr(kind, each))} >= methods, name
-        kind = made(reem, name)
-        assert not [each for each in public(kind) if inspect.iscoroutinefunction(getattr(kind, each))], name
-    for name in ("value", "track_schema_changes"):
-        for kind in (reem_async.SilentSubscriber, reem_async.KeyValueStore):
-            assert not inspect.iscoroutinefunction(getattr(kind, name, None))
+@pytest.mark.parametrize("name", CLASSES)
+def test_nothing_is_a_coroutine_in_the_blocking_front(name):
+    kind = made(reem, name)
+    assert not [each for each in public(kind) if inspect.iscoroutinefunction(getattr(kind, each))]
 
 
 @pytest.mark.parametrize("module", ["recording", "snapshots"])

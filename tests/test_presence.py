@@ -11,15 +11,15 @@ import time
 import pytest
 import redis
 from chaos.proxy import Proxy
+from chaos.servers import PrivateServer
 from clikit import environment, running
 from conftest import FRONTS, PATIENCE, eventually, python, url_of_user
-from own_servers import free_port, own_server
+from own_servers import own_server
 from test_startup import cluster_port  # noqa: F401 - a fixture
 
 import reem
 import reem_async
 from reem_async.concurrency.queues import EMPTY
-from reem_async.server import EmbeddedServer
 
 SOON = 1.5
 """Seconds within which it is known that a program has left: one, and what a busy machine adds."""
@@ -193,28 +193,24 @@ def test_a_program_that_was_stopped_goes_on_in_each_role(server):
 @pytest.mark.parametrize(
     "keep", [pytest.param(True, marks=pytest.mark.long, id="with its data"), pytest.param(False, id="without")]
 )
-def test_nodes_are_back_within_a_second_after_a_restart(tmp_path, keep):
+def test_nodes_are_back_within_a_second_after_a_restart(keep):
     """And none is reported to have left, since it has not."""
-    port = free_port()
-    server = EmbeddedServer(port, tmp_path if keep else None)
-    server.start()
-    with contextlib.closing(reem.RedisInterface(server.url, name="planner")) as one:
-        one.initialize()
-        watcher = reem.RedisInterface(server.url, timeout=0.3)
+    with (
+        PrivateServer(keep=keep) as server,
+        reem.RedisInterface(server.url, name="planner"),
+        reem.RedisInterface(server.url, timeout=0.3) as watcher,
+    ):
         eventually(watcher.nodes)
         with watcher.watch_nodes() as watch:
             assert next(watch).node.name == "planner"
-            os.kill(server.pid, signal.SIGKILL)
+            server.kill()
             time.sleep(1.2)
-            server = EmbeddedServer(port, tmp_path if keep else None)
             server.start()
             begin = time.monotonic()
             eventually(lambda: contextlib.suppress(reem.ReemError) and watcher.nodes())
             assert time.monotonic() - begin < SOON
             time.sleep(1.3)
             assert watch._core.queue.take() is EMPTY
-        watcher.close()
-    server.stop()
 
 
 @pytest.mark.parametrize("kind", ["cluster", pytest.param("sentinel", marks=pytest.mark.long)])

@@ -12,7 +12,7 @@ from conftest import assert_no_orphans, assert_same
 import reem
 import reem_async
 from reem_async.concurrency.queues import Every
-from reem_async.errors import Conflict, MissingKey, NotConnected, PathRefused, WriteOnly
+from reem_async.errors import Conflict, MissingKey, NotConnected, PathRefused
 from reem_async.plan.arithmetic import calculate, compute
 from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.keys import keys_of
@@ -63,24 +63,6 @@ async def test_an_edit_that_somebody_overtook_is_a_conflict(akvs, kvs, key, imag
     assert_no_orphans(raw, key())
 
 
-async def test_many_edits_at_once_lose_nothing(akvs, key):
-    """Every conflict is reported, so retrying them all counts right."""
-    await akvs[key()].write({"n": 0, "pad": np.zeros(2)})
-
-    async def count():
-        for _ in range(10):
-            while True:
-                try:
-                    async with akvs[key()].edit() as value:
-                        value["n"] += 1
-                    break
-                except Conflict:
-                    await asyncio.sleep(0)
-
-    await asyncio.gather(*(count() for _ in range(4)))
-    assert await akvs[key()]["n"].read() == 40
-
-
 async def test_a_cancelled_call_harms_no_other(akvs, key):
     """Its reply is dropped, not handed to the next caller."""
     await akvs[key()].write({str(n): n for n in range(50)} | {"image": np.zeros(100_000)})
@@ -96,23 +78,6 @@ async def test_a_cancelled_call_harms_no_other(akvs, key):
     assert await akvs[key()]["7"].read() == 7
 
 
-async def test_an_async_program_reads_what_a_blocking_one_wrote_and_the_reverse(akvs, kvs, key):
-    """One layout serves both fronts; a blocking call also works inside a running loop."""
-    value = {"n": 0.9374604873776271, "image": np.arange(6.0).reshape(2, 3), "b": b"x", "l": [np.arange(2)]}
-    kvs[key()] = value
-    assert_same(await akvs[key()].read(), value)
-    await akvs[key("back")].write(value)
-    assert_same(kvs[key("back")].read(), value)
-
-
-async def test_the_interface_need_not_be_initialized(server_url, key):
-    """The first call connects; `KeyValueStore` also takes the address itself."""
-    kvs = reem_async.KeyValueStore(server_url)
-    await kvs[key()].write(1)
-    assert await kvs[key()].read() == 1
-    await kvs.interface.close()
-
-
 def test_handles_can_be_pickled(open_front, key):
     """Stores, accessors, publish spaces and interfaces reconnect."""
     front, space = open_front(), open_front("PublishSpace")
@@ -126,20 +91,6 @@ def test_handles_can_be_pickled(open_front, key):
     front.wait(store.interface.close())
     space.wait(publishing.interface.close())
     space.wait(bare.close())
-
-
-def test_a_publish_space_cannot_be_read(open_front, key):
-    """It is a store that only writes; the error says so."""
-    front = open_front("PublishSpace")
-    assert issubclass(reem.PublishSpace, reem.KeyValueStore)
-    assert issubclass(reem_async.PublishSpace, reem_async.KeyValueStore)
-    front.write([key()], {"a": 1})
-    for call in (front.read, front.length, front.type):
-        with pytest.raises(WriteOnly) as caught:
-            call([key(), "a"])
-        assert isinstance(caught.value, NotImplementedError)
-    with pytest.raises(WriteOnly):
-        front.get(key() + ".a")
 
 
 def test_nobody_listening_is_said_with_a_remedy():

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import redis
 from chaos.proxy import Proxy
-from conftest import FRONTS, PATIENCE, assert_same, eventually, python, sized
+from conftest import FRONTS, PATIENCE, assert_same, eventually, python, sized, stopped
 
 import reem
 import reem_async
@@ -41,21 +41,6 @@ def publisher(request, server_url, key):
             return front
 
         yield make
-
-
-@pytest.fixture
-def paused(server):
-    """A server that is stopped inside the block, and a store of it."""
-
-    @contextlib.contextmanager
-    def pause():
-        os.kill(server.pid, signal.SIGSTOP)
-        try:
-            yield
-        finally:
-            os.kill(server.pid, signal.SIGCONT)
-
-    return pause
 
 
 @pytest.fixture
@@ -112,28 +97,6 @@ def test_all_values_arrive_in_order_as_they_were_in_the_call(publisher, kvs, key
     assert (front.kvs.dropped, front.kvs.waiting) == (0, 0)
 
 
-def test_entries_of_one_update_are_stored_together(publisher, kvs, key):
-    front, torn, done = publisher(), [], threading.Event()
-
-    def read():
-        while not done.is_set():
-            value = kvs[key()].read()
-            torn.append(value["x"] != value["y"])
-
-    front.write([key()], {"x": 0, "y": 0})
-    front.flush()
-    reading = threading.Thread(target=read)
-    reading.start()
-    for number in range(200):
-        front.update([key()], {"x": number, "y": number})
-        front.sleep(0.001)
-    front.flush()
-    done.set()
-    reading.join()
-    assert len(torn) > 5
-    assert not any(torn)
-
-
 @pytest.mark.parametrize("front", ["blocking"])
 def test_bad_input_is_refused_in_the_call(publisher, front, key):
     space = publisher()
@@ -143,14 +106,12 @@ def test_bad_input_is_refused_in_the_call(publisher, front, key):
     assert (space.kvs.dropped, space.kvs.waiting) == (0, 0)
 
 
-def test_the_newest_of_each_place_is_left_where_the_server_lags_and_the_rest_is_counted(
-    publisher, server, paused, reader
-):
+def test_the_newest_of_each_place_is_left_where_the_server_lags_and_the_rest_is_counted(publisher, server, reader):
     front = publisher(server.url, timeout=PATIENCE)
     front.write(["a"], {"x": 0, "y": 0, "z": {}})
     front.flush()
     with reader["a"].watch(Every(10_000)) as watch:
-        with paused():
+        with stopped(server):
             for number in range(1, 1001):
                 front.write(["a", "x"], number)
                 front.update(["a"], {"y": number, "w": number})
@@ -172,13 +133,13 @@ def test_the_newest_of_each_place_is_left_where_the_server_lags_and_the_rest_is_
 
 
 @pytest.mark.parametrize("bound", ["calls", "bytes"])
-def test_the_queue_is_bounded(publisher, server, paused, reader, monkeypatch, bound):
+def test_the_queue_is_bounded(publisher, server, reader, monkeypatch, bound):
     """The oldest of a key go first, the newest stays."""
     monkeypatch.setattr(*((send_queue, "MOST_CALLS", 50) if bound == "calls" else (outage, "_MOST", 60_000)))
     front = publisher(server.url, timeout=PATIENCE)
     front.write(["a"], {})
     front.flush()
-    with paused():
+    with stopped(server):
         for number in range(200):
             front.write(["a", f"n{number}"], "x" * 1000)
         assert 30 <= front.kvs.waiting <= 51
@@ -276,11 +237,11 @@ def test_closing_sends_what_is_queued(publisher, kvs, key):
         front.write([key()], 1)
 
 
-def test_closing_waits_not_for_long_and_reports_what_was_not_sent(publisher, server, paused, caplog):
+def test_closing_waits_not_for_long_and_reports_what_was_not_sent(publisher, server, caplog):
     front = publisher(server.url, timeout=0.3)
     front.write(["a"], {})
     front.flush()
-    with paused():
+    with stopped(server):
         for number in range(20):
             front.write(["a", f"n{number}"], number)
         began = time.monotonic()
@@ -353,12 +314,12 @@ def test_an_event_loop_that_ends_sends_what_was_published(server_url, key, kvs):
     assert (space.dropped, space.waiting) == (0, 0)
 
 
-def test_the_queue_of_a_forked_child_is_empty(server, paused, reader):
+def test_the_queue_of_a_forked_child_is_empty(server, reader):
     with reem.RedisInterface(server.url, timeout=PATIENCE) as interface:
         space = reem.PublishSpace(interface, wait=False)
         space["a"] = {"n": 0}
         space.flush()
-        with paused():
+        with stopped(server):
             for number in range(1, 6):
                 space["a"]["n"] = number
             child = os.fork()
@@ -465,7 +426,7 @@ def test_a_link_that_is_cut_again_and_again(publisher, server, reader):
 
 
 @pytest.mark.parametrize("large", [False, True])
-def test_early_updates_arrive_while_the_server_does_not_answer(publisher, server, paused, large):
+def test_early_updates_arrive_while_the_server_does_not_answer(publisher, server, large):
     """In the order of the calls; each once, and at rest mirror and server agree."""
     url, told = f"redis://localhost:{server.port}", []
     front = publisher(url, local="early", timeout=PATIENCE)
@@ -487,7 +448,7 @@ def test_early_updates_arrive_while_the_server_does_not_answer(publisher, server
             front.flush()
             front.sleep(0.01)
         front.sleep(0.3)
-        with paused():
+        with stopped(server):
             for number in range(1, 4):
                 front.write(["a", "n"], value(number))
                 eventually(lambda number=number: told[-1][1:] == (True, number))

@@ -183,14 +183,8 @@ class LeaseConnection:
         """
         contention: Contention | None = None
         while True:
-            held = await self._opened()
-            try:
-                replies: list[Reply] = await held.roundtrip(commands, bulk=bulk)
-            except BaseException as error:
-                await self.leave(error)
-                raise
-            if self.sharded:
-                await self.leave()
+            async with self.hold() as held:
+                replies = await held.roundtrip(commands, bulk=bulk)
             if replies[-1] is not None or commands[-1][0] != "EXEC":
                 return replies
             contention = contention or Contention(self.timeout)

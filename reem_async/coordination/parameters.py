@@ -23,7 +23,6 @@ from ..errors import (
     BadKey,
     BadType,
     BadValue,
-    Conflict,
     MissingKey,
     NotAllowed,
     PathRefused,
@@ -42,7 +41,7 @@ from ..pubsub.follower import Follower
 from ..pubsub.manager import manager_of
 from ..pubsub.subscribers import Link
 from ..session import Session
-from ..store.document import DocumentWriter
+from ..store.document import DocumentWriter, retried
 from ..store.publish import publisher
 from ..store.reader import DocumentReader
 from .specification import Specification, as_json, equal, from_stored, specified
@@ -55,7 +54,6 @@ SPECIFICATIONS = "_parameters"
 _LARGEST = 4096  # bytes of an array that is fetched: a vector that another program has stored as an array is smaller
 _ECHO = 0.5  # seconds to wait until a value that was written is in the copy; it is later only if the connection broke
 _PAUSE = 1.0  # seconds between attempts to store defaults that are gone
-_TRIES = 50  # of storing a default while other programs write to the same key
 _MOST_REPORTED = 20  # different warnings about one parameter
 
 
@@ -268,7 +266,8 @@ class ParameterGroup:
         """Publish the default unless something is stored: of several programs, the first one does."""
         writer, inner = publisher(self.session, self._keys.name, "raise"), live.path[1:]
         reader = DocumentReader(self.session, self._keys.name)
-        for tries_left in reversed(range(_TRIES)):
+
+        async def attempt() -> None:
             await self.session.run(make_parents(self._keys, inner))
             try:
                 await reader.read(inner)
@@ -276,13 +275,9 @@ class ParameterGroup:
                 missing = error
             else:
                 return
-            try:
-                await writer.put_absent(inner, as_json(live.specification.default), missing)
-            except Conflict:
-                if not tries_left:
-                    raise
-            else:
-                return
+            await writer.put_absent(inner, as_json(live.specification.default), missing)
+
+        await retried(attempt)
 
     async def _describe(self, live: LiveParameter, *, again: bool = False) -> None:
         """Store the specification for tools; `again`, only if there is none."""
@@ -349,8 +344,12 @@ def changes_of(live: LiveParameter, declaration: Declaration) -> tuple[Caller, C
     return Caller(live.name, lambda update: on_change(update.data)), queue
 
 
-class ParameterHandle(Handle):
-    """A parameter as a program uses it: `float(kp)`, `kp.value`."""
+class Parameter(Handle):
+    """A value that is declared with type and bounds, kept current, and read without a round trip.
+
+    `await kvs["control"].parameter("kp", 2.0, low=0.0, high=10.0)` returns one. `float(kp)`, `int(kp)`, `bool(kp)`,
+    `str(kp)` and `kp.value` are the value as of now.
+    """
 
     __slots__ = ("_declaration", "_live")
     _how_to_read = ".value, float() or int()"
@@ -377,7 +376,16 @@ class ParameterHandle(Handle):
         self._live.group.check(self._live.name)
 
     def _assign(self, value: Any) -> None:
-        raise NotImplementedError
+        raise BadType(f"assignment cannot wait for the server; use: await parameter.write({shorten(value)})")
+
+    async def write(self, value: Any) -> None:
+        """Publish a value. One round trip; afterwards it is `value`, unless another was written since.
+
+        Raises:
+            BadType, BadValue: It is not of the type, out of range or not among the choices; nothing was sent.
+            NotConnected, ConnectionLost: As any write.
+        """
+        await self._live.write(value)
 
     @property
     def invalid(self) -> str:
@@ -418,28 +426,6 @@ class ParameterHandle(Handle):
 
     def __reduce__(self) -> NoReturn:
         raise BadType(f"{self.name}: a parameter cannot be pickled; declare it in each program")
-
-
-class Parameter(ParameterHandle):
-    """A value that is declared with type and bounds, kept current, and read without a round trip.
-
-    `await kvs["control"].parameter("kp", 2.0, low=0.0, high=10.0)` returns one. `float(kp)`, `int(kp)`, `bool(kp)`,
-    `str(kp)` and `kp.value` are the value as of now.
-    """
-
-    __slots__ = ()
-
-    async def write(self, value: Any) -> None:
-        """Publish a value. One round trip; afterwards it is `value`, unless another was written since.
-
-        Raises:
-            BadType, BadValue: It is not of the type, out of range or not among the choices; nothing was sent.
-            NotConnected, ConnectionLost: As any write.
-        """
-        await self._live.write(value)
-
-    def _assign(self, value: Any) -> NoReturn:
-        raise BadType(f"assignment cannot wait for the server; use: await parameter.write({shorten(value)})")
 
 
 async def declared(session: Session, declaration: Declaration) -> Parameter:

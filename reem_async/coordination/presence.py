@@ -17,7 +17,7 @@ import secrets
 import socket
 import time
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -262,9 +262,6 @@ class NodeWatch(Stream[NodeEvent]):
     loses its network has left within a second. One that comes back joins again, with the same `id` if it is the same
     process. While this program has no connection, nothing is reported. What has changed meanwhile is reported within
     two seconds after it is back. Of more than 1,000 events that wait for a slow loop, the oldest are dropped.
-
-    Args:
-        session: The server.
     """
 
     def __init__(self, session: Session) -> None:
@@ -291,7 +288,7 @@ class NodeWatch(Stream[NodeEvent]):
         if self._following:
             return
         self._nodes = await listed(self._session)
-        for node in sorted(self._nodes.values(), key=_order):
+        for node in in_order(self._nodes.values()):
             self.queue.put(NodeEvent("joined", node, initial=True))
         self._place = os.getpid(), asyncio.get_running_loop()
         self._task = self._session.tasks.start(_poll(weakref.ref(self), self._session), "reem watch of nodes")
@@ -312,7 +309,7 @@ class NodeWatch(Stream[NodeEvent]):
         joined = [found[node_id] for node_id in found.keys() - before.keys()]
         self._nodes = {**before, **found} if keep else found
         for kind, nodes in (("left", left), ("joined", joined)):
-            for node in sorted(nodes, key=_order):
+            for node in in_order(nodes):
                 self.queue.put(NodeEvent(kind, node))  # type: ignore[arg-type]
 
 
@@ -342,10 +339,6 @@ async def _poll(reference: weakref.ref[NodeWatch], session: Session) -> None:
         del watch
 
 
-def _order(node: NodeInfo) -> tuple[str, str, int, str]:
-    return node.name, node.host, node.pid, node.id
-
-
-def in_order(nodes: dict[str, NodeInfo]) -> list[NodeInfo]:
+def in_order(nodes: Iterable[NodeInfo]) -> list[NodeInfo]:
     """Return nodes in the order of their names."""
-    return sorted(nodes.values(), key=_order)
+    return sorted(nodes, key=lambda node: (node.name, node.host, node.pid, node.id))

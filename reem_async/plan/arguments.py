@@ -126,3 +126,12 @@ _NUMBERS = (
 )
 for _name in _NUMBERS.split():
     setattr(Handle, f"__{_name}__", _number)
+
+
+def cannot_wait(syntax: str, call: str) -> Any:
+    """Return a method for syntax that asyncio cannot await; it raises BadType, which names the call to use."""
+
+    def refuse(self: object, *given: object) -> NoReturn:
+        raise BadType(f"{syntax} cannot wait for the server; use: {call.format(*given)}")
+
+    return refuse

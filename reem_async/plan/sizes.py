@@ -9,19 +9,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from ..errors import BadValue
-from . import Command, Plan, Reply
+from . import Command, Reply
 
 LARGE = 1 << 16  # bytes from which other calls should not wait behind a value, in either direction
 
 
-class Limits(NamedTuple):
-    """Limits of a server."""
-
-    argument: int  # bytes of one argument, so of an array, or of the text of a document
-    call: int  # bytes of all commands of a transaction
-
-
-USUAL = Limits(512 << 20, 1 << 30)  # the defaults of proto-max-bulk-len and client-query-buffer-limit
+LONGEST, LONGEST_CALL = 512 << 20, 1 << 30
+"""Bytes of one value, and of a call: servers' defaults of proto-max-bulk-len and client-query-buffer-limit."""
 _WORDS = 1 << 16  # bytes of a call for its other words, and for what the server has read ahead
 
 
@@ -47,32 +41,17 @@ def sizes_of(commands: Iterable[Command]) -> list[int]:
     return [_size(word) for command in commands for word in command if type(word) is not str]
 
 
-def limits() -> Plan:
-    """Plan to ask a server for its limits; the result is `USUAL` if the user may not ask."""
-    names = ("proto-max-bulk-len", "client-query-buffer-limit")
-
-    def decode(replies: Sequence[Reply]) -> Limits:
-        found = replies[0] if isinstance(replies[0], dict) else {}
-        own = [found.get(name.encode(), b"") for name in names]
-        return Limits(*[int(text) if text.isdigit() else usual for text, usual in zip(own, USUAL, strict=True)])
-
-    return Plan([("CONFIG", "GET", *names)], decode)
-
-
-def check_sizes(sizes: Sequence[tuple[str, int]], most: Limits) -> None:
+def check_sizes(sizes: Sequence[tuple[str, int]]) -> None:
     """Raise BadValue if a call is too large for a server, given its paths and the bytes of each."""
     # Names the largest, also if only the sum is too much: that value should be stored in another call.
     where, size = max(sizes, key=lambda it: it[1])
-    if size > most.argument:
-        raise BadValue(
-            f"{where}: {size} bytes are more than the server takes in one value, {most.argument} (its setting "
-            "proto-max-bulk-len); store it in parts"
-        )
+    if size > LONGEST:
+        raise BadValue(f"{where}: {size} bytes are more than a server takes in one value, {LONGEST}; store it in parts")
     total = sum([size for _, size in sizes])
-    if total > most.call - _WORDS:
+    if total > LONGEST_CALL - _WORDS:
         raise BadValue(
-            f"{where}: {total} bytes in one call are more than the server takes at once, {most.call - _WORDS} (its "
-            "setting client-query-buffer-limit, less 64 KB); store them in several calls"
+            f"{where}: {total} bytes in one call are more than a server takes at once, {LONGEST_CALL - _WORDS}; store "
+            "them in several calls"
         )
 
 

@@ -64,24 +64,8 @@ class Mirror(Following):
     connection is down, or the copy older than `max_age`, they raise Stale rather than return an old value. With
     `stale="keep"` they return the last known value through an outage. With `ttl` they raise Silent once no update has
     been published for that long, whatever the reason.
-    Use it with `async with`, or `listen()` and `close()`.
-
-    Args:
-        session: The server.
-        keys: The top-level key's names.
-        path: The path below it.
-        max_age: Largest `age` of an answer in seconds, 0.005 at least; None for any, as long as the connection stands.
-            The server is probed three times in that time. Use at least three times the round trip.
-        largest: Bytes of an array up to which it is fetched. A larger one stays at the server, and an object that says
-            what it is (`label`, `size`, `summary`) is in its place, another one when it has changed; None for no limit.
-        stale: What answers do while the connection is down: "raise" Stale, or "keep" the last known value. `age` says
-            how old that is.
-        ttl: Seconds for which answers count, from the arrival of the last published update on this program's clock;
-            None for any. A shorter break of the connection is not noticed, unless `max_age` is given too. What is found
-            at the beginning or after a break does not count until the next update arrives, nor do plain writes.
-
-    Raises:
-        BadType, BadValue: An argument that cannot be used, or `max_age` or `ttl` with `stale="keep"`.
+    Use it with `async with`, or `listen()` and `close()`. `mirror` of an accessor makes one, and explains
+    the arguments.
     """
 
     def __init__(

@@ -39,16 +39,8 @@ class PatternWatch(PatternStream[Update]):
     spells out: of `imu.temp` what is at `imu.temp`, of `robot1.*` all of `robot1`.
 
     In a cluster what is published in the first moment of a key may be told as what it led to, and, if the key is
-    deleted in that moment, once more.
-
-    Args:
-        session: The server.
-        patterns: Globs of paths such as "arm", "cam_*" or "robot.*.battery"; all keys if there is none.
-        policy: What to keep for a loop that is slower than the updates; `Last(1000)` if not given.
-        largest: Bytes of an array up to which it is fetched; None for no limit. See `Mirror`.
-
-    Raises:
-        BadKey: Not a pattern.
+    deleted in that moment, once more. `watch` of a store makes one, and explains
+    the arguments.
     """
 
     def __init__(

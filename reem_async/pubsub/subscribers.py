@@ -90,18 +90,9 @@ class Watch(Stream[Update]):
     """Follows one path and yields its updates, one by one: an async iterator.
 
     Follows from the first `async for` or `async with` on. The first update is the value that is
-    already there, if any (`initial`). Cancelling a waiting loop loses no update. Leaving a loop
-    with `break` keeps following until the watch is closed or dropped.
-
-    Args:
-        session: The server.
-        keys: The top-level key's names.
-        path: The path below it.
-        policy: What to keep for a loop that is slower than the updates.
-        queue: Where they go; a plain queue if not given.
-        stored: Yield what is only stored, too.
-        ttl: Seconds without a published update after which there is silence. Only updates that are not older are
-            yielded then, and one when silence begins (`silent`).
+    already there, if any (`initial`). In asyncio, cancelling a waiting loop loses no update. Leaving a loop
+    with `break` keeps following until the watch is closed or dropped. `watch` of an accessor makes one, and explains
+    the arguments.
     """
 
     def __init__(
@@ -291,11 +282,12 @@ class CallbackSubscriber(SilentSubscriber):
 
     Called as `callback(data, updated_path, **kwargs)`, the first two by name where it has these
     names, in any order, or takes `**kwargs` alone: the whole structure below the channel, and
-    which path was updated, such as "callback_channel.number". Calls are made one after the other,
-    in order. An exception in one is logged and does not end the subscription. SystemExit and
-    KeyboardInterrupt leave the event loop, as from any callback of asyncio. If calls are slower
-    than updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a large update
-    `data` may have later ones in it already, which are called for too.
+    which path was updated, such as "callback_channel.number". Calls are made one after the other, in order: in plain
+    programs on a thread of the subscriber's own, where they may use REEM, in asyncio on the event loop. An exception in
+    one is logged and does not end the subscription. So is SystemExit on a thread, since `sys.exit()` cannot end the
+    program from there, and KeyboardInterrupt, which is also raised in the main thread; in asyncio both leave the event
+    loop. If calls are slower than updates, the oldest of over 1000 waiting ones are dropped; a warning says so. After a
+    large update `data` may have later ones in it already, which are called for too.
 
     A callback with a parameter `update`, or that takes `**kwargs`, gets the `Update` by that name. It says how the call
     came about: after an outage the callback is called with what was found (`update.origin`), which may be old.
@@ -303,7 +295,7 @@ class CallbackSubscriber(SilentSubscriber):
     Args:
         channel: The path to follow.
         interface: The server: a RedisInterface, or what it takes as host.
-        callback_function: A plain function (then it must not block) or a coroutine function.
+        callback_function: The function; in asyncio it must not block, or is a coroutine function.
         kwargs: Keyword arguments for each call.
         policy: What to keep when calls are slower than updates.
         stored: Call for plain writes too, by any client.

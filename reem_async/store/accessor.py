@@ -6,7 +6,7 @@ import builtins
 import operator
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, Self, overload
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 import numpy as np
 
@@ -16,14 +16,14 @@ from ..coordination.calls import call
 from ..coordination.lease import Lease, OwnedPublisher
 from ..coordination.parameters import Parameter, declared, prepared
 from ..coordination.services import QUEUE, Service
-from ..errors import BadKey, BadType, Conflict, Contended, MissingDocument, MissingKey, Misuse, WrongType
-from ..plan.arguments import Handle
+from ..errors import BadKey, BadType, MissingDocument, MissingKey, Misuse, WrongType
+from ..plan.arguments import Handle, cannot_wait
 from ..plan.documents import number_text
 from ..plan.paths import Path, check_element, check_name, parse, show
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
 from .catalog import Outline, outline
-from .document import DocumentWriter
+from .document import DocumentWriter, retried
 from .reader import DocumentReader, opened
 
 if TYPE_CHECKING:
@@ -32,20 +32,15 @@ if TYPE_CHECKING:
 
 _NOTHING: Any = object()
 
-_TRIES = [False] * 49 + [True]  # tries of a call that reads and then writes; whether one is the last
-
-
-def _cannot_calculate(sign: str, call: str, more: str = "") -> str:
-    return f"`{sign}` cannot wait for the server; use: await accessor.{call}{more}"
-
 
 class Accessor(Handle):
     """One place in the dictionary: `kvs["foo"]["bar"]`, `kvs["foo"]["tiles"][0]`.
 
-    It is only a path, immutable and cheap; nothing is sent before a method is awaited. Every method
-    is atomic, may be cancelled at any time (the call is then applied once or not at all) and raises
-    `redis.exceptions.RedisError` if the server or the connection fails. It is not its value: comparing it with one,
-    its truth, arithmetic and the like raise a TypeError that says how to read.
+    It is only a path, immutable and cheap; nothing is sent before a method is called, or in plain programs it is
+    assigned to, deleted from, or changed with `+=`, `-=`, `*=`, `/=`. Every call is atomic, may be cancelled at any
+    time (it is then applied once or not at all) and raises `redis.exceptions.RedisError` if the server or the
+    connection fails. It is not its value: comparing it with one, its truth, arithmetic and the like raise a TypeError
+    that says how to read.
     """
 
     __slots__ = ("_path", "_reader", "_writer")
@@ -60,32 +55,15 @@ class Accessor(Handle):
     def __getitem__(self, key: str | int) -> Accessor:
         return type(self)(self._reader, self._writer, (*self._path, check_element(key, self.full_path)))
 
-    def __setitem__(self, key: str | int, value: Any) -> None:
-        raise BadType(f"assignment cannot wait for the server; use: await accessor[{key!r}].write(value)")
-
-    def __delitem__(self, key: str | int) -> None:
-        raise BadType(f"del cannot wait for the server; use: await accessor[{key!r}].delete()")
-
-    def __iter__(self) -> Any:
-        raise BadType("iterating cannot wait for the server; use: for key in await accessor.keys(), or await .read()")
-
-    def __contains__(self, key: object) -> bool:
-        raise BadType(f"`in` cannot wait for the server; use: await accessor.contains({key!r}), or await .read()")
-
-    def __iadd__(self, number: Any) -> NoReturn:
-        raise BadType(_cannot_calculate("+=", "increment(number)", ", or of a list await accessor.extend(items)"))
-
-    def __isub__(self, number: Any) -> NoReturn:
-        raise BadType(_cannot_calculate("-=", "increment(-number)"))
-
-    def __imul__(self, number: Any) -> NoReturn:
-        raise BadType(_cannot_calculate("*=", "multiply(number)"))
-
-    def __itruediv__(self, number: Any) -> NoReturn:
-        raise BadType(_cannot_calculate("/=", "divide(number)"))
-
-    def __len__(self) -> int:
-        raise BadType("len() cannot wait for the server; use: await accessor.length()")
+    __setitem__ = cannot_wait("assignment", "await accessor[{0!r}].write(value)")
+    __delitem__ = cannot_wait("del", "await accessor[{0!r}].delete()")
+    __iter__ = cannot_wait("iterating", "for key in await accessor.keys(), or await .read()")
+    __contains__ = cannot_wait("`in`", "await accessor.contains({0!r}), or await .read()")
+    __iadd__ = cannot_wait("`+=`", "await accessor.increment(number), or of a list await accessor.extend(items)")
+    __isub__ = cannot_wait("`-=`", "await accessor.increment(-number)")
+    __imul__ = cannot_wait("`*=`", "await accessor.multiply(number)")
+    __itruediv__ = cannot_wait("`/=`", "await accessor.divide(number)")
+    __len__ = cannot_wait("len()", "await accessor.length()")
 
     @property
     def _place(self) -> tuple[object, Path]:
@@ -229,21 +207,19 @@ class Accessor(Handle):
         """Do what `pop` does, with the value here."""
         if len(default) > 1:
             raise BadType(f"pop() takes one default, not {len(default)}")
-        for last in _TRIES:
-            try:
-                before = await self._reader.raw_read(self._path)
-                value = await opened(before)
-                await self._writer.take(self._path, before)
-            except Conflict as error:
-                if last or isinstance(error, Contended):
-                    raise
-            except MissingKey:
-                if not default:
-                    raise
-                return default[0]
-            else:
-                return value
-        raise AssertionError  # the last try returns or raises
+
+        async def attempt() -> Any:
+            before = await self._reader.raw_read(self._path)
+            value = await opened(before)
+            await self._writer.take(self._path, before)
+            return value
+
+        try:
+            return await retried(attempt)
+        except MissingKey as error:
+            if not default:
+                raise error.with_traceback(None) from None
+            return default[0]
 
     async def update(self, values: Mapping[str, Any] | Iterable[tuple[str, Any]] = (), /, **more: Any) -> None:
         """Store each of `values`, and of the named ones, in the dict here, as `dict.update` does: all or none.
@@ -273,19 +249,16 @@ class Accessor(Handle):
 
     async def _read_or_put(self, default: Any) -> Any:
         """Do what `setdefault` does, with the value here."""
-        for last in _TRIES:
+
+        async def attempt() -> Any:
             try:
                 return await self._reader.read(self._path)
             except MissingKey as error:
-                why = error
-            try:
-                await self._writer.put_absent(self._path, default, why)
-            except Conflict as error:
-                if last or isinstance(error, Contended):
-                    raise
-            else:
-                return default
-        raise AssertionError  # the last try returns or raises
+                missing = error
+            await self._writer.put_absent(self._path, default, missing)
+            return default
+
+        return await retried(attempt)
 
     async def type(self) -> builtins.type:
         """Return the Python type of the value here: dict, list, int, float, bool, str, numpy.ndarray, ...
@@ -452,13 +425,20 @@ class Accessor(Handle):
         `await arm.wait_until(predicate, timeout)` waits for a change.
 
         Args:
-            max_age: Largest `age` of an answer in seconds; beyond it, and without a connection, answers raise Stale. It
-                measures the link to the server, not the age of the value, and does not notice a dead publisher.
-            largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one.
-                `kvs["arm"]["image"].read()` fetches it.
+            max_age: Largest `age` of an answer in seconds, 0.005 at least; beyond it, and without a connection, answers
+                raise Stale. It measures the link to the server, not the age of the value, and does not notice a dead
+                publisher. The server is probed three times in that time: use at least three times the round trip.
+            largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one, with
+                its `label`, `size` and `summary`. `kvs["arm"]["image"].read()` fetches it.
             stale: "keep" has answers return the last known value while the connection is down, instead of raising.
-            ttl: Seconds after the last published update in which answers count; then they raise Silent, also if the
-                publisher, the server or the network is gone, or return what is given: `cmd.value(default=STOP)`.
+                `age` says how old that is.
+            ttl: Seconds after the last published update in which answers count, on this program's clock; then they
+                raise Silent, also if the publisher, the server or the network is gone, or return what is given:
+                `cmd.value(default=STOP)`. A shorter break of the connection is not noticed. What is found at the
+                beginning or after a break does not count until the next update arrives, nor do plain writes.
+
+        Raises:
+            BadType, BadValue: An argument that cannot be used, or `max_age` or `ttl` with `stale="keep"`.
         """
         return Mirror(
             self._reader.session,
@@ -726,12 +706,7 @@ class Edit:
 
 
 class Reader:
-    """Reads one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Reads one top-level key."""
 
     def __init__(self, top_key_name: str, interface: RedisInterface) -> None:
         self.interface = interface
@@ -748,12 +723,7 @@ class Reader:
 
 
 class Writer:
-    """Writes one top-level key.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Writes one top-level key."""
 
     _kind: type[DocumentWriter] = DocumentWriter
 

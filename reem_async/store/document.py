@@ -12,7 +12,9 @@ from ..errors import (
     BadKey,
     BadType,
     BadValue,
+    Conflict,
     ConnectionLost,
+    Contended,
     MissingKey,
     MissingTop,
     NotConnected,
@@ -94,6 +96,7 @@ class Turn:
 
 _SILENT_TURN = Turn()
 
+_TRIES = 50  # of a call that reads and then writes
 
 # Seconds, 300 years: servers refuse what leaves 64 bits of milliseconds.
 _LONGEST_EXPIRY = 1e10
@@ -112,6 +115,18 @@ def _may_have_left(error: BaseException) -> bool:
     if isinstance(error, PartialWrite):  # the server could not be reached to remove them
         return isinstance(error.__cause__, NotConnected)
     return not isinstance(error, ReemError) or isinstance(error, ConnectionLost)
+
+
+async def retried(attempt: Callable[[], Awaitable[Any]]) -> Any:
+    """Return the result of a call that reads and then writes, which is tried again if what it read was changed."""
+    for _ in range(_TRIES - 1):
+        try:
+            return await attempt()
+        except Contended:
+            raise
+        except Conflict:
+            continue
+    return await attempt()
 
 
 class DocumentWriter:
@@ -152,7 +167,7 @@ class DocumentWriter:
             await self._set(path, text, attachments)
             return
         if len(text) > HUGE:
-            await self.encoder.check_sizes(path, [text])
+            self.encoder.check_sizes(path, [text])
         await self._set(path, text, ())
 
     def _store(self, assignments: Sequence[Assignment]) -> Awaitable[Any]:
@@ -181,7 +196,7 @@ class DocumentWriter:
         ]
         assignments = [Assignment(place, *it, is_entry=True) for place, it in encoded]
         every = [each for it in assignments for each in it.attachments]
-        await self.encoder.check_sizes(path, [text for _, (text, _) in encoded], every)
+        self.encoder.check_sizes(path, [text for _, (text, _) in encoded], every)
         if assignments:
             await self._store(assignments)
 
@@ -198,7 +213,7 @@ class DocumentWriter:
             text, its = await self.encoder.encoded((*path, -1), value, f"{tail}.{number}")
             texts.append(text)
             attachments.extend(its)
-        await self.encoder.check_sizes(path, texts, attachments)
+        self.encoder.check_sizes(path, texts, attachments)
         if texts:
             await self._demand(self._append, path, texts, tuple(attachments))
 

@@ -7,13 +7,12 @@ import secrets
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import BadValue
 from ..plan import Command
 from ..plan.changes import EncodedAttachment
 from ..plan.documents import Attachment, plain, walk
 from ..plan.keys import Keys
 from ..plan.paths import Path, has_index, show, suffix
-from ..plan.sizes import USUAL, check_sizes, limits, sizes_of
+from ..plan.sizes import check_sizes, sizes_of
 from ..session import Session
 
 HUGE = 256 << 20  # bytes from which the size of a value is checked exactly; a ship may need more than it says
@@ -47,7 +46,7 @@ class Encoder:
         text = self.plain(path, value)
         if text is None:
             return await self.walked(path, value, tail)
-        await self.check_sizes(path, [text])
+        self.check_sizes(path, [text])
         return text, ()
 
     async def walked(self, path: Path, value: Any, tail: str | None = None) -> Encoded:
@@ -69,41 +68,25 @@ class Encoder:
         is_huge = len(found.text) + sum([each.size for each in found.attachments]) > HUGE
         # Before packing too, which copies an array that takes no memory (np.broadcast_to) in full.
         if is_huge and (exact := [each for each in found.attachments if each.ship.describes_exactly]):
-            await self._check_limits([(self._where(each.suffix), each.size) for each in exact])
+            check_sizes([(self._where(each.suffix), each.size) for each in exact])
         attachments = [
             self._packed(each) if each.ship.blob is not None else await self._recorded(each)
             for each in found.attachments
         ]
-        if is_huge:
-            await self._ask_for_limits(path, [found.text], attachments)
+        self.check_sizes(path, [found.text], attachments)
         return found.text, tuple(attachments)
 
-    async def check_sizes(
-        self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment] = ()
-    ) -> None:
+    def check_sizes(self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment] = ()) -> None:
         """Raise BadValue if the server would close the connection because of the size of the call."""
-        if sum(map(len, texts)) + sum([sum(sizes_of(each.commands)) for each in attachments]) > HUGE:
-            await self._ask_for_limits(path, texts, attachments)
-
-    async def _ask_for_limits(
-        self, path: Path, texts: Sequence[bytes], attachments: Sequence[EncodedAttachment]
-    ) -> None:
-        """Check the exact sizes, by the server's limits if they are over the defaults."""
-        sizes = [(show((self._keys.name, *path)), len(text)) for text in texts]
-        for each in attachments:
-            sizes += [(self._where(each.suffix), size) for size in sizes_of(each.commands)]
-        await self._check_limits(sizes)
+        each_size = [(self._where(each.suffix), sizes_of(each.commands)) for each in attachments]
+        if sum(map(len, texts)) + sum([sum(sizes) for _, sizes in each_size]) > HUGE:
+            whole = show((self._keys.name, *path))
+            check_sizes(
+                [(whole, len(text)) for text in texts] + [(where, size) for where, sizes in each_size for size in sizes]
+            )
 
     def _where(self, suffix: str) -> str:
         return self._keys.name + suffix.partition("~")[0]
-
-    async def _check_limits(self, sizes: Sequence[tuple[str, int]]) -> None:
-        # A value within the default limits needs no question.
-        try:
-            check_sizes(sizes, USUAL)
-        except BadValue:
-            at = await self._session.transport.owner(self._keys.document.encode())
-            check_sizes(sizes, await self._session.run(limits(), at))
 
     def _packed(self, attachment: Attachment) -> EncodedAttachment:
         blob = attachment.ship.blob.pack(attachment.value)

@@ -33,7 +33,7 @@ from ..errors import (
 )
 from ..plan.changes import Announcement, EncodedAttachment
 from ..plan.keys import Keys
-from ..plan.paths import Path, below, show
+from ..plan.paths import below, has_index, show
 from ..plan.reads import exists
 from ..plan.sizes import sizes_of
 from ..session import Session
@@ -57,7 +57,7 @@ class Kept(NamedTuple):
     size: int  # bytes
     called: CallTime  # when it was published
     announcements: tuple[Announcement, ...] = ()  # if they have their numbers already
-    removals: int = 0  # how many items had been removed before from the outermost list on the path
+    removals: int = 0  # how many items had been removed from lists before, if the path leads through one
 
     def replaces(self, older: Kept, in_list: bool) -> bool:
         """Return whether nothing of an older update is left after this one; `in_list` if its path leads through one."""
@@ -85,30 +85,26 @@ class UnsentUpdates:
         self.kept: collections.OrderedDict[int, Kept] = collections.OrderedDict()
         self.away = away
         self.sending = self.last = self.done = 0
-        self._put_bytes = self._taken_bytes = 0  # each is changed by one thread
-        self._removals: dict[Path, int] = {}  # of items, by the outermost list
+        self._removals = 0  # of items of lists
 
     @property
     def size(self) -> int:
         """How many bytes are kept, about."""
-        return self._put_bytes - self._taken_bytes
+        return sum([it.size for it in list(self.kept.values())])
 
     def put(self, it: Kept, *, merge: bool = True) -> int:
         """Keep the assignments of a call; return how many older ones they replaced, none without `merge`."""
         first = it.assignments[0]
-        path = first.path
-        # The outermost list on the path. Several assignments are entries of one dict, so they have it in common.
-        outermost = next((path[:place] for place, key in enumerate(path) if isinstance(key, int)), None)
-        if outermost is not None:
-            it = it._replace(removals=self._removals.get(outermost, 0))
-            if first.text is None and isinstance(path[-1], int):
-                self._removals[outermost] = it.removals + 1
+        # Several assignments are entries of one dict, so they have the lists on their paths in common.
+        in_list = has_index(first.path)
+        if in_list:
+            it = it._replace(removals=self._removals)
+            self._removals += first.text is None and isinstance(first.path[-1], int)
         self.last += 1
-        number, self._put_bytes = self.last, self._put_bytes + it.size
+        number = self.last
         self.kept[number] = it  # one step, so an interrupted call has put all or nothing
         if not merge:
             return 0
-        in_list = outermost is not None
         older = [each for each, old in list(self.kept.items()) if each != number and it.replaces(old, in_list)]
         return sum([self._drop(each) for each in older])
 
@@ -125,10 +121,7 @@ class UnsentUpdates:
 
     def _drop(self, number: int) -> int:
         it = self.kept.pop(number, None)  # None: it is being sent
-        if it is None:
-            return 0
-        self._put_bytes -= it.size
-        return len(it.assignments)
+        return 0 if it is None else len(it.assignments)
 
     def take(self) -> tuple[int, Kept] | None:
         """Take the oldest call to send it, and count it as being sent; None if there is none."""
@@ -139,11 +132,9 @@ class UnsentUpdates:
             self.sending = 0
             return None
         self.sending = len(it.assignments)
-        self._taken_bytes += it.size
         return number, it
 
     def put_back(self, number: int, it: Kept) -> None:
-        self._taken_bytes -= it.size
         self.kept[number] = it
         self.kept.move_to_end(number, last=False)
 

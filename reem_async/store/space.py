@@ -52,12 +52,7 @@ class PublishAccessor(Accessor):
 
 
 class Publisher(Writer):
-    """Writes one top-level key and notifies its subscribers, in the same transaction.
-
-    Args:
-        top_key_name: The key.
-        interface: The server.
-    """
+    """Writes one top-level key and notifies its subscribers, in the same transaction."""
 
     _kind = DocumentPublisher
 
@@ -69,33 +64,17 @@ class PublishSpace(KeyValueStore):
     large one is announced, and subscribers fetch the newest.
 
     `outage` is the policy for `write`, `update` and `delete` in an outage (NotConnected, ConnectionLost or
-    ServerNotReady). They raise, or return at once until the server answers again:
-
-    - "drop": Updates are dropped, and counted in `dropped`.
-    - "newest": The newest update of each place is kept, with the bytes and the time of its call, and sent when the
-      server is back, in the order of the calls. A replaced update is counted in `dropped`. Removals of
-      list items are all kept, since an index names another item after each of them. Over 256 MB of values, in all, the
-      oldest of a key are dropped, and counted.
-
-    Nothing is applied twice: an update in progress when the connection broke was applied or not, is not sent again, and
-    counts as dropped. Subscribers see dropped updates like lost ones, by `gap` and `missed`. `append`, `extend` and
-    arithmetic depend on the stored value, so they always raise in an outage; once the server is back they come after
-    the kept updates. A kept update that the server refuses is logged and counted, and closing the interface drops the
-    rest. The beginning and the end of an outage are logged ("reem.publish").
+    ServerNotReady). They raise, or return at once until the server answers again: "drop" drops the updates. "newest"
+    keeps the newest update of each place, up to 256 MB in all, and sends these when the server is back, in the order of
+    the calls, with the bytes and the time of the call. Nothing is applied twice. What is not published, or not for
+    certain, is counted in `dropped`, and subscribers see it by `gap` and `missed`. `append`, `extend` and arithmetic
+    depend on the stored value, so they always raise in an outage. Promise 14 of docs/guarantees.md has the details.
 
     With `wait=False`, `write`, `update` and `delete` encode and queue their updates and return. A background task sends
-    them in the order of the calls. What that means:
-
-    - A read through the same interface may not see the update yet. `flush` waits until it is stored; `append`, `extend`
-      and arithmetic wait for the server, behind what is queued for their key.
-    - Bad input raises in the call. Errors of the server go to `on_error`, or the next call raises the first of them
-      and queues nothing. Each such update is counted in `dropped`.
-    - Up to 32 calls of a key wait. A further one replaces those of the same place and inside it, and they are counted
-      in `dropped`. Over 1000 calls or 256 MB, in all, the oldest of a key are dropped, and counted.
-    - In an outage the queue follows `outage`: "raise" drops what is queued, counts it, and reports the error once;
-      "drop" does so without the error; "newest" keeps it.
-    - Closing the interface, and the end of the program, send what is queued for up to a second; the rest is counted and
-      logged. A killed program loses its queue, and a forked child begins with an empty one.
+    them in the order of the calls. Bad input raises in the call. Errors of the server go to `on_error`, or the next
+    call raises the first of them and queues nothing. If 32 calls of a key wait, a further one replaces those of the
+    same place. A read may not see an update yet: `flush` waits until it is stored. Closing the interface, and the end
+    of the program, send what is queued for up to a second. Promise 25 has the details.
 
     Args:
         interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.

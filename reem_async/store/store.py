@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 from ..concurrency.queues import Policy
 from ..connection import RedisInterface
 from ..errors import BadType, MissingDocument, MissingKey
+from ..plan.arguments import cannot_wait
 from ..plan.paths import parse
 from ..pubsub.pattern_watch import PatternWatch
 from ..session import Session
@@ -67,17 +68,10 @@ class KeyValueStore:
         # Another thread may have made one in between: all use the same.
         return self._tops.setdefault(name, self._accessor(self._accessor._reads(session, name), writer, ()))
 
-    def __setitem__(self, key: str, value: Any) -> None:
-        raise BadType(f"assignment cannot wait for the server; use: await store[{key!r}].write(value)")
-
-    def __delitem__(self, key: str) -> None:
-        raise BadType(f"del cannot wait for the server; use: await store[{key!r}].delete()")
-
-    def __iter__(self) -> Any:
-        raise BadType("iterating cannot wait for the server; use: for key in await store.keys()")
-
-    def __contains__(self, key: object) -> bool:
-        raise BadType(f"`in` cannot wait for the server; use: await store.contains({key!r})")
+    __setitem__ = cannot_wait("assignment", "await store[{0!r}].write(value)")
+    __delitem__ = cannot_wait("del", "await store[{0!r}].delete()")
+    __iter__ = cannot_wait("iterating", "for key in await store.keys()")
+    __contains__ = cannot_wait("`in`", "await store.contains({0!r})")
 
     def at(self, path: str) -> Accessor:
         """Return the accessor of a dotted path such as "foo.bar" or "foo.tiles[2]"; sends nothing.
@@ -172,13 +166,7 @@ class KeyValueStore:
     def track_schema_changes(
         self, set_value: bool | None = None, keys: Iterable[str] | None = None, *, track: bool | None = None
     ) -> None:
-        """Do nothing: old programs set this switch of the first REEM to be quicker. Writes are quick without it.
-
-        Args:
-            set_value: Whether shapes may change.
-            keys: The top-level keys meant; None for all.
-            track: Another name of `set_value`.
-        """
+        """Do nothing: old programs set this switch of the first REEM to be quicker. Writes are quick without it."""
         if set_value is None and track is None:
             raise BadType("track_schema_changes() takes True or False")
 
