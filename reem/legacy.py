@@ -25,7 +25,8 @@ from .accessor import Accessor, PublishAccessor, Publisher
 from .store import KeyValueStore
 
 __all__ = [
-    "ROOT_PATH", "ActiveSubscriberKeyAccessor", "KeyAccessor", "NumpyMarshaller", "PublishWriter",
+    "ROOT_PATH", "ROOT_VALUE_SEQUENCE", "SEPARATOR_CHARACTER", "ActiveSubscriberKeyAccessor", "KeyAccessor",
+    "NumpyMarshaller", "PublishWriter",
     "SpecialDatatypeMarshaller", "TolerantKVSVar", "TolerantKVSVarSubkey", "TolerantKeyValueStore",
     "WriteOnlyKeyAccessor", "append_to_path", "check_valid_key_name", "check_valid_key_name_ext",
     "copy_dictionary_without_paths", "extract_object", "filter_paths_by_prefix", "insert_into_dictionary",

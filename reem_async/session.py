@@ -113,11 +113,9 @@ class Activities:
         self.leases: WeakList[Any] = WeakList()  # of coordination/lease.py
 
     def add_service(self, name: str) -> None:
-        """Note that the program serves `name` from now on."""
         self._serves.append(name)
 
     def remove_service(self, name: str) -> None:
-        """Take back one `add_service`."""
         with contextlib.suppress(ValueError):
             self._serves.remove(name)
 

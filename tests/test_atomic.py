@@ -8,6 +8,7 @@ import contextlib
 import random
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -35,35 +36,6 @@ def assert_not_torn(value):
     assert len(seen) == 1, f"torn: {seen}"
 
 
-class Crew:
-    """Threads that work until told to stop, and whose failures count."""
-
-    def __init__(self):
-        self.failures = []
-        self.over = threading.Event()
-        self.threads = []
-
-    def start(self, work, *arguments):
-        def run():
-            try:
-                work(*arguments)
-            except BaseException as failure:
-                self.failures.append(failure)
-
-        self.threads.append(threading.Thread(target=run))
-        self.threads[-1].start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.over.set()
-        for thread in self.threads:
-            thread.join()
-        if self.failures:
-            raise self.failures[0]
-
-
 # --- torn values -----------------------------------------------------------------------------------
 
 
@@ -78,11 +50,11 @@ def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
             for _ in range(4)
         ]
         stores[0][key()] = {"frame": frame(0, shape)}
-        written = [0, 0]
+        written, over = [0, 0], threading.Event()
 
         def write(me):
             for stamp in range(1 + me, 10**9, 2):
-                if crew.over.is_set():
+                if over.is_set():
                     return
                 if stamp % 5:
                     stores[me][key()]["frame"] = frame(stamp, shape)
@@ -92,19 +64,20 @@ def test_image_and_stamp_are_never_read_apart(server_url, key, shape, reads):
 
         def read(me):
             number = 0
-            while number < reads // 2 or (min(written) < 3 and not crew.failures):
+            while number < reads // 2 or (min(written) < 3 and not any(each.done() for each in writers)):
                 number += 1
                 if number % 3:
                     assert_not_torn(stores[me][key()]["frame"].read())
                 else:
                     assert_not_torn(stores[me][key()].read()["frame"])
 
-        with Crew() as crew:
-            crew.start(write, 0)
-            crew.start(write, 1)
-            with Crew() as readers:
-                readers.start(read, 2)
-                readers.start(read, 3)
+        with ThreadPoolExecutor(4) as pool:
+            writers = [pool.submit(write, me) for me in range(2)]
+            try:
+                list(pool.map(read, range(2, 4)))
+            finally:
+                over.set()
+            assert [each.result() for each in writers] == [None, None]
         assert min(written) >= 3, "a run counts only if there was load"
 
 
@@ -238,9 +211,8 @@ def test_eight_clients_that_change_shapes_lose_nothing_and_leave_no_orphans(serv
             mine, last = _change_shapes(reem.KeyValueStore(opened[me]), top, me, random.Random(seed + me), failed)
             expected[top][mine] = last
 
-        with Crew() as crew:
-            for me in range(8):
-                crew.start(work, me)
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(work, range(8)))
         kvs = reem.KeyValueStore(opened[0])
         for top, entries in expected.items():
             assert_no_orphans(raw, top)

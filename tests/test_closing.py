@@ -132,23 +132,6 @@ async def test_loops_do_not_wait_for_a_task_that_is_slow_to_end(server_url, key)
     await closing
 
 
-def test_a_task_that_is_slow_to_end_keeps_no_connection_open(server_url, key):
-    """The loop of the blocking front waits longer for the end of all than for that of a task."""
-    ship = Slow(1.5)
-    interface = reem.RedisInterface(server_url, ships=[ship], local="off")
-    loop = Waiting(reem.KeyValueStore(interface)[key("other")].watch())
-    slow = reem.SilentSubscriber(key(), interface)
-    slow.listen()
-    reem.PublishSpace(interface)[key()] = {"large": b"slow" + bytes(30_000)}
-    eventually(lambda: ship.begun)
-    followers = interface._followers.session
-    wires = list(followers.subscriptions._wires.values())
-    interface.close()
-    assert loop.ends()
-    assert not any(wire.alive for wire in wires)
-    assert followers.local._off  # the last of what closing does
-
-
 @pytest.fixture
 def short_turns():
     """Threads take turns as often as can be."""

@@ -62,21 +62,15 @@ def test_closing_while_other_threads_call_ends_their_calls_with_interface_closed
         kvs[key()] = {"image": np.zeros((200, 300))}
         ends = []
 
-        def work(kvs=kvs, ends=ends):
+        def until_closed(call, ends=ends):
             try:
                 while True:
-                    kvs[key()].read()
+                    call()
             except BaseException as error:
                 ends.append(error)
 
-        def follow(kvs=kvs, ends=ends):
-            try:
-                while True:
-                    next(iter(kvs[key()].watch()))
-            except BaseException as error:
-                ends.append(error)
-
-        threads = [threading.Thread(target=each, daemon=True) for each in (work, work, follow, follow)]
+        calls = [kvs[key()].read, lambda kvs=kvs: next(iter(kvs[key()].watch()))]
+        threads = [threading.Thread(target=until_closed, args=[call], daemon=True) for call in calls * 2]
         for thread in threads:
             thread.start()
         time.sleep(0.1)

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from conftest import assert_no_orphans, assert_same
 
-import reem
 import reem_async
 from reem_async.concurrency.queues import Every
-from reem_async.errors import Conflict, MissingKey, NotConnected, PathRefused
+from reem_async.errors import Conflict, MissingKey, PathRefused
 from reem_async.plan.arithmetic import calculate, compute
 from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.keys import keys_of
@@ -91,19 +90,6 @@ def test_handles_can_be_pickled(open_front, key):
     front.wait(store.interface.close())
     space.wait(publishing.interface.close())
     space.wait(bare.close())
-
-
-def test_nobody_listening_is_said_with_a_remedy():
-    """The error names `reem up` and the compose file."""
-    import socket
-
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    interface = reem.RedisInterface("127.0.0.1", port=port)
-    with pytest.raises(NotConnected, match=r"(?s)reem up.*compose|compose.*reem up"):
-        interface.initialize()
-    interface.close()
 
 
 # --- publishing: a change and its notice in one transaction, numbered in the order of the calls

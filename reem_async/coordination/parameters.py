@@ -187,9 +187,9 @@ class ParameterGroup:
         self.session = session
         self._keys = keys
         self._parameters: dict[Path, LiveParameter] = {}
-        self._queues: list[BoundedQueue] = []
+        self.queues: list[BoundedQueue] = []  # closed when following ends
         make = partial(Follower, keys, (), session.ships, session.cache, stored=True, largest=_LARGEST)
-        self._link = Link(session, make, self._queues)
+        self._link = Link(session, make, self.queues)
         self._link.on_state = self._take
         self._lock = asyncio.Lock()  # one declaration at a time
         self._restoring: asyncio.Task[Any] | None = None
@@ -230,10 +230,6 @@ class ParameterGroup:
             await self._describe(live)
         except NotAllowed as error:
             logger.warning("%s: tools will not know its type and bounds: %s", live.name, error)
-
-    def add(self, queue: BoundedQueue) -> None:
-        """Have a queue closed when following ends."""
-        self._queues.append(queue)
 
     def _take(self, tree: Any) -> None:
         follower = self._link.follower
@@ -339,7 +335,7 @@ def changes_of(live: LiveParameter, declaration: Declaration) -> tuple[Caller, C
     """Return what calls the `on_change` of a declaration, and the queue of the values that it is called with."""
     on_change, queue = declaration.on_change, ChangeQueue()
     assert on_change is not None
-    live.group.add(queue)
+    live.group.queues.append(queue)
     live.changes.append((queue, declaration.given))
     return Caller(live.name, lambda update: on_change(update.data)), queue
 

@@ -26,27 +26,18 @@ _OPTIONAL = {"low": None, "high": None, "unit": "", "help": "", "choices": ()}
 
 @dataclass(frozen=True)
 class Specification:
-    """What values one parameter may have. `specified` makes and checks it.
+    """What values one parameter may have; see `Accessor.parameter`. `specified` makes and checks it.
 
     Vectors, and bounds that are vectors, are tuples.
-
-    Attributes:
-        type: "bool", "int", "float" or "str"; of vectors with their length, such as "float[3]".
-        default: The value where none is stored.
-        low: The least number, None for no bound; of a vector also one for each element.
-        high: The greatest number, likewise.
-        unit: Such as "1/s".
-        help: What it does, in a line.
-        choices: The values it may have; empty for all of its type.
     """
 
-    type: str
+    type: str  # "bool", "int", "float" or "str"; of vectors with their length, such as "float[3]"
     default: Any
     low: Any = None
     high: Any = None
     unit: str = ""
     help: str = ""
-    choices: tuple[Any, ...] = ()
+    choices: tuple[Any, ...] = ()  # empty for all of its type
 
     def checked(self, where: str, value: Any) -> Any:
         """Return a value as it is kept: a scalar of Python, or a tuple of numbers.

@@ -101,11 +101,7 @@ def _held(keys: Keys, claim: Claim, milliseconds: int) -> HeldLease:
 def acquisition(keys: Keys, claim: Claim, milliseconds: int, *, take: bool) -> Plan:
     """Plan to acquire the lease; the result is a `HeldLease`. Two round trips, again if another client was faster.
 
-    Args:
-        keys: The top-level key.
-        claim: The future owner, number and time left open.
-        milliseconds: How long the lease lasts.
-        take: Whether to take it from another owner.
+    Number and time of the claim are left open. `take` takes the lease from another owner.
 
     Raises (in decode):
         Owned: Another owner has it.

@@ -501,7 +501,7 @@ class Accessor(Handle):
         """Ask the service at this place, and return its answer: `actions = await kvs["policy"].call(image=image)`.
 
         One of the programs that `serve` here calls its function with these arguments, at most once. Arguments and
-        answer are what REEM stores: native values, arrays, what ships carry. Arrays in an answer are read-only.
+        answer are what REEM stores. Arrays in an answer are read-only.
         Nothing is stored under this key; what is sent in passing expires. A call that is left, by cancelling or by its
         timeout, cancels a coroutine function, and is not begun if it still waits.
 

@@ -151,6 +151,7 @@ class Outage:
 
     def __init__(self, session: Session, policy: str) -> None:
         self.policy = policy
+        self.chosen: dict[str, Any] = {"policy": policy}  # of the PublishSpace
         self._session = session
         self.forget()
         session.closing.add(self)
@@ -166,11 +167,6 @@ class Outage:
         self._asking: asyncio.Task[Any] | bool = False
         self._away = False  # the server did not answer the last call or question
         self._reason: Exception = NotConnected("not yet connected")  # why it did not
-
-    @property
-    def chosen(self) -> dict[str, Any]:
-        """The choices of the PublishSpace."""
-        return {"policy": self.policy}
 
     @property
     def dropped(self) -> int:

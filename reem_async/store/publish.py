@@ -82,14 +82,9 @@ class PublishTurn(Turn):
     ) -> UpdateAnnouncement:
         if self.announced:
             return self.announced.pop(0)
-        lease = None if self._lease is None else self._lease()
-        if text is None:
-            announcement = UpdateAnnouncement(self._session, self._keys, self._identity, self.called, deleted)
-        else:
-            announcement = ValueAnnouncement(self._session, self._keys, self._identity, self.called, text, attachments)
-        announcement.lease = lease
-        self._announcements.append(announcement)
-        return announcement
+        made = UpdateAnnouncement(self, deleted) if text is None else ValueAnnouncement(self, text, attachments)
+        self._announcements.append(made)
+        return made
 
     def not_applied(self, count: int) -> None:
         for announcement in reversed(self._announcements[-count:]):
@@ -106,21 +101,19 @@ class UpdateAnnouncement(Announcement):
 
     __slots__ = ("_began", "_deleted", "_everywhere", "_keys", "_made", "_reserved", "_session", "_time", "lease")
 
-    def __init__(
-        self, session: Session, keys: Keys, identity: PublisherIdentity, called: CallTime | None, deleted: bool = False
-    ) -> None:
-        self.lease: HeldLease | None = None  # the owner's, which is renewed with the change
-        self._session = session
-        self._keys = keys
-        self._time = None if called is None else called.wall
-        self._began = None if called is None else called.monotonic
+    def __init__(self, turn: PublishTurn, deleted: bool = False) -> None:
+        # The owner's, which is renewed with the change; first, since it raises LeaseLost if there is none.
+        self.lease = None if turn._lease is None else turn._lease()
+        self._session, self._keys = turn._session, turn._keys
+        self._time = None if turn.called is None else turn.called.wall
+        self._began = None if turn.called is None else turn.called.monotonic
         self._deleted = deleted
         # A number is first reserved, then in a plan (made), then used. `release` gives back a reserved number, `unsent`
         # and `not_applied` one of a plan that was not applied.
-        self._reserved: list[_Stamp] = [identity.stamp(keys)]
+        self._reserved: list[_Stamp] = [turn._identity.stamp(self._keys)]
         self._made: _Stamp = self._reserved[0]
         # In a cluster, clients that find keys by pattern get the first notices of a key on any node.
-        self._everywhere = identity.is_fresh(keys)
+        self._everywhere = turn._identity.is_fresh(self._keys)
 
     def commands(self, path: Path) -> list[Command]:
         notices = self._numbered(path, self._payload)
@@ -175,18 +168,9 @@ class ValueAnnouncement(UpdateAnnouncement):
 
     __slots__ = ("_attachments", "_early", "_is_shared", "_slot", "_text")
 
-    def __init__(
-        self,
-        session: Session,
-        keys: Keys,
-        identity: PublisherIdentity,
-        called: CallTime | None,
-        text: bytes,
-        attachments: Attachments,
-    ) -> None:
-        super().__init__(session, keys, identity, called)
-        self._text = text
-        self._attachments = attachments
+    def __init__(self, turn: PublishTurn, text: bytes, attachments: Attachments) -> None:
+        super().__init__(turn)
+        self._text, self._attachments = text, attachments
         self._slot: Slot | None = None
         self._is_shared = False  # with subscribers on this host, in early mode
         self._early: tuple[_Stamp, bytes] | None = None  # the notice that subscribers near by have, with its number

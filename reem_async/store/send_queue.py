@@ -79,6 +79,7 @@ class SendQueue(Outage):
     def __init__(self, session: Session, policy: str, on_error: Callable[[Exception], object] | None) -> None:
         self._on_error = on_error
         super().__init__(session, policy)
+        self.chosen = {"policy": policy, "wait": False, "on_error": on_error}
 
     def forget(self) -> None:
         super().forget()
@@ -93,10 +94,6 @@ class SendQueue(Outage):
         self._is_outage = False
         # The event loop in which the server has answered; None for the blocking front.
         self._reached: asyncio.AbstractEventLoop | bool | None = False
-
-    @property
-    def chosen(self) -> dict[str, Any]:
-        return {"policy": self.policy, "wait": False, "on_error": self._on_error}
 
     @property
     def dropped(self) -> int:
