@@ -31,16 +31,13 @@ def for_plain_code(text: str) -> str:
 def documented_by(core: type) -> Callable[[Class], Class]:
     """Give each method of a class the docstring of the method of the same name of `core`.
 
-    The class gets what its own docstring lacks: all of a text of which it is the beginning, or the arguments.
+    The class gets that of `core` if its own is the beginning of it.
     """
 
     def decorate(facade: Class) -> Class:
         own, whole = facade.__doc__ or "", for_plain_code(core.__doc__ or "")
         if whole.startswith(own):
             facade.__doc__ = whole
-        elif "Args:" in whole and "Args:" not in own:
-            before = whole[: whole.index("Args:")]
-            facade.__doc__ = own.rstrip() + whole[len(before.rstrip()) :]
         for name, member in vars(facade).items():
             twin = getattr(core, name, None)
             # Properties keep their own text: theirs is one line, and has no word of asyncio.

@@ -41,11 +41,7 @@ __all__ = [
 
 @documented_by(core.Recorder)
 class Recorder:
-    """Records what is published under some patterns of paths, and samples of others, into an MCAP file.
-
-    A context manager: inside of the block it records, in the background. For the rest see
-    `reem_async.recording.Recorder`; the arguments are the same.
-    """
+    """Records what is published under some patterns of paths, and samples of others, into an MCAP file."""
 
     @takes_interface(core.Recorder.__init__)
     def __init__(self, interface: RedisInterface, *given: Any, **options: Any) -> None:
@@ -73,10 +69,7 @@ class Recorder:
 
 @documented_by(core.Replayer)
 class Replayer:
-    """Publishes a recording again: first all that was there at the start, then every update in its turn.
-
-    See `reem_async.recording.Replayer`; the arguments are the same.
-    """
+    """Publishes a recording again: first all that was there at the start, then every update in its turn."""
 
     @takes_interface(core.Replayer.__init__)
     def __init__(self, interface: RedisInterface, *given: Any, **options: Any) -> None:

@@ -16,11 +16,7 @@ from .subscribe import PatternWatch
 
 @documented_by(core.KeyValueStore)
 class KeyValueStore:
-    """The dictionary on the server.
-
-    `kvs["foo"] = value` and `kvs["foo"]["bar"] = value` write; `kvs["foo"]["bar"]` alone is an
-    `Accessor`, a path that is read with `read()`.
-    """
+    """The dictionary on the server."""
 
     _kind: type[core.KeyValueStore] = core.KeyValueStore
     _accessor: type[Accessor] = Accessor

@@ -282,6 +282,9 @@ def test_a_publish_space_refuses_what_would_read(open_front, key):
 async def test_what_cannot_wait_says_what_to_await(akvs, key):
     place = akvs[key()]
     for call, remedy in [
+        (lambda: operator.setitem(akvs, key(), 1), f"await store['{key()}'].write(value)"),
+        (lambda: operator.setitem(place, "a", 1), "await accessor['a'].write(value)"),
+        (lambda: operator.delitem(place, "a"), "await accessor['a'].delete()"),
         (lambda: list(place), "await accessor.keys()"),
         (lambda: "a" in place, "await accessor.contains('a')"),
         (lambda: list(akvs), "await store.keys()"),

@@ -1,6 +1,7 @@
 """Many calls at once, and an event loop that is busy with other things: a time limit counts what the server needs."""
 
 import asyncio
+import contextlib
 import socket
 import time
 
@@ -62,41 +63,37 @@ async def test_calls_made_in_a_turn_that_takes_longer_than_the_limit_are_answere
         assert set(await asyncio.gather(*(accessor.read() for _ in range(20_000)))) == {1}
 
 
-async def test_a_busy_event_loop_connects_and_follows(server_url, key):
-    """Each turn takes 0.06 s, and a handshake about thirty turns, which is longer than its limit of 1 s."""
+@contextlib.asynccontextmanager
+async def busy(seconds):
+    """Inside the block each turn of the event loop takes so long."""
 
-    async def busy():
+    async def work():
         while True:
-            time.sleep(0.06)
+            time.sleep(seconds)
             await asyncio.sleep(0)
 
-    task = asyncio.ensure_future(busy())
+    task = asyncio.ensure_future(work())
     try:
-        async with reem_async.RedisInterface(server_url) as interface:
-            accessor = reem_async.KeyValueStore(interface)[key()]
-            await accessor.write(1)
-            assert (await anext(accessor.watch())).data == 1
+        yield
     finally:
         task.cancel()
+
+
+async def test_a_busy_event_loop_connects_and_follows(server_url, key):
+    """Each turn takes 0.06 s, and a handshake about thirty turns, which is longer than its limit of 1 s."""
+    async with busy(0.06), reem_async.RedisInterface(server_url) as interface:
+        accessor = reem_async.KeyValueStore(interface)[key()]
+        await accessor.write(1)
+        assert (await anext(accessor.watch())).data == 1
 
 
 async def test_a_silent_server_is_given_up_by_a_busy_event_loop_too():
-    server = socket.create_server(("127.0.0.1", 0))  # the kernel takes connections for it
-    port = server.getsockname()[1]
-
-    async def busy():
-        while True:
-            time.sleep(0.02)
-            await asyncio.sleep(0)
-
-    task, began = asyncio.ensure_future(busy()), time.monotonic()
-    try:
-        with pytest.raises(NotConnected):
-            await reem_async.RedisInterface(f"redis://127.0.0.1:{port}").initialize()
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # the kernel takes connections for it
+        began = time.monotonic()
+        async with busy(0.02):
+            with pytest.raises(NotConnected):
+                await reem_async.RedisInterface(f"redis://127.0.0.1:{silent.getsockname()[1]}").initialize()
         assert 0.9 < time.monotonic() - began < 10
-    finally:
-        task.cancel()
-        server.close()
 
 
 async def test_callers_that_wait_for_a_connection_learn_that_none_can_be_made(key):

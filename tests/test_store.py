@@ -23,13 +23,6 @@ from reem_async.store.publish import PublishTurn
 from reem_async.transport.packing import CommandRecorder
 
 
-async def test_assigning_to_an_item_names_the_call_to_await(akvs, key):
-    with pytest.raises(TypeError, match=r"await .*write\("):
-        akvs[key()] = 1
-    with pytest.raises(TypeError, match=r"await .*write\("):
-        akvs[key()]["bar"] = 1
-
-
 async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):
     """Also arrays, which are writable copies inside the block."""
     await akvs[key()].write({"n": 1, "image": np.zeros(3), "gone": np.ones(2)})

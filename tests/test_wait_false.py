@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import redis
 from chaos.proxy import Proxy
+from chaos.servers import PrivateServer
 from conftest import FRONTS, PATIENCE, assert_same, eventually, python, sized, stopped
 
 import reem
@@ -195,13 +196,13 @@ def test_errors_go_to_the_callback(publisher, server, caplog):
 
 
 @pytest.mark.parametrize("policy", ["raise", "drop", "newest"])
-def test_the_server_is_killed_and_comes_back(publisher, tmp_path, policy, caplog):
+def test_the_server_is_killed_and_comes_back(publisher, policy, caplog):
     """With each policy; the call never waits, and what is not stored is counted."""
-    with reem_async.server.embedded.EmbeddedServer(directory=tmp_path) as server:
-        front, port, errors = publisher(f"redis://127.0.0.1:{server.port}", policy), server.port, 0
+    with PrivateServer(keep=True) as server:
+        front, errors = publisher(server.url, policy), 0
         front.write(["a"], {"x": 0})
         front.flush()
-        os.kill(server.pid, signal.SIGKILL)
+        server.kill()
         for number in range(1, 201):
             try:
                 front.write(["a", "x"], number)
@@ -212,7 +213,7 @@ def test_the_server_is_killed_and_comes_back(publisher, tmp_path, policy, caplog
         dropped = front.kvs.dropped
         assert dropped + front.kvs.waiting + errors == 200
         assert (errors > 0) == (policy == "raise")
-    with reem_async.server.embedded.EmbeddedServer(directory=tmp_path, port=port) as server:
+        server.start()
         front.until(lambda: "the server answers again" in caplog.text)
         with contextlib.suppress(NotConnected):
             front.flush()

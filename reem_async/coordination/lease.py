@@ -61,10 +61,6 @@ class Lease:
         """Whether the program owns the key, as far as is known. Another thread may ask, so nothing is noted."""
         return not self._lost and time.monotonic() - self._renewed <= self._milliseconds / 1000
 
-    @property
-    def number(self) -> int:
-        return self.held.claim.number if self.held is not None else 0
-
     def _reason(self) -> str:
         if not self._lost and time.monotonic() - self._renewed > self._milliseconds / 1000:
             self._lost = f"the lease was not renewed for over {self._milliseconds / 1000:g} s, and has expired"

@@ -635,7 +635,7 @@ class OwnedAccessor(Accessor):
     @property
     def fence(self) -> int:
         """The fencing number of this acquisition, which its updates carry: higher than that of any owner before."""
-        return self._lease.number
+        return self._lease.held.claim.number if self._lease.held is not None else 0
 
     async def acquire(self) -> None:
         """Become the owner, as entering the block does; three round trips.

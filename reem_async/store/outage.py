@@ -42,7 +42,7 @@ from .document import Assignment, CallTime, DocumentWriter, Turn
 logger = logging.getLogger("reem.publish")
 
 _PAUSES = (0.02, 0.05, 0.1, 0.2, 0.25)  # seconds between two attempts to reach the server; the last one repeats
-_LOOKS = (0.0005, 0.001, 0.002, 0.005)  # seconds between two looks of `flush` at what is unsent; the last one repeats
+_LOOK = 0.001  # seconds between two looks of `flush` at what is unsent
 _MOST = 256 << 20  # bytes of kept values, of all keys together
 _OVERHEAD = 500  # bytes that a kept value needs besides its content, about
 _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
@@ -394,13 +394,12 @@ class Outage:
 
     async def _is_sent_within(self, seconds: float) -> bool:
         await self._wake()
-        deadline, looks = time.monotonic() + seconds, 0
+        deadline = time.monotonic() + seconds
         for document, out, last in [(document, out, out.last) for document, out in list(self._out.items())]:
             while out.done < last and self._out.get(document) is out:
                 if time.monotonic() >= deadline:
                     return False
-                await self._session.transport.pause(_LOOKS[min(looks, len(_LOOKS) - 1)])
-                looks += 1
+                await self._session.transport.pause(_LOOK)
         return True
 
     async def _wake(self) -> None:

@@ -32,8 +32,8 @@ def without_options(interface: Interface, options: Mapping[str, Any]) -> Interfa
 class KeyValueStore:
     """The dictionary on the server.
 
-    `kvs["foo"]["bar"]` is an `Accessor`: a path, nothing is sent yet; `await` its `read()`,
-    `write(value)` and so on.
+    `kvs["foo"]["bar"]` is an `Accessor`: a path, nothing is sent yet. In plain programs `kvs["foo"] = value` and
+    `kvs["foo"]["bar"] = value` write, and `read()` reads; in asyncio `await` its `read()`, `write(value)` and so on.
 
     Args:
         interface: The server: a RedisInterface, another store, or what RedisInterface takes as host.

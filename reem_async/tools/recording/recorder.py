@@ -81,7 +81,7 @@ class RecorderStatus:
 class Recorder:
     """Records what is published under some patterns of paths, and samples of others, into an MCAP file.
 
-    An asynchronous context manager: inside of the block it records. Small values come with their
+    A context manager: inside of the block it records. Small values come with their
     notices, large ones are fetched, the newest only; both are as they were published, bit for bit, and in this order.
     A large one that others changed inside before it was fetched is skipped, and counted; what is left of it is
     recorded as found, so that the updates inside of it have their place. At the
