@@ -157,17 +157,13 @@ class Portal:
                     async with asyncio.timeout(_LONGEST_LAST):
                         await self._last()
         finally:
-            await self._end_tasks()
-
-    async def _end_tasks(self) -> None:
-        """Cancel what still runs, including calls that were handed over just before the end."""
-        # One turn of the loop: calls that were handed over but not begun become tasks.
-        await asyncio.sleep(0)
-        left = asyncio.all_tasks() - {asyncio.current_task()}
-        for task in left:
-            task.cancel()
-        if left:
-            await asyncio.wait(left, timeout=1.0)
+            # One turn of the loop: calls that were handed over but not begun become tasks. Then all are cancelled.
+            await asyncio.sleep(0)
+            left = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in left:
+                task.cancel()
+            if left:
+                await asyncio.wait(left, timeout=1.0)
 
     @property
     def inside(self) -> bool:

@@ -8,7 +8,7 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Self, overload
 
-from reem_async.coordination.parameters import Declaration, prepared
+from reem_async.coordination.parameters import prepared
 from reem_async.coordination.services import QUEUE
 from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
@@ -144,7 +144,9 @@ class Accessor(Handle):
     call = waits(core.Accessor.call, FOLLOWER)
     own = makes(core.Accessor.own, lambda interface, inner: OwnedAccessor(interface, inner))
     # The arguments are checked here, and declared on the background loop.
-    parameter = makes(core.Accessor.parameter, declared, lambda self: SimpleNamespace(parameter=self._prepared))
+    parameter = makes(
+        core.Accessor.parameter, declared, lambda self: SimpleNamespace(parameter=partial(prepared, self.full_path))
+    )
     _ipython_key_completions_ = known_keys
 
     # Not by way of the methods: an error that says it all shows one frame less.
@@ -174,9 +176,6 @@ class Accessor(Handle):
     @property
     def _place(self) -> tuple[object, Path]:
         return self._interface, self.full_path
-
-    def _prepared(self, name: str, default: Any, **options: Any) -> Declaration:
-        return prepared(self.full_path, name, default, **options)
 
     def _follower(self) -> core.Accessor:
         """Return the core's accessor on the background loop: connections of the caller's thread only ask and answer."""

@@ -86,7 +86,13 @@ class _Background:
     def _begun(self) -> tuple[Portal | LastPortal, reem_async.RedisInterface]:
         # After a fork it is the parent's: what was made from it goes on here, and ends with the rest.
         before = [*self._made.values()]
-        interface = before[0][1] if before else self._new_interface()
+        if before:
+            interface = before[0][1]
+        else:
+            host, ships, settings = self._direct._given
+            # The other one has the name.
+            interface = reem_async.RedisInterface(host, ships, **{**settings, "name": None})
+            interface.session.share_with(self._direct.session)
         portal = LastPortal() if _exiting else Portal("reem-loop")
         # One step of C, so of two threads that come here at once the second finds what the first has made.
         made = self._made.setdefault(os.getpid(), (portal, interface))
@@ -99,13 +105,6 @@ class _Background:
             self.stop()
             raise
         return made
-
-    def _new_interface(self) -> reem_async.RedisInterface:
-        host, ships, settings = self._direct._given
-        # The other one has the name.
-        interface = reem_async.RedisInterface(host, ships, **{**settings, "name": None})
-        interface.session.share_with(self._direct.session)
-        return interface
 
     def close(self) -> None:
         """Close all connections and end the loop. Idempotent; a caller that was interrupted may call it again."""

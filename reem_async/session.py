@@ -93,7 +93,7 @@ class PublisherIdentity:
         return last is not None and time.monotonic() < last[3]
 
     def recent(self, seconds: float) -> list[str]:
-        """Return the channels of the keys that it has published in the last seconds, the newest first."""
+        """Return the channels of the keys published in the last seconds, the newest first."""
         since = time.monotonic() - seconds
         if self._pid != os.getpid():  # what is there was published by the parent
             return []

@@ -123,13 +123,6 @@ def _renewal(keys: Keys, node_id: str, said: dict[str, Any]) -> Plan:
     return Plan(commands, lambda replies: _raise_refused(replies, commands))
 
 
-def _departure(keys: Keys, ids: Sequence[str]) -> Plan:
-    """Plan to remove nodes. What the user may not remove expires."""
-    return Plan(
-        [("UNLINK", _key(keys, node_id)) for node_id in ids] + [("SREM", _index(keys), *ids)], lambda replies: None
-    )
-
-
 def _listing(keys: Keys) -> Plan:
     """Plan to read all nodes, by id; two round trips, and a third one if some have left without a word."""
     list_ids: Command = ("SMEMBERS", _index(keys))
@@ -252,7 +245,9 @@ class Presence:
         keys = _group(session)
         with contextlib.suppress(ReemError, RedisError, OSError), timeout(min(_FAREWELL, time_limit(_FAREWELL))):
             async with session.transport.ordered(_index(keys)):
-                await session.run(_departure(keys, [node_id]))
+                # What the user may not remove expires.
+                commands: list[Command] = [("UNLINK", _key(keys, node_id)), ("SREM", _index(keys), node_id)]
+                await session.run(Plan(commands, lambda replies: None))
 
 
 class NodeWatch(Stream[NodeEvent]):

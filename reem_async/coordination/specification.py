@@ -211,15 +211,12 @@ def _bound(where: str, value: Any, kind: str) -> Any:
     if value is None:
         return None
     scalar, _, length = kind.partition("[")
+    is_vector = _is_vector(value)
     # Bounds of whole numbers may be floats, as in low=0.0.
-    numbers = "float" if scalar == "int" and _has_floats(value) else scalar
-    whole = f"{numbers}[{length}" if length and _is_vector(value) else numbers
+    has_floats = any(_scalar_type(item) == "float" for item in (_items(value) if is_vector else [value]))
+    numbers = "float" if scalar == "int" and has_floats else scalar
+    whole = f"{numbers}[{length}" if length and is_vector else numbers
     return _converted(where, value, whole)
-
-
-def _has_floats(value: Any) -> bool:
-    items = _items(value) if _is_vector(value) else [value]
-    return any(_scalar_type(item) == "float" for item in items)
 
 
 def _choices(where: str, choices: Iterable[Any], kind: str) -> tuple[Any, ...]:

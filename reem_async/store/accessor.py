@@ -542,12 +542,11 @@ class Accessor(Handle):
 
         A plain function runs on a thread of REEM's own, and may use REEM. In asyncio a coroutine function runs on the
         event loop and is cancelled when its caller leaves; it must not block. An exception reaches the caller as
-        RemoteError. Several programs, and several functions in one, may serve the same place: they share the calls.
+        RemoteError. Programs, and functions in one, that serve the same place share the calls.
 
-        In plain programs it has begun when this returns. In asyncio it begins in the background, and is tried again
-        until there is a server; `async with` and `await service.listen()` return when it has begun, and raise what
-        prevents it. It ends with `close()`, with the interface, or with the program, which it does not keep from
-        ending: `await service.wait()` is the last line of a program that only serves. A forked child does not serve.
+        In plain programs it has begun when this returns. In asyncio it begins in the background, as soon as there is a
+        server; `async with` and `await service.listen()` return when it has begun, and raise what prevents it. It ends
+        with `close()`, the interface or the program: `await service.wait()` keeps one that only serves.
 
         Args:
             function: What answers. It gets the arguments of a call by name; arrays are read-only.
@@ -576,14 +575,10 @@ class Accessor(Handle):
         after the last write; `await cmd.renew()` renews it without one. Leaving the block releases it. Programs that
         do not call `own` are not kept from writing: readers with a `ttl` ignore them while there is an owner.
 
-        Entering takes three round trips and makes a connection that the owner keeps. It raises:
-
-        - Owned: Another program owns the key. The error says which, and for how long.
-        - NotAllowed: The user lacks a right; the error names it.
-
-        A write raises LeaseLost, with nothing written, if the lease has expired or another owner has it; then
-        `cmd.lost` is true. To own the key again, call `await cmd.acquire()` or enter another `own`. If the connection
-        breaks, a write raises as in a PublishSpace; the next one reconnects, and is made if the lease is still there.
+        Entering takes three round trips and makes a connection that the owner keeps. It raises Owned if another program
+        owns the key, NotAllowed if a right is missing. A write raises LeaseLost, with nothing written, if the lease has
+        expired or another owner has it; then `cmd.lost` is true, and `await cmd.acquire()` owns the key again. If the
+        connection breaks, the next write reconnects, and is made if the lease is still there.
 
         Args:
             ttl: Seconds for which the lease lasts after each write, 0.001 to 3600. Write at least twice as often.

@@ -153,7 +153,6 @@ class DocumentWriter:
         return type(self)
 
     async def check(self, value: Any) -> None:
-        """Raise BadInput if `value` cannot be stored as the whole document."""
         await self.encoder.encoded((), value)
 
     async def set(self, path: Path, value: Any) -> None:
@@ -205,7 +204,6 @@ class DocumentWriter:
         await self._store([Assignment(path, None)])
 
     async def extend(self, path: Path, values: Sequence[Any]) -> None:
-        """Append `values` to the list at `path`, all or none."""
         tail = unique_tail()
         texts: list[bytes] = []
         attachments: list[EncodedAttachment] = []
@@ -218,7 +216,6 @@ class DocumentWriter:
             await self._demand(self._append, path, texts, tuple(attachments))
 
     async def calculate(self, path: Path, command: str, operation: Operation, operand: float) -> Any:
-        """Apply a JSON arithmetic command; returns the new number."""
         text = number_text(operand, (self.name, *path))
         if isinstance(operand, np.generic):
             operand = operand.item()
@@ -229,7 +226,6 @@ class DocumentWriter:
         return await self._demand(self._calculate, plan)
 
     async def compute(self, path: Path, function: Any) -> Any:
-        """Replace the number at `path` by a function of it; returns the new number."""
 
         def plan(announcement: Announcement) -> Plan:
             return compute(self.keys, path, function, announcement, self.session.cache)
@@ -254,7 +250,6 @@ class DocumentWriter:
         await self._demand(self._expire, None if seconds is None else _milliseconds(seconds, self.name))
 
     async def take(self, path: Path, before: RawRead) -> None:
-        """Remove the value at `path` if it is still `before`; raises Conflict."""
         await self._demand(self._take, path, before)
 
     async def in_turn(self, send: Callable[..., Awaitable[Any]], *what: Any) -> Any:

@@ -89,7 +89,6 @@ class UnsentUpdates:
 
     @property
     def size(self) -> int:
-        """How many bytes are kept, about."""
         return sum([it.size for it in list(self.kept.values())])
 
     def put(self, it: Kept, *, merge: bool = True) -> int:
@@ -109,11 +108,9 @@ class UnsentUpdates:
         return sum([self._drop(each) for each in older])
 
     def drop_first(self) -> int:
-        """Drop the oldest call; return how many updates it had."""
         return self._drop(next(iter(list(self.kept)), 0))
 
     def drop_all(self) -> int:
-        """Drop all calls; return how many updates they had."""
         numbers = list(self.kept)
         count = sum([self._drop(number) for number in numbers])
         self.done = max(self.done, *numbers, 0)
@@ -140,7 +137,6 @@ class UnsentUpdates:
 
     @property
     def count(self) -> int:
-        """How many updates are unsent."""
         return sum([len(it.assignments) for it in list(self.kept.values())]) + self.sending
 
 
@@ -410,7 +406,6 @@ class Outage:
         """Prepare for the end of the interface, or of the program."""
 
     def close(self) -> None:
-        """Drop the kept updates."""
         self._is_closed = True
         left, self._out = self._out, {}
         counts = [(out.writer.keys, out.drop_all()) for out in left.values()]
