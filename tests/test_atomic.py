@@ -95,17 +95,7 @@ def test_a_plain_read_is_one_command_and_a_plain_write_needs_no_transaction(fron
     front.write([key()], {"n": 2, "x": 0.25})
     with nothing_sent(raw):
         pass
-    for name in (
-        "eval",
-        "evalsha",
-        "fcall",
-        "script",
-        "function",
-        "keys",
-        "flushall",
-        "flushdb",
-        "config|set",
-    ):
+    for name in ["eval", "evalsha", "fcall", "script", "function", "keys", "flushall", "flushdb", "config|set"]:
         assert not commands_run(raw).get(name), f"{name} was used"
 
 

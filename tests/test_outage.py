@@ -18,7 +18,7 @@ from conftest import FRONTS, PATIENCE, aeventually, assert_same, eventually, siz
 import reem
 import reem_async
 from reem_async.concurrency.queues import Every
-from reem_async.errors import BadValue, ConnectionLost, NotConnected
+from reem_async.errors import ConnectionLost, NotConnected
 from reem_async.plan.trees import MISSING, CannotApply, removed, replaced
 from reem_async.store import outage
 from reem_async.store.document import Assignment
@@ -56,12 +56,6 @@ def lose(front, server):
     front.write(["lost"], 0)
     server.kill()
     front.write(["lost"], 1)
-
-
-def test_what_is_no_policy_is_refused():
-    for package in (reem, reem_async):
-        with pytest.raises(BadValue, match="'raise', 'drop' or 'newest'"):
-            package.PublishSpace(package.RedisInterface("redis://127.0.0.1:1"), outage="keep")
 
 
 def test_a_publisher_raises_unless_it_says_otherwise(publisher, server):

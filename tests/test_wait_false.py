@@ -59,6 +59,7 @@ def test_choices_that_mean_nothing_are_refused():
             ({"on_error": print}, BadValue),
             ({"wait": False, "on_error": "log"}, BadType),
             ({"wait": False, "outage": "keep"}, BadValue),
+            ({"outage": "keep"}, BadValue),
         ):
             with pytest.raises(error, match=r"wait=|on_error=|outage="):
                 package.PublishSpace(interface, **choices)
