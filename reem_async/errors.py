@@ -9,6 +9,58 @@ from __future__ import annotations
 import redis.exceptions
 from redis.exceptions import RedisError as RedisError
 
+__all__ = [
+    "BadData",
+    "BadInput",
+    "BadKey",
+    "BadType",
+    "BadValue",
+    "Busy",
+    "CallTimeout",
+    "ClusterNode",
+    "Conflict",
+    "ConnectionLost",
+    "Contended",
+    "InsecureConnection",
+    "InterfaceClosed",
+    "LeaseLost",
+    "LoginRefused",
+    "MissingDocument",
+    "MissingKey",
+    "MissingTop",
+    "Misuse",
+    "NoJsonSupport",
+    "NoService",
+    "NotAllowed",
+    "NotConnected",
+    "NotFinite",
+    "Overflow",
+    "Owned",
+    "PartialWrite",
+    "PathRefused",
+    "QueueFull",
+    "ReadOnly",
+    "ReemError",
+    "Refused",
+    "RemoteError",
+    "ServerFailed",
+    "ServerFull",
+    "ServerMissing",
+    "ServerNotReady",
+    "ServerReadOnly",
+    "ServiceError",
+    "ServiceLost",
+    "Silent",
+    "Stale",
+    "TlsRefused",
+    "TooDeep",
+    "WriteOnly",
+    "WrongKind",
+    "WrongLoop",
+    "WrongType",
+]
+
+
 ClusterReply = (
     redis.exceptions.AskError  # MovedError is one of them
     | redis.exceptions.ClusterCrossSlotError
@@ -320,10 +372,3 @@ def turned_down(error: Exception) -> Refused:
     elif isinstance(error, redis.exceptions.ClusterDownError):
         fact = "the server is a node of a Redis Cluster that does not serve this key at the moment"
     return ClusterNode(f"{fact} (it says: {error!s:.120})", ALL_NODES)
-
-
-__all__ = [
-    name
-    for name, kind in vars().items()
-    if isinstance(kind, type) and issubclass(kind, ReemError | Warning) and kind.__module__ == __name__
-]

@@ -1,5 +1,6 @@
 """The two fronts agree: the same names, the same parameters, the same promises in their docstrings."""
 
+import ast
 import importlib
 import inspect
 
@@ -148,6 +149,17 @@ def test_tools_have_the_same_names_and_parameters(module):
             assert {each for each in used if not each.startswith("_")} <= {*dir(mine)}, name
         elif name != "describe":  # its blocking form says whose result it returns
             assert mine.__doc__ == core.__doc__, name
+
+
+def test_type_checkers_know_every_error():
+    """They read the list as it is written; `reem` and `reem.errors` export by it."""
+    (listed,) = (
+        ast.literal_eval(node.value)
+        for node in ast.parse(inspect.getsource(errors)).body
+        if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"
+    )
+    kinds = [each for each in vars(errors).values() if inspect.isclass(each) and each.__module__ == errors.__name__]
+    assert set(listed) == {kind.__name__ for kind in kinds}
 
 
 def test_errors_policies_and_ships_are_the_very_same_objects():
