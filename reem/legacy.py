@@ -141,6 +141,11 @@ class TolerantKeyValueStore(KeyValueStore):
         return TolerantKVSVar(self, path, self.defaultVarRefreshRate if refreshRate is None else refreshRate)
 
 
+def _changing(change: Callable[..., object]) -> Callable[[Any, Any], TolerantKVSVar]:
+    """Return a method of a variable for an augmented assignment."""
+    return lambda self, value: self._do(lambda: change(self.node, value))
+
+
 class TolerantKVSVar:
     """A variable for one place of a store: `get`, `set`, `[]`, `del`, `type`, `len`, `+=` and so on, `append`.
 
@@ -214,17 +219,8 @@ class TolerantKVSVar:
     def __len__(self) -> int:
         return len(self._current()) if self.refreshRate else len(self.node)
 
-    def __iadd__(self, value: Any) -> TolerantKVSVar:
-        return self._do(lambda: self.node.add(value))
-
-    def __isub__(self, value: Any) -> TolerantKVSVar:
-        return self._do(lambda: self.node.decrement(value))
-
-    def __imul__(self, value: Any) -> TolerantKVSVar:
-        return self._do(lambda: self.node.multiply(value))
-
-    def __itruediv__(self, value: Any) -> TolerantKVSVar:
-        return self._do(lambda: self.node.divide(value))
+    __iadd__, __isub__ = _changing(Accessor.add), _changing(Accessor.decrement)
+    __imul__, __itruediv__ = _changing(Accessor.multiply), _changing(Accessor.divide)
 
     def append(self, value: Any) -> None:
         """Append to the list that is the value."""
