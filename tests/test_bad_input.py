@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import asyncio
 import collections
 import dataclasses
 import datetime
@@ -29,7 +28,6 @@ from reem_async.errors import (
     ReemError,
     TooDeep,
     WrongKind,
-    WrongLoop,
 )
 
 
@@ -296,23 +294,6 @@ def test_a_closed_interface_says_so(open_front, key):
         for call in (lambda: front.read([key()]), lambda: front.write([key()], 2)):
             with pytest.raises(InterfaceClosed):
                 call()
-
-
-def test_an_async_interface_in_a_second_loop_says_so(server_url, key):
-    """It is bound to the loop that used it first."""
-    import reem_async
-
-    with asyncio.Runner(loop_factory=asyncio.new_event_loop) as first:
-        interface = reem_async.RedisInterface(server_url)
-        first.run(interface.initialize())
-        kvs = reem_async.KeyValueStore(interface)
-
-        async def read():
-            return await kvs[key()].read()
-
-        with asyncio.Runner(loop_factory=asyncio.new_event_loop) as second, pytest.raises(WrongLoop):
-            second.run(read())
-        first.run(interface.close())
 
 
 def test_a_wrong_option_is_a_type_error():

@@ -103,7 +103,7 @@ def test_a_quiet_owner_cannot_resume(front, raw, key, how):
             time.sleep(0.4)
             front.wait(cmd.renew())
         front.wait(cmd.write(1))
-        cmd_lease = (cmd._core if hasattr(cmd, "_core") else cmd)._lease
+        cmd_lease = (cmd._core if hasattr(cmd, "_core") else cmd)._writer.lease
         cmd_lease._milliseconds = 10_000  # or this process's clock would tell, too
         time.sleep(1.1)
     elif how == "removed":

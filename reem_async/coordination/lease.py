@@ -98,7 +98,6 @@ class Lease:
         self._renewed = time.monotonic()
 
     async def acquire(self) -> None:
-        """Acquire the lease; three round trips and a connection."""
         self.check_process()
         claim = self._claim._replace(process=os.getpid(), token=secrets.token_hex(8))
         plan = acquisition(self.keys, claim, self._milliseconds, take=self._take)
@@ -110,7 +109,6 @@ class Lease:
             await self.connection.open()
 
     async def renew(self) -> None:
-        """Renew the lease without a write; one round trip. Raises LeaseLost."""
         async with self._session.transport.ordered(self.keys.channel):
             await self.confirm()
 
@@ -306,12 +304,12 @@ class OwnedPublisher(DocumentPublisher):
 
     def __init__(self, lease: Lease, session: Session) -> None:
         super().__init__(session, lease.keys.name)
-        self._lease = lease
+        self.lease = lease
         self._run = lease.run  # over the owner's connection
 
     def turn(self, identity: PublisherIdentity | None = None) -> PublishTurn:
-        return PublishTurn(self.session, self.keys, identity, self._lease.check)
+        return PublishTurn(self.session, self.keys, identity, self.lease.check)
 
     async def _expire(self, turn: Any, milliseconds: int | None) -> None:
-        await self._lease.confirm()
+        await self.lease.confirm()
         await super()._expire(turn, milliseconds)

@@ -594,7 +594,8 @@ class Accessor(Handle):
                 f"{show(self.full_path)}: only a whole top-level key can be owned; use kvs[{self._reader.name!r}].own()"
             )
         session = self._reader.session
-        return OwnedAccessor.of(self._reader, Lease(session, self._reader.keys, ttl, name, take))
+        lease = Lease(session, self._reader.keys, ttl, name, take)
+        return OwnedAccessor(self._reader, OwnedPublisher(lease, session), ())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return rebuilt, (type(self), self._writer.maker(), self._reader.session, self.full_path)
@@ -608,15 +609,8 @@ def rebuilt(kind: Any, writer: Any, session: Session, path: tuple[Any, ...]) -> 
 class OwnedAccessor(Accessor):
     """A top-level key that this program owns: what `Accessor.own` returns. See there."""
 
-    __slots__ = ("_lease",)
-    _lease: Lease
-
-    @classmethod
-    def of(cls, reader: DocumentReader, lease: Lease) -> OwnedAccessor:
-        """Return the handle of a lease, which is not acquired yet."""
-        made = cls(reader, OwnedPublisher(lease, reader.session), ())
-        made._lease = lease
-        return made
+    __slots__ = ()
+    _writer: OwnedPublisher
 
     def __getitem__(self, key: str | int) -> Accessor:
         # Only the top-level key is owned, acquired and released.
@@ -625,12 +619,13 @@ class OwnedAccessor(Accessor):
     @property
     def lost(self) -> bool:
         """Whether the next write raises LeaseLost, as far as is known without asking the server."""
-        return self._lease.lost
+        return self._writer.lease.lost
 
     @property
     def fence(self) -> int:
         """The fencing number of this acquisition, which its updates carry: higher than that of any owner before."""
-        return self._lease.held.claim.number if self._lease.held is not None else 0
+        held = self._writer.lease.held
+        return 0 if held is None else held.claim.number
 
     async def acquire(self) -> None:
         """Become the owner, as entering the block does; three round trips.
@@ -639,7 +634,7 @@ class OwnedAccessor(Accessor):
             Owned: Another program owns the key.
             NotAllowed: The user lacks a right.
         """
-        await self._lease.acquire()
+        await self._writer.lease.acquire()
 
     async def renew(self) -> None:
         """Renew the lease without a write. One round trip, two in a cluster.
@@ -647,14 +642,14 @@ class OwnedAccessor(Accessor):
         Raises:
             LeaseLost: It has expired, or another owner has it.
         """
-        await self._lease.renew()
+        await self._writer.lease.renew()
 
     async def release(self) -> None:
         """Stop to be the owner: others need not wait until the lease expires. One round trip, two in a cluster.
 
         Nothing is done if this is not the owner, or if the server cannot be reached. Idempotent.
         """
-        await self._lease.release()
+        await self._writer.lease.release()
 
     async def __aenter__(self) -> Self:
         await self.acquire()
