@@ -2,10 +2,8 @@
 
 import asyncio
 import contextlib
-import errno
 import gc
 import os
-import threading
 import time
 import weakref
 
@@ -15,7 +13,7 @@ from conftest import FRONTS, PATIENCE, aeventually, eventually, python
 import reem
 import reem_async
 from reem_async import CallbackSubscriber, PublishSpace, RedisInterface, SilentSubscriber
-from reem_async.concurrency.queues import BoundedQueue, Ended, Every, Last
+from reem_async.concurrency.queues import Every
 from reem_async.concurrency.timeouts import time_limit
 from reem_async.errors import WrongLoop
 
@@ -218,37 +216,6 @@ async def test_a_time_limit_for_listen_is_not_one_for_the_calls(ainterface, apsp
         await apspace[key()].write(1)
         await aeventually(lambda: limits == [7.0])
     await subscriber.close()
-
-
-@pytest.mark.parametrize("policy", [Last(100), Every(100)], ids=["last", "every"])
-@pytest.mark.parametrize("descriptors", ["left", "used up"])
-def test_any_number_of_threads_may_wait_at_a_queue(policy, descriptors, monkeypatch):
-    """Each item is taken once, and closing ends all who wait; also where the system gives nothing to wait at."""
-    if descriptors == "used up":
-        monkeypatch.setattr(os, "pipe", none_left)
-    queue, taken, over = BoundedQueue(policy), [], []
-
-    def take():
-        try:
-            while True:
-                taken.append(queue.take_waiting())
-        except Ended:
-            over.append(threading.current_thread())
-
-    threads = [threading.Thread(target=take, daemon=True) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    for number in range(100):
-        queue.put(number)
-    queue.close()
-    for thread in threads:
-        thread.join(PATIENCE)
-    assert sorted(taken) == list(range(100))
-    assert len(over) == 4
-
-
-def none_left(*_):
-    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")

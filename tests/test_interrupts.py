@@ -1,5 +1,6 @@
 """Ctrl-C ends any blocking call and leaves the interface usable; a handler of SIGTERM may close it."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -144,9 +145,16 @@ def test_a_queue_that_may_drop_nothing_fails_after_what_it_has():
         box.take_waiting()
 
 
+def none_left(*_):
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+
+@pytest.mark.parametrize("descriptors", ["left", "used up"])
 @pytest.mark.parametrize("policy", [Newest(), Last(3)])
-def test_several_threads_take_from_a_queue_while_one_puts(policy):
+def test_several_threads_take_from_a_queue_while_one_puts(policy, descriptors, monkeypatch):
     """Each update is taken once or counted as dropped, losses add up, the last arrives, and all threads end."""
+    if descriptors == "used up":
+        monkeypatch.setattr(os, "pipe", none_left)
     box, taken = BoundedQueue(policy), []
 
     def take():

@@ -41,6 +41,15 @@ def descriptors():
     return len(os.listdir("/proc/self/fd"))
 
 
+@pytest.fixture
+def uncollected():
+    """What earlier tests have left is not finalized in the steps of a test."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+
+
 def interrupt():
     raise KeyboardInterrupt
 
@@ -133,6 +142,7 @@ def test_a_call_that_is_refused_a_slot_leaves_it_to_who_has_it():
     assert number not in late
 
 
+@pytest.mark.usefixtures("uncollected")
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_an_interrupt_in_the_middle_of_writing_leaves_every_slot_free():
     segment, place, reached = Segment(1000), 0, True
@@ -146,6 +156,7 @@ def test_an_interrupt_in_the_middle_of_writing_leaves_every_slot_free():
     check_all_slots(segment)
 
 
+@pytest.mark.usefixtures("uncollected")
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 def test_an_interrupt_in_the_middle_of_reading_leaves_no_lock_and_no_descriptor():
     segment, reader, place, reached = Segment(1000), LocalReader(), 0, True

@@ -287,29 +287,6 @@ async def test_many_wait_and_one_is_cancelled(akvs, key):
         await aeventually(lambda: not mirror._waiting)
 
 
-def test_threads_read_one_mirror(kvs, key):
-    kvs[key()] = {"a": 0, "b": 0}
-    with kvs[key()].mirror() as mirror:
-        torn, ended = [], threading.Event()
-
-        def read():
-            while not ended.is_set():
-                value = mirror.value()
-                if value["a"] != value["b"]:
-                    torn.append(value)
-
-        readers = [threading.Thread(target=read) for _ in range(2)]
-        for reader in readers:
-            reader.start()
-        for number in range(1, 200):
-            kvs[key()] = {"a": number, "b": number}
-        mirror.wait_until(lambda value: value["a"] == 199, 10)
-        ended.set()
-        for reader in readers:
-            reader.join()
-        assert not torn
-
-
 # --- the age of a mirror is never smaller than the true one: delays, slow loops, expiry, SWAPDB, missing rights
 
 

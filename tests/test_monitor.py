@@ -121,16 +121,6 @@ async def test_monitor_reconnects_and_says_that_something_may_be_lost(apspace, a
         assert (third.value, third.gap) == (3, False)
 
 
-async def test_monitor_counts_what_was_missed(apspace, ainterface, key, raw):
-    async with Monitor(ainterface, [key("*")]) as monitor:
-        await apspace[key()].write(1)
-        await taken(monitor, 1)
-        apspace.interface.session.stamp(apspace[key()]._reader.keys)  # a number that is never published
-        await apspace[key()].write(2)
-        (event,) = await taken(monitor, 1)
-        assert (event.missed, event.gap) == (1, True)
-
-
 async def test_a_slow_loop_over_a_monitor_is_told(apspace, ainterface, key):
     async with Monitor(ainterface, [key()], Last(2)) as last, Monitor(ainterface, [key()], Every(2)) as every:
         for number in range(5):

@@ -14,7 +14,7 @@ import reem
 import reem_async
 from reem_async import CallbackSubscriber, Every, KeyValueStore, PublishSpace, RedisInterface
 from reem_async import SilentSubscriber as Mirror
-from reem_async.errors import BadType, InterfaceClosed, PathRefused, QueueFull
+from reem_async.errors import BadType, InterfaceClosed, PathRefused
 
 
 async def waiting(awaitable):
@@ -253,25 +253,6 @@ async def test_a_callback_subscriber_fetches_a_large_update_once(ainterface, bin
         await asyncio.sleep(0.05)
         assert raw.info("stats")["total_net_output_bytes"] - before < 6_000_000
         assert len(calls) == 1
-
-
-async def test_every_update_cannot_be_had_of_large_ones_that_are_skipped(akvs, server_url, key):
-    """Only the newest of them is ever fetched: the loop is told with QueueFull, and how many it missed."""
-    updates = akvs[key()].watch(Every(100))
-    await updates.listen()
-    with reem.RedisInterface(server_url) as interface:
-        space = reem.PublishSpace(interface)
-        for number in range(20):  # the loop cannot run meanwhile
-            space[key()] = np.full(5000, float(number))
-
-    async def take_all():
-        async for _ in updates:
-            pass
-
-    with pytest.raises(QueueFull):
-        await waiting(take_all())
-    assert updates.dropped > 0
-    await updates.close()
 
 
 @pytest.mark.parametrize("module", [reem, reem_async])

@@ -167,23 +167,6 @@ async def test_a_fast_publisher_of_new_keys_is_heard_from_the_first_update_on_wi
         assert [event.sequence for event in events if event.name == name] == list(range(1, 61))
 
 
-async def test_hundreds_of_keys_that_begin_at_once_are_all_followed_and_nothing_is_lost(cluster, pair, key):
-    """They are followed together, not one after the other, while what all nodes are told still comes."""
-    space, other = pair
-    names = [key(f"k{number}") for number in range(300)]
-    async with hearing(other, key("*")) as events:
-        for number in range(1, 4):
-            await asyncio.gather(*[space[name].write(number) for name in names])
-        await aeventually(lambda: len(events) >= 3 * len(names))
-        key_watcher = manager_of(other.session)._key_watcher
-        listeners = [one for each in key_watcher._followed.values() for one in each.values()]
-        await aeventually(lambda: len(listeners) == len(names) and all(one.begun for one in listeners))
-    assert not [event for event in events if event.gap or event.missed]
-    assert sorted((event.name, event.value) for event in events) == sorted(
-        (name, number) for name in names for number in range(1, 4)
-    )
-
-
 async def test_a_fence_is_behind_all_that_was_published_on_any_node(cluster, pair, key):
     """As a recorder needs it that is told to end."""
     space, other = pair

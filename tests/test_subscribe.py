@@ -8,7 +8,7 @@ import pytest
 from conftest import PATIENCE, aeventually, assert_same, eventually
 
 import reem
-from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace, RedisInterface
+from reem_async import CallbackSubscriber, Every, KeyValueStore, Last, PublishSpace
 from reem_async import SilentSubscriber as Mirror
 from reem_async.concurrency.queues import EMPTY
 from reem_async.errors import InterfaceClosed, MissingKey
@@ -233,29 +233,6 @@ async def test_a_closed_subscriber_follows_no_more(ainterface, akvs, apspace, ke
     assert heard == [1]
     with contextlib.suppress(InterfaceClosed):
         assert one.value() == 1
-
-
-async def test_close_ends_every_loop(server_url, key):
-    """No task waits for ever, and none is left over."""
-    tasks = asyncio.all_tasks()
-    interface = RedisInterface(server_url)
-    await KeyValueStore(interface)[key()].write(1)
-    mirror = Mirror(key(), interface)
-    await mirror.listen()
-    started = []
-
-    async def loop(updates):
-        with contextlib.suppress(InterfaceClosed):
-            async for update in updates:
-                started.append(update)  # noqa: PERF401
-
-    loops = [asyncio.create_task(loop(KeyValueStore(interface)[key()].watch())) for _ in range(3)]
-    loops.append(asyncio.create_task(loop(mirror)))
-    await aeventually(lambda: len(started) >= 3)
-    await interface.close()
-    async with asyncio.timeout(PATIENCE):
-        await asyncio.gather(*loops)
-    await aeventually(lambda: asyncio.all_tasks() <= tasks)
 
 
 def test_a_deletion_at_any_index_is_a_notice_that_can_be_read(interface, pspace, key):

@@ -26,7 +26,6 @@ class Locks(Generic[Lock]):
         self._trimming = threading.Lock()
 
     def of(self, key: str) -> Lock:
-        """Return the lock of `key`, to which the caller refers while it is in use."""
         lock = self._recent.get(key)
         return lock if lock is not None else self._put(key)
 
@@ -59,8 +58,12 @@ class WeakList(Generic[Item]):
     def add(self, item: Item) -> None:
         self._references.append(weakref.ref(item, self._references.remove))
 
+    def present(self) -> list[Item]:
+        # A tuple first: another thread may drop one meanwhile.
+        return [item for reference in tuple(self._references) if (item := reference()) is not None]
+
     def __iter__(self) -> Iterator[Item]:
-        return iter([item for reference in tuple(self._references) if (item := reference()) is not None])
+        return iter(self.present())
 
 
 class Inherited(WeakList[Item]):
@@ -92,7 +95,6 @@ class ThreadLock:
             return
 
     def let_go(self) -> None:
-        """Give it back if this thread still has it."""
         with contextlib.suppress(RuntimeError):
             while True:
                 self._lock.release()

@@ -95,7 +95,6 @@ class BoundedQueue:
         self.wake: Callable[[], None] = noop  # called after each change, from the putting thread
 
     def put(self, update: Any) -> None:
-        """Add an update, dropping or failing as the policy says."""
         if self._end is not None:
             return
         if self._policy.fails and len(self._items) >= self._policy.bound:
@@ -119,11 +118,7 @@ class BoundedQueue:
         self._tell()
 
     def overtaken(self, update: Any) -> None:
-        """Note that later updates changed what one wrote before it was read, so its value is unknown.
-
-        Args:
-            update: Its path, and all that is there now; None if a later one of this path is delivered.
-        """
+        """Note that later updates changed what one wrote before it was read; None if one of its path is delivered."""
         self.skip()
 
     def _skip(self) -> None:

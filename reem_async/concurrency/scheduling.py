@@ -25,7 +25,6 @@ _SHORTEST_TURN = 100_000  # nanoseconds; the least that the kernel accepts as a 
 
 
 def give_way() -> None:
-    """Let a waiting thread or program run."""
     if hasattr(os, "sched_yield"):
         os.sched_yield()
     else:
@@ -40,12 +39,9 @@ def come_second() -> None:
 
 
 def stand_back() -> None:
-    """Run only when the processor is idle from now on, with all threads begun later: perhaps never.
+    """Run only when the processor is idle from now on, with all threads begun later; there is no way back.
 
-    There is no way back without rights. Where there is no SCHED_IDLE (not Linux), it is niceness 19.
-
-    Raises:
-        AttributeError, OSError: This system has neither, or does not allow it.
+    Where there is no SCHED_IDLE (not Linux), it is niceness 19. Raises AttributeError or OSError where neither works.
     """
     if hasattr(os, "SCHED_IDLE"):
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))

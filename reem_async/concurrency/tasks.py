@@ -34,7 +34,6 @@ class Tasks:
         self._running: set[asyncio.Task[Any]] = set()
 
     def start(self, coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
-        """Run a coroutine as a named task until it is done or the owner is closed."""
         task = started(coroutine, name)
         self._running.add(task)
         task.add_done_callback(self._running.discard)
@@ -42,11 +41,9 @@ class Tasks:
 
     @property
     def place(self) -> object:
-        """The process and event loop that tasks run in."""
         return os.getpid(), id(asyncio.get_running_loop())
 
     async def pause(self, seconds: float) -> None:
-        """Wait in one of the tasks, until their owner is closed at the latest."""
         await asyncio.sleep(seconds)
 
     async def end(self) -> None:

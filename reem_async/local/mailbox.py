@@ -148,7 +148,6 @@ def _folder() -> str:
 
 
 def _remove_dead(folder: str) -> None:
-    """Remove the mailboxes of processes that were killed."""
     for name in os.listdir(folder):
         if not is_address(name):
             continue
@@ -163,7 +162,6 @@ def _remove_dead(folder: str) -> None:
 
 
 def publishers() -> list[str]:
-    """Return the addresses of the early publishers of this host."""
     beginning = host() + PUBLISHER
     try:
         return [name for name in os.listdir(_path()) if name.startswith(beginning) and is_address(name)]
@@ -217,7 +215,6 @@ class Subscribers:
         return len(self._known.get(channel, ()))
 
     def notify(self, channel: bytes, notice: bytes) -> None:
-        """Send an update to the subscribers of a channel."""
         known, mailbox, now = self._known.get(channel, {}), self._mailbox, time.monotonic()
         if mailbox is None or len(notice) > _LARGEST - _HEAD.size - len(channel):
             return

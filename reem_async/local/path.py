@@ -6,6 +6,7 @@ What shares memory is imported only where the system has it.
 from __future__ import annotations
 
 import collections
+import functools
 import os
 import time
 from collections.abc import Sequence
@@ -41,21 +42,17 @@ class LocalPath:
             raise BadValue(f"local={mode!r:.40} is none of {', '.join(map(repr, _MODES))}")
         if type(memory) is not int or memory < 0:
             raise BadValue(f"local_memory={memory!r:.40} is not a number of bytes")
-        self._reader: LocalReader | None = None
         self.early = mode == "early"  # subscribers on this host are notified before the server has an update
         self._off = mode == "off" or memory == 0
         self._memory = memory  # bytes that it may take in all
         self._pid = os.getpid()
         self._segments: dict[str, Segment] = {}
         self._audiences: collections.OrderedDict[str, tuple[int, float]] = collections.OrderedDict()
-        self._subscribers: Subscribers | None = None
 
-    @property
+    @functools.cached_property
     def reader(self) -> LocalReader:
         """What looks into the memory of publishers near by; only where there is a `host`."""
-        if self._reader is None:
-            self._reader = LocalReader()
-        return self._reader
+        return LocalReader()
 
     @property
     def host(self) -> str:
@@ -72,12 +69,10 @@ class LocalPath:
         """Return the first bytes of a slot, so many, read-only; None if they are not to be had, or not near by."""
         return self.reader.view(slot, size) if slot.host == self.host else None
 
-    @property
+    @functools.cached_property
     def subscribers(self) -> Subscribers:
         """The subscribers that are notified early; only where there is a `host`."""
-        if self._subscribers is None:
-            self._subscribers = Subscribers()
-        return self._subscribers
+        return Subscribers()
 
     def is_to_ask(self, keys: Keys) -> bool:
         """Return whether it is not known any more how many near by listen to a key."""
@@ -147,8 +142,7 @@ class LocalPath:
     def close(self) -> None:
         """Give all memory back; what subscribers look into stays as long as they do."""
         self._off = True
-        if self._reader is not None:
-            self._reader.close()
-        if self._subscribers is not None:
-            self._subscribers.close()
+        for each in ("reader", "subscribers"):
+            if each in vars(self):
+                getattr(self, each).close()
         self._segments = {}

@@ -158,5 +158,4 @@ class LocalReader:
                 self._mappings.pop(place, None)
 
     def close(self) -> None:
-        """Let go of all segments; what is looked into stays as long as it is."""
         self._mappings.clear()

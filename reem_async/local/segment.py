@@ -79,14 +79,11 @@ def _set(descriptor: int, kind: int, number: int) -> bool:
 
 
 class Shape(NamedTuple):
-    """How a segment is divided."""
-
     slots: int
     room: int  # bytes in each
 
     @property
     def size(self) -> int:
-        """Bytes of the whole file."""
         return HEAD + self.slots * self.room
 
     def start(self, number: int) -> int:

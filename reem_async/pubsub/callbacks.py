@@ -116,10 +116,7 @@ class Caller:
         self._dropped = 0
 
     def call(self, update: Update, dropped: int) -> Any:
-        """Call the function, unless the update is only the value that was there already; log what it raises.
-
-        Log the number of updates that were `dropped` until now, if it has grown.
-        """
+        """Call the function, unless the update is only the value that was there already; log what it raises."""
         # Before the call, so that the log has the loss ahead of what it may cause.
         if dropped > self._dropped:
             self._dropped = dropped
@@ -168,10 +165,7 @@ class Caller:
 
 
 class Calls:
-    """The calls of one subscriber on the event loop, one after the other, until its queue is closed.
-
-    They are made in the loop's next turn, without a task: only what must be awaited gets one.
-    """
+    """The calls of one subscriber in turns of the event loop, one after the other, until its queue is closed."""
 
     def __init__(self, caller: Caller, updates: Stream[Update], kept: set[Any]) -> None:
         self.loop = asyncio.get_running_loop()
@@ -252,11 +246,7 @@ class Calls:
             self._over.set_result(None)
 
     async def done(self) -> None:
-        """Wait until the queue, which is closed, is empty and all calls were made.
-
-        Returns at once within any callback and in tasks that it has started: two that close each other would wait for
-        ever.
-        """
+        """Wait until all calls were made. Returns at once in callbacks and their tasks: two may close each other."""
         caller = _current_call.get()
         if self.loop is asyncio.get_running_loop() and (caller is None or caller.done()):
             await asyncio.wait([self._over])

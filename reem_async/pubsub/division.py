@@ -129,7 +129,6 @@ class Division(Generic[U]):
         return not undecided
 
     def take(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
-        """Return what is covered and what is later."""
         covered, later = self.covered, [*self._doubtful, *self._later]
         self.phase, self.begins = _IDLE, False
         self.covered, self._doubtful, self._later = [], [], []

@@ -17,14 +17,10 @@ _RETRIES = 10  # of an answer
 
 
 class EarlyInbox:
-    """The mailbox of the subscriptions of an event loop; opened when there is an early publisher on this host.
-
-    Args:
-        take: Called with the channel of an early update, and its notice.
-    """
+    """The mailbox of the subscriptions of an event loop; opened when there is an early publisher on this host."""
 
     def __init__(self, take: Callable[[bytes, bytes], None]) -> None:
-        self._take = take
+        self._take = take  # called with the channel of an early update, and its notice
         self._mailbox: Mailbox | None = None
         self._loop = asyncio.get_running_loop()
 

@@ -83,8 +83,6 @@ class Look(NamedTuple):
 
 
 class Updated(NamedTuple):
-    """Event: an update."""
-
     notice: Notice
     data: Any  # All that is at the followed path; MISSING if nothing is. Not to be changed.
     value: Any  # what was written; the same object as `data` if that is all of it
@@ -134,14 +132,9 @@ _UNKNOWN: Any = object()  # a copy of which it is not known what it was
 class Report(Enum):
     """How the next snapshot is reported."""
 
-    INITIAL = auto()
-    """As the value that was there when following began."""
-
-    GAP = auto()
-    """As what is there after updates were lost, those in it included."""
-
-    UPDATES = auto()
-    """Not at all: each update in it is reported."""
+    INITIAL = auto()  # as the value that was there when following began
+    GAP = auto()  # as what is there after updates were lost, those in it included
+    UPDATES = auto()  # not at all: each update in it is reported
 
 
 class EventMaker:
@@ -164,7 +157,6 @@ class EventMaker:
         self.missed = None if self.missed is None or None in lost else self.missed + sum(filter(None, lost))
 
     def update(self, notice: Notice, tree: Any, written: Any = MISSING) -> None:
-        """Report an update. Its value is `written` if that is given, else what the copy has."""
         data = value = get(tree, self._rest) if self._rest else tree
         inner = () if self._rest else notice.path[len(self._path) :]
         if written is not MISSING:

@@ -134,7 +134,6 @@ class KeyFeed(Generic[U]):
         self._outcome: list[Reply] = []  # of the plan, while its fence is on its way
 
     def begin(self, *, initial: bool, tracked: bool) -> None:
-        """Start on a connection that is subscribed: the first one, or one after a loss."""
         self.division.begin(initial=initial)
         self.tracked, self.dirty = tracked, False
         self.attachments.values.clear()
@@ -183,7 +182,6 @@ class KeyFeed(Generic[U]):
         return Read(self.number, self._plan)
 
     def awaits(self, number: int, *phases: Phase) -> bool:
-        """Return whether an answer is that to the present read, which is in one of these phases."""
         return number == self.number and self.division.phase in phases
 
     def answered(self, outcome: list[Reply]) -> Step | None:
@@ -211,7 +209,6 @@ class KeyFeed(Generic[U]):
         return Open(self.number, result)
 
     def take(self) -> tuple[list[Heard[U]], list[Heard[U]]]:
-        """Return which updates are in what was read, and which came later."""
         if self.tracked:
             self.attachments.opened()
         return self.division.take()

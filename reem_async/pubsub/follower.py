@@ -360,7 +360,6 @@ class Follower(Listener):
         return notice.late, notice.arrived
 
     def _tell_state(self, inner: Path, tree: Any, value: Any, origin: Origin, **how: Any) -> None:
-        """Report what is there, and who published it is unknown."""
         path = self._path(inner)
         for queue in self.queues:
             data = own(tree)

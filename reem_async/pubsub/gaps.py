@@ -17,8 +17,6 @@ Stamp = tuple[str, int, float]  # publisher, number and time of an update
 
 
 class Numbered(Protocol):
-    """An update, such as a `Notice` or an `Event`."""
-
     @property
     def publisher(self) -> str: ...
     @property
@@ -109,7 +107,6 @@ class GapDetector:
         return missing
 
     def is_next(self, update: Numbered) -> bool:
-        """Return whether an update comes directly behind what was heard of its publisher."""
         last = self._heard.last.get(update.publisher)
         return last is not None and update.sequence == last + 1
 

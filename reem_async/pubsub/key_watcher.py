@@ -87,7 +87,6 @@ class KeyWatcher:
             self._looking = self._manager.tasks.start(find_regularly(self._look_for_all), "reem discovery")
 
     def listeners(self) -> list[Listener]:
-        """Return the listeners to patterns: the manager itself only has their keys. Any thread may ask."""
         return [listener for each in self._followed.keyrefs() if (listener := each()) is not None]
 
     async def unfollow(self, listener: Listener) -> None:
@@ -136,18 +135,11 @@ class KeyWatcher:
 
     async def _look_for_all(self) -> bool:
         """Search for each listener; return whether any is left. The next one starts this again."""
-        failure: Exception | None = None
         for listener in list(self._new_keys):
-            try:
-                await self._look(listener, late=True)
-            except (RedisError, OSError) as error:
-                failure = error
-        if failure is not None:
-            raise failure
+            await self._look(listener, late=True)
         return bool(self._followed)
 
     async def _look(self, listener: Listener, *, late: bool) -> None:
-        """Follow the keys that are not followed yet."""
         async for page in scanned(self._manager.transport, _glob(listener), DOCUMENT):
             await self._found(listener, page, late=late)
 
@@ -194,16 +186,16 @@ class _Part(Listener):
 
     def __init__(self, listener: Listener, topic: Topic) -> None:
         super().__init__(topic, listener.max_batch_delay)
-        self.listener: Callable[[], Listener | None] = weakref.ref(listener)
+        self._listener: Callable[[], Listener | None] = weakref.ref(listener)
 
     def lost(self, reason: Exception) -> None:
         if self.ready is not None:
             super().lost(reason)
-        elif (listener := self.listener()) is not None:
+        elif (listener := self._listener()) is not None:
             listener.lost(reason)
 
     def invalidate(self, channel: bytes) -> None:
-        if (listener := self.listener()) is not None:
+        if (listener := self._listener()) is not None:
             listener.invalidate(channel)
 
 
@@ -221,14 +213,14 @@ class _KeyListener(_Part):
         if self._new_keys is not None:
             self._new_keys.buffer(self.topic.name, here=True).begun()
             self._new_keys.begin(wire, beginning)
-        elif (listener := self.listener()) is not None:
+        elif (listener := self._listener()) is not None:
             listener.start(wire, beginning)
         super().start(wire, beginning)
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
         if self._new_keys is not None:
             self._new_keys.buffer(channel, here=True).told_here(notice)
-        elif (listener := self.listener()) is not None:
+        elif (listener := self._listener()) is not None:
             listener.on_notice(notice, channel)
 
 
@@ -246,17 +238,15 @@ class _NewKeysListener(_Part):
         self._early: collections.deque[tuple[Notice, bytes]] | None = collections.deque(maxlen=_MOST)
 
     def is_settled(self, channels: Iterable[bytes] | None) -> bool:
-        """Return whether the keys of some channels, or all, are listened to at their own nodes only."""
         found = self._buffers.values() if channels is None else map(self._buffers.get, channels)
         return all(buffer is None or buffer.here for buffer in found)
 
     def buffer(self, channel: bytes, *, here: bool = False) -> ReorderBuffer:
-        """Return the buffer of a key; a new one as given."""
         found = self._buffers.get(channel)
         if found is None:
             if len(self._buffers) >= _MOST:
                 del self._buffers[next(iter(self._buffers))]
-            found = self._buffers[channel] = ReorderBuffer(self.listener, channel, here=here)
+            found = self._buffers[channel] = ReorderBuffer(self._listener, channel, here=here)
         return found
 
     def start(self, wire: Wire, beginning: Beginning) -> None:
@@ -271,7 +261,7 @@ class _NewKeysListener(_Part):
             else:
                 self._telling = True
                 asyncio.get_running_loop().call_soon(setattr, self, "_telling", False)
-        if (listener := self.listener()) is not None:
+        if (listener := self._listener()) is not None:
             listener.start(wire, beginning)
 
     def looked(self) -> None:
@@ -281,7 +271,7 @@ class _NewKeysListener(_Part):
             self.on_notice(notice, channel)
 
     def on_notice(self, notice: Notice, channel: bytes) -> None:
-        if (listener := self.listener()) is None:
+        if (listener := self._listener()) is None:
             return
         if self._early is not None:
             self._early.append((notice, channel))
@@ -291,16 +281,10 @@ class _NewKeysListener(_Part):
 
 
 class ReorderBuffer:
-    """What one listener hears of one key, in order.
-
-    Args:
-        listener: Returns the listener, None if it was dropped.
-        channel: The key's channel.
-        here: The key's node is the only one listened to, from the beginning or by now.
-    """
+    """What one listener hears of one key, in order."""
 
     def __init__(self, listener: Callable[[], Listener | None], channel: bytes, *, here: bool = False) -> None:
-        self.here = here
+        self.here = here  # the key's node is the only one listened to, from the beginning or by now
         self._listener = listener
         self._channel = channel
         self._told: dict[Stamp, None] = {}  # what all nodes were told: it comes at the key's node too
@@ -311,11 +295,9 @@ class ReorderBuffer:
 
     @property
     def waits(self) -> bool:
-        """Whether an update has come and is not handed on yet."""
         return bool(self._waiting)
 
     def told_to_all(self, notice: Notice) -> None:
-        """Take an update that its publisher sent to all nodes."""
         stamp = notice.publisher, notice.sequence, notice.time
         if self.here or stamp in self._told:
             return
@@ -335,7 +317,6 @@ class ReorderBuffer:
             self._timer = asyncio.get_running_loop().call_later(_PATIENCE, self._give_up)
 
     def told_here(self, notice: Notice) -> None:
-        """Take an update that came at the key's own node."""
         if self.here:
             self._tell_once(notice)
             return

@@ -6,11 +6,11 @@ import asyncio
 import functools
 import logging
 import math
-import weakref
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum, auto
 from typing import Any, Concatenate, NamedTuple, ParamSpec
 
+from ..concurrency.locks import WeakList
 from ..concurrency.queues import BoundedQueue
 from ..errors import BadData
 from ..local.path import LocalPath
@@ -37,8 +37,6 @@ class Topic(NamedTuple):
 
 
 class Beginning(Enum):
-    """How a listener begins over a connection."""
-
     FIRST = auto()
     AFTER_LOSS = auto()  # of a connection, or a slot has moved: what was published meanwhile is unknown
 
@@ -115,27 +113,17 @@ class Listener:
             queue.close(error)
 
 
-class ListenerGroup:
-    """The listeners to one topic, held weakly. A WeakSet does the same but takes as long as decoding a notice."""
+class ListenerGroup(WeakList[Listener]):
+    """The listeners to one topic, in the order in which they came."""
 
-    __slots__ = ("_references",)
-
-    def __init__(self) -> None:
-        self._references: list[weakref.ref[Listener]] = []
-
-    def add(self, listener: Listener) -> None:
-        if listener not in self.present():
-            self._references.append(weakref.ref(listener, self._references.remove))
+    def add(self, item: Listener) -> None:
+        if item not in self.present():
+            super().add(item)
 
     def discard(self, listener: Listener) -> None:
         for reference in tuple(self._references):
             if reference() is listener:
                 self._references.remove(reference)
-
-    def present(self) -> list[Listener]:
-        """Return all that were not dropped, in the order in which they came."""
-        # A tuple first: another thread may drop its subscriber, which removes a reference, meanwhile.
-        return [listener for reference in tuple(self._references) if (listener := reference()) is not None]
 
 
 NO_LISTENERS = ListenerGroup()
@@ -235,7 +223,6 @@ class Inbox:
                 listener.invalidate(channel)
 
     def _take_early(self, channel: bytes, payload: bytes) -> None:
-        """Take an update that a publisher on this host sent ahead of the server."""
         topic: Any = (channel, False)
         listeners = [listener for listener in self._topics.get(topic, NO_LISTENERS).present() if listener.local]
         if not listeners:
@@ -250,7 +237,6 @@ class Inbox:
             self._unreadable(channel, error)
 
     def _changed(self, names: Any) -> None:
-        """Notify the listeners of keys that were changed; None for all."""
         if names is None:
             for group in (*self._topics.values(), self.watchers):
                 for listener in group.present():

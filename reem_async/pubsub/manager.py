@@ -66,7 +66,7 @@ class SubscriptionManager:
         self._lock = asyncio.Lock()
         self.tasks = Tasks()  # all that runs in the background for what is followed; ended by `close`
         self._reconnecting: asyncio.Task[Any] | None = None
-        self._key_watcher: KeyWatcher | None = None
+        self._key_watcher = KeyWatcher(self)
         self._reported: set[str] = set()
         self._pace = 0.0
         self._closed = False
@@ -84,7 +84,7 @@ class SubscriptionManager:
         self.transport.check()
         await self._ships.ready()
         if listener.topic.pattern and self.transport.sharded:
-            await self._watch_keys().follow(listener)
+            await self._key_watcher.follow(listener)
         else:
             await self.follow_here(listener)
 
@@ -160,7 +160,6 @@ class SubscriptionManager:
             self._beginners = ()
 
     async def follow_here(self, listener: Listener) -> None:
-        """Follow a topic that the servers themselves know."""
         deadline = time.monotonic() + self.transport.timeout
         retry = False
         while True:
@@ -220,13 +219,6 @@ class SubscriptionManager:
         for wire in self._wires.values():
             wire.pace = self._pace
 
-    def _watch_keys(self) -> KeyWatcher:
-        if self._closed:
-            raise InterfaceClosed("this RedisInterface is closed; make a new one")
-        if self._key_watcher is None:
-            self._key_watcher = KeyWatcher(self)
-        return self._key_watcher
-
     async def _connected(self, node: Transport) -> Wire:
         if self._closed:
             raise InterfaceClosed("this RedisInterface is closed; make a new one")
@@ -260,23 +252,16 @@ class SubscriptionManager:
         return [listener for topic in wanted for listener in self._topics.get(topic, NO_LISTENERS).present()]
 
     async def fence(self, channels: Iterable[str] | None = None) -> None:
-        """Return when all that was published before now to what is followed has been told; one round trip.
+        """Return when all that was published before now has been delivered; raises ConnectionLost.
 
-        In a cluster, up to a second more for keys that a pattern has found just now: what was published to them before
-        they were followed comes by other nodes.
-
-        Args:
-            channels: Of the keys that matter; of all if not given.
-
-        Raises:
-            ConnectionLost: A connection broke meanwhile.
+        One round trip; in a cluster, up to a second more for keys that a pattern has found just now. `channels` are
+        those of the keys that matter; of all if not given.
         """
         await asyncio.gather(*[wire.roundtrip([("PING",)]) for wire in self._wires.values() if wire.alive])
-        if self._key_watcher is not None:
-            await self._key_watcher.settled(None if channels is None else [each.encode() for each in channels])
+        await self._key_watcher.settled(None if channels is None else [each.encode() for each in channels])
 
     async def unfollow(self, listener: Listener) -> None:
-        if self._key_watcher is not None and listener.topic.pattern:
+        if listener.topic.pattern:
             await self._key_watcher.unfollow(listener)
         await self.unfollow_here(listener)
 
@@ -314,7 +299,6 @@ class SubscriptionManager:
             self.transport.states.answered()
 
     def on_note(self, listener: Listener, note: Reply) -> None:
-        """Hand a listener the server's note of its key, unless that is an error of the server."""
         if isinstance(note, Moved):  # this node is only a replica now
             self._moved([listener.topic], str(note))
         elif not isinstance(note, Exception):
@@ -363,7 +347,6 @@ class SubscriptionManager:
         ]
 
     async def _reconnect(self) -> None:
-        """Connect and subscribe, with retries, until nothing is missing."""
         pause = 0.05
         try:
             while self._missing():
@@ -427,8 +410,7 @@ class SubscriptionManager:
 
     def _everybody(self) -> list[Listener]:
         """Return all listeners, also those to patterns in a cluster. Any thread may ask."""
-        beyond = self._key_watcher.listeners() if self._key_watcher is not None else []
-        return [*beyond, *self._listeners()]
+        return [*self._key_watcher.listeners(), *self._listeners()]
 
     @property
     def is_here(self) -> bool:
@@ -438,10 +420,9 @@ class SubscriptionManager:
 
 
 class Heartbeats:
-    """Asks over each connection for the notes of the last updates, every second.
+    """Asks over each connection for the notes of the last updates each second, and for the types of documents.
 
-    Asks for the types of documents as often as their listeners need it. This also makes the server notice a key whose
-    time to live has passed. Belongs to an event loop.
+    These also make the server notice a key whose time to live has passed.
     """
 
     def __init__(self, manager: SubscriptionManager) -> None:
@@ -456,7 +437,6 @@ class Heartbeats:
         self._beating.pop(wire, None)
 
     def limit_period(self, seconds: float) -> None:
-        """Send probes at least that often as long as a listener needs it."""
         if seconds < self._period:
             self._period = seconds
             for wire, task in list(self._beating.items()):
@@ -483,7 +463,6 @@ class Heartbeats:
     # Functions of their own, since a task that held listeners while it waits would keep those that are dropped.
 
     def _needed(self) -> float:
-        """Return the seconds between looks that those who still listen need."""
         return min([_PERIOD, *(listener.heartbeat for listener in self._manager.forget_empty())])
 
     def _notes(self, wire: Wire) -> list[str]:

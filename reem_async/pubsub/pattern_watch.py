@@ -22,7 +22,7 @@ from .finder import find_regularly, present_keys
 from .follower import Follower, checked_largest
 from .listeners import Listener, Topic
 from .manager import SubscriptionManager
-from .patterns import PatternStream
+from .monitor import PatternStream
 
 logger = logging.getLogger("reem.subscribe")
 
@@ -144,11 +144,8 @@ class PatternWatch(PatternStream[Update]):
             logger.debug("new keys are not followed yet: %s", error)
 
     def gone(self, name: str) -> None:
-        """Stop following a key that is gone; if it comes to be again, it is found like any other.
-
-        Not at once: its follower may be about to tell that it has come to be again, and would be the only one that
-        knows.
-        """
+        """Stop following a key that is gone; if it comes to be again, it is found like any other."""
+        # Not at once: its follower may be about to report that it is there again.
         asyncio.get_running_loop().call_soon(self._drop_if_gone, name)
 
     def _drop_if_gone(self, name: str) -> None:

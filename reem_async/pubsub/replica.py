@@ -72,14 +72,6 @@ _UNCONFIRMED = 100  # early updates of one publisher in a copy; further ones are
 _PATIENT = 3  # notes, one a second, after which what was told early should have been confirmed: at least two seconds
 
 
-class Outcome(Enum):
-    """What an update says of those that were told early."""
-
-    NEW = auto()  # nothing: it is to be taken as any other
-    CONFIRMED = auto()  # it is one of them
-    WRONG = auto()  # one of them is not what the server has, or in another order
-
-
 class State(Enum):
     OFFLINE = auto()
     ARMING = auto()
@@ -187,13 +179,13 @@ class Replica:
 
     def _settles(self, notice: Notice, missing: int) -> bool:
         """Return whether there is nothing more to do for an update, by what was told early."""
-        outcome = self._early.settle(notice, missing)
-        if outcome is Outcome.WRONG:
+        confirmed = self._early.settle(notice, missing)
+        if confirmed is False:
             self._early.clear()
             self._take(Heard(notice, None))
         elif self._early.look_waits and not self._early:
             self.look()
-        return outcome is not Outcome.NEW
+        return confirmed is not None
 
     def unreadable(self) -> None:
         if self.state is not State.OFFLINE:
@@ -372,18 +364,12 @@ class EarlyUpdates:
 
         both -- settle(): something else comes first, or overdue(): refused, or its publisher is dead --> wrong
 
-    Args:
-        path: What the copy holds.
-
-    Attributes:
-        look_waits: The copy is to be read once all are confirmed; until then no other one is reported early.
-        since: When the oldest of those in the copy was received; infinite if there is none.
     """
 
     def __init__(self, path: Path) -> None:
-        self.look_waits = False
-        self.since = math.inf
-        self._path = path
+        self.look_waits = False  # the copy is to be read once all are confirmed; until then no other one is reported
+        self.since = math.inf  # when the oldest of those in the copy was received; infinite if there is none
+        self._path = path  # what the copy holds
         self._told: dict[str, collections.deque[tuple[Notice, float]]] = {}  # and when each was received
         self._in_copy = False  # else all are awaited
         self._base: Any = _NONE  # the copy without them, until they are confirmed or a snapshot is opened
@@ -411,23 +397,27 @@ class EarlyUpdates:
         self._told.setdefault(notice.publisher, collections.deque()).append((without_value, moment))
         self.since = min(self.since, moment)
 
-    def settle(self, notice: Notice, missing: int) -> Outcome:
-        """Compare with an update that the server has, before which so many of its publisher are missing."""
-        publisher, outcome = notice.publisher, Outcome.NEW
+    def settle(self, notice: Notice, missing: int) -> bool | None:
+        """Compare with an update that the server has, before which so many of its publisher are missing.
+
+        Returns whether it confirms one, or shows that one is wrong; None if it does neither.
+        """
+        publisher = notice.publisher
+        confirmed: bool | None = None
         chain = self._told.get(publisher)
         if chain is None:
             if self._touches(notice):
-                return Outcome.WRONG
+                return False
         else:
             early, _ = chain.popleft()
             if missing != 0 or _identity(early) != _identity(notice):
-                return Outcome.WRONG
+                return False
             if chain:
                 self._notes[publisher] = 0
             else:
                 del self._told[publisher], self._notes[publisher]
             if self._in_copy:
-                outcome = Outcome.CONFIRMED
+                confirmed = True
         if self._in_copy:
             self.since = min([each[0][1] for each in self._told.values()], default=math.inf)
             if not self._told:
@@ -435,7 +425,7 @@ class EarlyUpdates:
             elif missing == 0 and concerns(notice, self._path) and is_whole(notice, self._path, self._base):
                 with contextlib.suppress(CannotApply):  # the copy itself is read in this case
                     self._base = applied(self._base, notice, self._path)
-        return outcome
+        return confirmed
 
     def overdue(self) -> bool:
         """Return, for each note of the server, whether one of them should have been confirmed by now."""

@@ -28,12 +28,7 @@ while it was busy: uvloop calls timers before it does that."""
 
 
 def checked_ttl(ttl: float, path: Path) -> float:
-    """Return `ttl` as a float; raises BadType or BadValue.
-
-    Args:
-        ttl: Seconds.
-        path: What is followed, top-level key first.
-    """
+    """Return `ttl` as a float, for a path with the top-level key first; raises BadType or BadValue."""
     check_number("ttl", ttl, _CURE, above=0, most=LONGEST)
     if counts_from_end(path):
         raise BadValue(
@@ -47,11 +42,6 @@ class LiveQueue(BoundedQueue):
 
     An update's age is for how long it was late at its publisher, and what has passed since its notice arrived. Updates
     that are found or only stored are not delivered. Losses that they report are reported by the next one.
-
-    Args:
-        policy: What to keep for a loop that is slower than the updates.
-        ttl: Seconds.
-        path: What is followed, top-level key first.
     """
 
     def __init__(self, policy: Policy, ttl: float, path: Path) -> None:

@@ -20,8 +20,6 @@ _TRACK = ("CLIENT", "TRACKING", "ON")
 
 
 class Subscribing:
-    """Subscribes to topics over connections that the caller chooses."""
-
     def __init__(
         self,
         transport: Transport,
@@ -109,7 +107,6 @@ class Invalidations:
             wire.tracked = True
 
     async def touch(self, wire: Wire, names: Iterable[str], touched: Callable[[], None]) -> bool:
-        """Do as `SubscriptionManager.touch`, over a connection."""
         if not wire.alive or not wire.tracked:
             return False
         answered = asyncio.get_running_loop().create_future()

@@ -213,7 +213,6 @@ def _dtype(descr: Any) -> np.dtype[Any]:
 
 
 def _checked(descr: Any, fields: list[int], depth: int) -> Any:
-    """Return `descr`, refusing all but plain data."""
     if isinstance(descr, str):
         if not _CODE.fullmatch(descr) or int(re.findall(r"\d+", descr)[0]) > _WIDEST.get(descr[1], _LARGEST_ITEM):
             raise ValueError(descr)

@@ -120,7 +120,6 @@ class Ships:
         return label in self._by_label
 
     def labelled(self, label: str, where: str) -> Registered:
-        """Return the ship with this label; raises BadData if there is none."""
         try:
             return self._by_label[label]
         except KeyError:
