@@ -281,23 +281,6 @@ def test_hz_reports_as_it_goes_and_at_the_end(listening, announced):
     assert "foo" not in heard + rest
 
 
-def test_the_live_table_in_a_terminal(cli, announced, raw):
-    before = subscriptions(raw)
-
-    def publish(sequence):
-        if subscriptions(raw) > before:
-            announced("camera", sequence, size=1000)
-
-    with repeated(publish, 0.02):
-        shown, code = cli.in_terminal("hz", "cam*", keys=[(b"camera", b"\x03")])
-    assert code == 0
-    assert "waiting for updates of cam*" in shown
-    last = shown.rsplit("lost", 2)[-2]
-    assert "camera" in last
-    assert "std ms" in shown
-    assert " updates in " in shown
-
-
 def event(received, *, sent=0.0, size=0, missed=0):
     return Event(("p",), None, False, size, sent, received, "publisher", 1, missed)
 

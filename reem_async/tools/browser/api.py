@@ -205,7 +205,7 @@ class Api:
             left -= len(page.nodes)
             nodes = [_marked(node, marks) for node in page.nodes]
             branches.append({"address": where, "total": page.total, "start": page.start, "nodes": nodes})
-        return reply({"branches": branches, **self.span()})
+        return reply({"branches": branches, **self._source.status()._asdict()})
 
     async def _marks(self, request: Request, at: float | None) -> tuple[set[Path], set[Path]]:
         """Return what changed, and what is above it."""
@@ -215,9 +215,6 @@ class Api:
         until = self._source.status().end if at is None else at
         changed = await self._source.differing(min(since, until), max(since, until), _MOST_MARKS)
         return changed, {path[:end] for path in changed for end in range(1, len(path))}
-
-    def span(self) -> dict[str, Any]:
-        return dict(self._source.status()._asdict())
 
     async def node(self, request: Request) -> Response:
         path, at = path_in(request), at_of(request)

@@ -305,7 +305,7 @@ class _Pages:
             "live": self._source.live,
             "write": self._api.allow_write,
             "key": self._api.key if self._api.allow_write else "",
-            **self._api.span(),
+            **self._source.status()._asdict(),
         }
         page = self._files["page.html"].decode()
         page = page.replace("{title}", html.escape(visible(self._source.title)))

@@ -49,7 +49,7 @@ def fail(message: str) -> NoReturn:
 
 
 def _up_cluster(*, plain: bool) -> None:
-    """Keep a cluster up until told to stop. The other nodes go on when one ends."""
+    """Keep a cluster up until told to stop."""
     stop = Stop()
     try:
         with EmbeddedCluster(json=not plain) as cluster:
@@ -59,12 +59,8 @@ def _up_cluster(*, plain: bool) -> None:
             labels = ["primaries", *[""] * (half - 1), "replicas", *[""] * (half - 1)]
             facts_lines([("address", cluster.url), *zip(labels, nodes, strict=True)])
             facts_lines(_use(cluster.url, json=cluster.json, data="in memory, gone when the cluster stops"))
-            left = list(cluster.nodes)
             while not stop.wait():
-                for node in [node for node in left if node.ended()]:
-                    left.remove(node)
-                    emit(f"The node on port {node.port} has ended; the others go on.")
-                    sys.stdout.flush()
+                pass
     except (ServerFailed, ServerMissing) as error:
         fail(for_users(error))
     with suppress(OSError):  # the terminal may have closed
