@@ -404,7 +404,7 @@ async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs
     """
     monkeypatch.setattr(finder, "_PERIOD", 600.0)
     async with followed_all(binterface, key(), akvs) as (follower, history):
-        follower._monitor.broken = lambda: None
+        follower.monitor.broken = lambda: None
         for connection in subscribed(raw):
             raw.client_kill_filter(_id=connection)
         await akvs[key()].write({"n": 2})

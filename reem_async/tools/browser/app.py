@@ -257,7 +257,7 @@ def create_app(
     routes = [*api.routes(), *Arrays(source).routes(), *Events(source, lambda: app.state.ending).routes()]
     app.router.routes.extend(
         [
-            Route("/", pages.root, methods=["GET"]),
+            Route("/", pages.view, methods=["GET"]),
             Route("/view/{where:path}", pages.view, methods=["GET"]),
             Route("/static/{name}", pages.static, methods=["GET"]),
             Mount("/api", routes=routes),
@@ -281,25 +281,11 @@ class _Pages:
         self._api = api
         self._files = files
 
-    async def root(self, request: Request) -> Response:
-        return self._page()
-
     async def view(self, request: Request) -> Response:
         try:
-            path_of(request.path_params["where"])
+            path_of(request.path_params.get("where", ""))
         except BadKey as error:
             return PlainTextResponse(f"{visible(str(error))}\n", 404)
-        return self._page()
-
-    async def static(self, request: Request) -> Response:
-        name = request.path_params["name"]
-        content = self._files.get(name)
-        if content is None or name == "page.html":
-            return PlainTextResponse("There is no such file.\n", 404)
-        kind = next(kind for suffix, kind in _TYPES.items() if name.endswith(suffix))
-        return Response(content, media_type=kind, headers={"cache-control": "no-cache"})
-
-    def _page(self) -> Response:
         config: dict[str, Any] = {
             "title": self._source.title,
             "live": self._source.live,
@@ -310,3 +296,11 @@ class _Pages:
         page = self._files["page.html"].decode()
         page = page.replace("{title}", html.escape(visible(self._source.title)))
         return Response(page.replace("{config}", html.escape(orjson.dumps(config).decode())), media_type="text/html")
+
+    async def static(self, request: Request) -> Response:
+        name = request.path_params["name"]
+        content = self._files.get(name)
+        if content is None or name == "page.html":
+            return PlainTextResponse("There is no such file.\n", 404)
+        kind = next(kind for suffix, kind in _TYPES.items() if name.endswith(suffix))
+        return Response(content, media_type=kind, headers={"cache-control": "no-cache"})

@@ -1,10 +1,7 @@
 """Filling the rolling buffer: every published update, and what the server says was only stored.
 
 Each key has a feed, as a subscriber's and a recording's. Its document is read, without the arrays, a moment after the
-server has said that it was changed, or an update was only announced. What differs then from the buffer goes into it.
-Arrays that were changed are read in turn, as far as an allowance goes.
-
-What the server does not tell of, since it may not be asked or the connection for it is broken, is read each second.
+server has said that it was changed, or an update was only announced. Arrays that were changed are read in turn.
 """
 
 from __future__ import annotations
@@ -280,10 +277,10 @@ class Follower:
         self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
         # Bytes of arrays that may be read: four pictures a second each of two cameras
         self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
-        self._monitor = Monitor(interface, policy=Last(_WAITING))
-        self._monitor.invalidated = lambda name: self.key(name).doubt()
-        self._monitor.broken, self._monitor.changed = self._lost, self._changed
-        self._monitor.resynchronised = self._read_again
+        self.monitor = Monitor(interface, policy=Last(_WAITING))
+        self.monitor.invalidated = lambda name: self.key(name).doubt()
+        self.monitor.broken, self.monitor.changed = self._lost, self._changed
+        self.monitor.resynchronised = self._read_again
         self._tasks: list[asyncio.Task[None]] = []
         self._keys: dict[str, FollowedKey] = {}
         self._due: dict[str, None] = {}  # documents to be read
@@ -298,8 +295,8 @@ class Follower:
         if self._tasks:
             return
         await self._interface.initialize()
-        await self._monitor.listen()
-        await self._monitor.watch_changes()
+        await self.monitor.listen()
+        await self.monitor.watch_changes()
         self.names = await self._present()
         self.unread.update(self.names)
         self.read_soon(self.names)
@@ -313,11 +310,7 @@ class Follower:
         await asyncio.gather(*tasks, return_exceptions=True)
         for key in self._keys.values():
             key.looks.cancel()
-        await self._monitor.close()
-
-    @property
-    def skipped(self) -> int:
-        return self._monitor.dropped
+        await self.monitor.close()
 
     @property
     def hears_of_changes(self) -> bool:
@@ -336,7 +329,7 @@ class Follower:
     # --- what is published
 
     async def _follow(self) -> None:
-        async for event in self._monitor:
+        async for event in self.monitor:
             self._take(event)
 
     async def fence(self, channel: str) -> None:
@@ -345,7 +338,7 @@ class Follower:
         self._pump()
 
     def _pump(self) -> None:
-        for event in arrived(self._monitor):
+        for event in arrived(self.monitor):
             self._take(event)
 
     def _take(self, event: Event) -> None:

@@ -50,11 +50,7 @@ _AWAY = ConnectionLost, NotConnected, ServerNotReady, OSError
 class LiveSource:
     """What a server holds, and what it held in the last seconds.
 
-    Sees every update that is published. Sees what any client only stores a moment after the server has said that a
-    key was changed: some hundredths of a second, half a second for a key that is published all the time, and as long as
-    8 MB a second of documents take. Keys that are new and only stored are found within a second. A server that does not
-    tell, for want of the right to CLIENT TRACKING, is looked at once a second: arrays that are overwritten by others of
-    their shape are not noticed then, and `status` says so. Arrays of the past are kept as far as the budget allows.
+    Every published update is there, and each stored change a moment after it was made; docs/limits.md says how late.
 
     Args:
         interface: The server; closed with the source.
@@ -83,8 +79,8 @@ class LiveSource:
 
     def status(self) -> Status:
         notes = ["the buffer is full: it reaches back less far than asked for"] if self.history.dropped else []
-        if self._follower.skipped:
-            notes.append(f"{self._follower.skipped} updates came too fast to be kept")
+        if self._follower.monitor.dropped:
+            notes.append(f"{self._follower.monitor.dropped} updates came too fast to be kept")
         if not self._follower.hears_of_changes:
             notes.append(_UNTOLD)
         end = self.history.clock.now()
