@@ -180,14 +180,10 @@ def demo(
 
 
 def _run(port: int | None, page_port: int | None, open_: bool) -> None:
-
     check_packages(None)
     # localhost and not 127.0.0.1: this way clients find the Unix socket, which is quicker.
-    with (
-        _first_of(port, _SERVER_PORT, _server) as server,
-        _programs(f"redis://localhost:{server.port}") as running,
-    ):
-        asyncio.run(_show(server.port, page_port, open_, running))
+    with _first_of(port, _SERVER_PORT, _server) as server, _programs(f"redis://localhost:{server.port}"):
+        asyncio.run(_show(server.port, page_port, open_))
 
 
 def _server(port: int) -> EmbeddedServer:
@@ -207,7 +203,7 @@ def _first_of(wanted: int | None, usual: int, start: Any) -> Any:
 
 
 @contextmanager
-def _programs(url: str) -> Iterator[list[subprocess.Popen[bytes]]]:
+def _programs(url: str) -> Iterator[None]:
     command = [sys.executable, "-m", "reem_async.tools.demo.robot"]
     # In a session of their own: Ctrl-C is for this command, which then ends them.
     running = [
@@ -215,7 +211,7 @@ def _programs(url: str) -> Iterator[list[subprocess.Popen[bytes]]]:
         for name in _PROGRAMS
     ]
     try:
-        yield running
+        yield
     finally:
         for process in running:
             with suppress(OSError):
@@ -228,36 +224,21 @@ def _programs(url: str) -> Iterator[list[subprocess.Popen[bytes]]]:
                 process.wait()
 
 
-async def _show(server_port: int, page_port: int | None, open_: bool, running: list[subprocess.Popen[bytes]]) -> None:
+async def _show(server_port: int, page_port: int | None, open_: bool) -> None:
     from reem_async.tools.browser import LiveSource, PageServer, create_app, listen
 
     source = LiveSource(RedisInterface(f"redis://localhost:{server_port}", timeout=5.0))
     sock = _first_of(page_port, _PAGE_PORT, lambda number: listen("127.0.0.1", number))
-    page = PageServer(create_app(source, allow_write=True), sock)
-    watch = asyncio.create_task(_ended(running, page))
     try:
         await source.start()
         address = f"http://127.0.0.1:{sock.getsockname()[1]}/"
         _describe(server_port, address)
         if open_:
             open_page(address)
-        await page.run_until_stopped()
-        if watch.done():
-            raise CommandFailed(f"the program `{watch.result()}` of the robot has ended by itself")
+        await PageServer(create_app(source, allow_write=True), sock).run_until_stopped()
     finally:
-        watch.cancel()
         sock.close()
         await source.close()
-
-
-async def _ended(running: list[subprocess.Popen[bytes]], page: Any) -> str:
-    """Stop the page as soon as one of the programs has ended; return its name."""
-    while True:
-        for name, process in zip(_PROGRAMS, running, strict=True):
-            if process.poll() is not None:
-                page.stop()
-                return name
-        await asyncio.sleep(0.5)
 
 
 def _describe(port: int, address: str) -> None:
