@@ -17,8 +17,7 @@ import time
 # Niceness: added to that of a program which comes second, and the highest there is.
 _NICER, _NICEST = 5, 19
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # what glibc's mallopt calls them
-_SET_ATTRIBUTES = {"x86_64": 314, "aarch64": 274}
-"""The number of Linux's system call sched_setattr on 64-bit processors; the C library has no name for it."""
+_SET_ATTRIBUTES = {"x86_64": 314, "aarch64": 274}  # Linux's system call sched_setattr, which the C library lacks
 # SCHED_FLAG_RESET_ON_FORK: programs that this one starts are scheduled as usual.
 _RESET_ON_FORK = 1
 _SHORTEST_TURN = 100_000  # nanoseconds; the least that the kernel accepts as a time slice

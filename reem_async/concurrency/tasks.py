@@ -10,8 +10,7 @@ from typing import Any
 
 from .timeouts import forget
 
-_LONGEST_END = 1.0
-"""Seconds to wait for cancelled tasks: a ship of a user's own may be at work in one, and not end at once."""
+_LONGEST_END = 1.0  # seconds to wait for cancelled tasks: a ship of a user's own may be at work in one
 
 
 def started(coroutine: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:

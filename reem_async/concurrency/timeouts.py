@@ -16,13 +16,9 @@ from contextvars import ContextVar
 from ..plan.arguments import check_number
 
 LONGEST = 1e6  # seconds that a time limit may have: eleven days, which is as good as none
-LOOKS = 160
-"""How many times per time limit to look whether a large value is moving: the limit begins at the last look that saw it
-move."""
+LOOKS = 160  # per time limit, whether a large value is moving: the limit begins at the last look that saw it move
 
-_DELAYED = 0.04
-"""Seconds after which the other side's kernel confirms the last bytes, if it has nothing to send with it: TCP's delayed
-acknowledgement. Those before are confirmed at once."""
+_DELAYED = 0.04  # seconds after which the other side's kernel confirms the last bytes: TCP's delayed acknowledgement
 
 _TCP_INFO = getattr(socket, "TCP_INFO", None) if sys.platform == "linux" else None
 _BYTES_ACKED = 120  # where tcpi_bytes_acked is in Linux's struct tcp_info: 64 bits

@@ -24,9 +24,9 @@ from .segment import IDENTITY, MARK, NAME, SEALS, STAMP, Shape, lock_for_reading
 
 _MAPPINGS = 64  # segments that are kept mapped: so many cameras that publish through one host
 
+# Slots of a segment that may be looked into at a time: what a slow callback works on, the newest, and the one that
+# takes its place. A program that keeps more gets copies.
 _PINS = 3
-"""Slots of a segment that may be looked into at a time: what a slow callback works on, the newest, and the one that
-takes its place. A program that keeps more gets copies, so that collecting frames does not use up the slots."""
 
 _IDLE = 10.0  # seconds after which a segment is unmapped that nothing was looked for in
 

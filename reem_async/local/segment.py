@@ -31,20 +31,16 @@ SLOTS = 6  # one that is written, three for a subscriber (see `reader.py`), two 
 NAME = "reem"  # of the file, for a look at the descriptors of a process
 HEAD = 4096  # bytes before the first slot: a page
 
-IDENTITY = struct.Struct("<8sQQ")
-"""What every segment begins with: a mark, how many slots it has, and the bytes of each."""
+IDENTITY = struct.Struct("<8sQQ")  # a mark, how many slots a segment has, and the bytes of each
 MARK = b"REEM\x00\x00\x00\x01"
 
 STAMP = struct.Struct("<Q")
 _STAMPS = 64
 
-_STEP = 1 << 20
-"""Bytes that are allocated at a time: older kernels restart when a signal comes, and timers may send many."""
+_STEP = 1 << 20  # bytes that are allocated at a time: older kernels restart when a signal comes
 
-_FUTURE_WRITE = 0x10
-"""F_SEAL_FUTURE_WRITE of <linux/fcntl.h>, which Python does not name: no mapping to write can be made any more."""
-_POPULATE_WRITE = 23
-"""MADV_POPULATE_WRITE of <sys/mman.h>, which Python does not name: map the pages now, and not at their first touch."""
+_FUTURE_WRITE = 0x10  # F_SEAL_FUTURE_WRITE of <linux/fcntl.h>: no mapping to write can be made any more
+_POPULATE_WRITE = 23  # MADV_POPULATE_WRITE of <sys/mman.h>: map the pages now, and not at their first touch
 SEALS = getattr(fcntl, "F_SEAL_SHRINK", 0) | getattr(fcntl, "F_SEAL_GROW", 0) | _FUTURE_WRITE
 
 

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger("reem.subscribe")
 
 
-_TOLD = frozenset(10**power for power in range(1, 12))
-"""Numbers of equal exceptions of a callback that are worth a line: at 200 Hz each would fill the log."""
+_TOLD = frozenset(10**power for power in range(1, 12))  # numbers of equal exceptions that are worth a line in the log
 
 _GIVEN = "data", "updated_path"  # the names of the first two arguments
 

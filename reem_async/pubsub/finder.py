@@ -14,9 +14,7 @@ from ..session import Session
 logger = logging.getLogger("reem.subscribe")
 
 _PERIOD = 1.0  # seconds between searches
-_PAUSE = 10
-"""The time until the next search is at least so many times as long as the last one took. A server with a million keys
-is asked for a thousand pages, and has other things to do."""
+_PAUSE = 10  # times as long as the last search took, at least, until the next one: a million keys are a thousand pages
 
 
 async def present_keys(session: Session, tops: Iterable[str]) -> set[str]:

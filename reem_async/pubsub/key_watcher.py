@@ -41,8 +41,7 @@ _ESCAPED = re.compile(r"\\(.)", re.DOTALL)
 
 
 _PATIENCE = 0.5  # seconds to wait for what is older: ten times as long as nodes took to pass it on
-_REMEMBERED = 5.0
-"""Seconds for which is remembered what all nodes were told, once the key's own node is listened to: it may be late."""
+_REMEMBERED = 5.0  # seconds for which it is remembered what came of all nodes, once the key's own is listened to
 
 
 class Subscriptions(Protocol):

@@ -25,8 +25,7 @@ from .early import EarlyInbox
 logger = logging.getLogger("reem.subscribe")
 
 Arguments = ParamSpec("Arguments")
-_MOST_WARNINGS = 100
-"""Channels of whose unreadable messages a warning is logged: any client may publish on any number of them."""
+_MOST_WARNINGS = 100  # channels of whose unreadable messages a warning is logged: any client may make up channels
 
 
 class Topic(NamedTuple):

@@ -28,8 +28,7 @@ Item = TypeVar("Item")
 
 # Keys. Beyond that every key is taken to have a gap, once.
 _MOST_OWED = 10_000
-_MOST_GAPS = 100_000
-"""Keys that are heard of after a loss; in a stream of ever new ones, those that come then are taken for new."""
+_MOST_GAPS = 100_000  # keys that are heard of after a loss; what comes then is taken for new
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,7 @@ class Pace(NamedTuple):
 LIVE = Pace(0.001, 0.02)  # of subscribers. A key that is stored at any rate is read 1,000 times a second at most.
 BACKGROUND = Pace(0.02, 0.5, 0.015)
 """Of recordings and the page. Their notices wait for each other up to 10 ms, which is less than the notice delay."""
-BACKGROUND_RATE = 8 << 20
-"""Bytes a second that recordings read of each key for what is only stored, and the page of all keys."""
+BACKGROUND_RATE = 8 << 20  # bytes a second that recordings read of each key for what is stored, the page of all keys
 
 
 class RefreshTimer(Generic[Owner]):

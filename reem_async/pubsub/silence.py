@@ -22,9 +22,8 @@ from .events import Origin, Update
 
 _CURE = "use seconds above 0, such as 0.2, up to a million, or None for no limit"
 
+# Seconds from the end of the time to the report: a busy uvloop calls timers before it reads what has arrived.
 _LOOK = 0.001
-"""Seconds from the end of the time to the report. In between, the event loop reads from its sockets what has arrived
-while it was busy: uvloop calls timers before it does that."""
 
 
 def checked_ttl(ttl: float, path: Path) -> float:

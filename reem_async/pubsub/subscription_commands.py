@@ -15,8 +15,7 @@ from .listeners import Topic
 
 logger = logging.getLogger("reem.subscribe")
 
-_TRACK = ("CLIENT", "TRACKING", "ON")
-"""Not BCAST: that has the server look through the prefixes of all who watch for each write of anybody."""
+_TRACK = ("CLIENT", "TRACKING", "ON")  # not BCAST: the server would compare each write with the prefixes of all
 
 
 class Subscribing:
