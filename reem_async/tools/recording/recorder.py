@@ -81,19 +81,14 @@ class RecorderStatus:
 class Recorder:
     """Records what is published under some patterns of paths, and samples of others, into an MCAP file.
 
-    A context manager: inside of the block it records. Small values come with their
-    notices, large ones are fetched, the newest only; both are as they were published, bit for bit, and in this order.
-    A large one that others changed inside before it was fetched is skipped, and counted; what is left of it is
-    recorded as found, so that the updates inside of it have their place. At the
+    A context manager: inside of the block it records. Values are as they were published, bit for bit,
+    and in this order. A large one that others changed before it was fetched is skipped, and counted. At the
     beginning, every `keyframe` seconds and after each gap the whole of the keys is written, so that any
     instant can be rebuilt quickly. No publisher waits for the recorder. What it cannot keep up with it drops,
     and counts.
 
-    What is only stored, by any client, is recorded a moment after the server has reported that it was changed, as
-    what it led to (`LogUpdate.kind` is "stored"): several changes in a moment are one. The moment is some
-    hundredths of a second; of a key that is published all the time half a second, and as long as 8 MB a second
-    take to read it. A key that is only stored is found within a second of its making. Where the user may not use
-    CLIENT TRACKING, a warning says so, and what is only stored is read at the keyframes.
+    What is only stored, by any client, is recorded a moment later (`LogUpdate.kind` is "stored"): several changes in a
+    moment are one. Where the user may not use CLIENT TRACKING, it is read at the keyframes, and a warning says so.
 
     The file can be read while it grows, and after the recorder was killed but for the last second. It
     is not synchronised to the disk: a power cut costs what the system had not written yet.
@@ -341,9 +336,8 @@ class Recorder:
                 self._keyframe_of_all()
 
     async def _search(self) -> bool:
-        """Follow new keys, if the server reports changes: else keys are read at each keyframe."""
-        if self.hears_of_changes:
-            self._keys.follow(await self._keys.present())
+        if self.hears_of_changes:  # else keys are read at each keyframe
+            await self._look()
         return True
 
     def _catch_up(self) -> None:
@@ -366,17 +360,18 @@ class Recorder:
         """Read what is there at the end: keys may have been stored since the last keyframe."""
         if self._connected and self.writer_thread.failure is None:
             with contextlib.suppress(RedisError, OSError):
-                if self.hears_of_changes:
-                    self._keys.follow(await self._keys.present())
-                    self._keys.look_at_once()
-                    await self._keys.settled(_PATIENCE)
-                else:
-                    await self._look()
+                await self._look()
+                self._keys.look_at_once()
+                await self._keys.settled(_PATIENCE)
 
     async def _look(self) -> None:
-        """Read keys of which no server reports whether they were stored since the last keyframe."""
-        self._keys.read_silent(await self._keys.present())
-        await self._keys.settled(_PATIENCE)
+        """Follow new keys; if no server reports what was stored since the last keyframe, read all that are there."""
+        present = await self._keys.present()
+        if self.hears_of_changes:
+            self._keys.follow(present)
+        else:
+            self._keys.read_silent(present)
+            await self._keys.settled(_PATIENCE)
 
     def _keyframe_of_all(self) -> None:
         self._keyframes += 1
