@@ -190,7 +190,7 @@ class Subscribers:
             except OSError as error:
                 if str(error) != self._reported:
                     self._reported = str(error)
-                    logger.warning("local='early': updates go through the server: %s", error)
+                    logger.warning("early updates are not possible here, all go through the server: %s", error)
                 return b""
         self._known.setdefault(channel, {})
         while len(self._known) > _CHANNELS:
