@@ -1,6 +1,7 @@
 """The page as something one leaves open all day: what it marks, says and plots."""
 
 # ruff: noqa: F811 - fixtures are named as arguments
+import contextlib
 import re
 import time
 
@@ -11,6 +12,7 @@ from conftest import eventually, repeated
 from pagekit import Visitor, address, chromium, playwright, row, visit  # noqa: F401
 
 from reem.server import EmbeddedServer
+from reem_async.errors import RemoteError
 from reem_async.tools.browser.history import History
 from reem_async.tools.browser.trees import differing
 
@@ -262,6 +264,18 @@ def test_the_first_page_shows_busy_keys_and_what_is_pinned_instead(visit, pspace
     expect(page.locator(".pane .pane-head a")).to_have_text([f"{key('quiet')}.y"])
     page.locator(".pin").click()
     expect(page.locator("#view h2")).not_to_have_text("Pinned")
+
+
+def test_the_first_page_lists_services(visit, kvs, key):
+    with kvs[key()].serve(lambda x: 1 / x):
+        page = visit.open("/")
+        row = page.locator(".services tbody tr").filter(has_text=key())
+        expect(row.locator("td").last).to_have_text("0")
+        for x in (1, 0):
+            with contextlib.suppress(RemoteError):
+                kvs[key()].call(x=x)
+        expect(row.locator("td").last).to_have_text("1")
+        expect(row.locator("td").nth(4)).to_have_text(re.compile(r"\d ms"))
 
 
 @pytest.mark.long

@@ -404,6 +404,7 @@ def test_a_stopped_server_is_noticed_and_begins_nothing_later(caller, server_url
         with pytest.raises(ServiceLost, match=r"0\.9 s"):
             caller[key()].call(number=5, done=str(tmp_path / "done"))
         assert time.monotonic() - began < sized(4, 2)
+        time.sleep(0.1)  # a program says in the background that it has left
         process.send_signal(signal.SIGCONT)
         eventually(lambda: answers(caller[key()]))
         assert not (tmp_path / "done").exists()

@@ -73,11 +73,15 @@ def _caller_of(session: Session, keys: Keys) -> Caller:
     return caller
 
 
-async def statistics(session: Session) -> list[dict[str, Any]]:
+async def statistics(session: Session, record: float = 0.0) -> list[dict[str, Any]]:
     """Return a dict for each server of each service in the namespace, sorted; waits up to a second for what they say.
 
     It has "service" (the path as text), "host", "pid", "calls" and "errors" since it began, "rate" (calls per second)
     and "median" (seconds) of the last 200, and "waiting"; None in the place of what a server did not say.
+
+    Args:
+        session: The server.
+        record: For so many seconds from now on the servers publish their calls under the key `services.CALLS`.
 
     Raises:
         NotAllowed: The user lacks a right; says which.
@@ -88,7 +92,8 @@ async def statistics(session: Session) -> list[dict[str, Any]]:
         for channel in await _channels(node, pattern, sharded=session.transport.sharded):
             if (names := Names.of(channel, session.keys, session.namespace)) is not None:
                 found[channel] = names
-    stated = await asyncio.gather(*(_caller_of(session, names.keys).ask(channel) for channel, names in found.items()))
+    asked = [_caller_of(session, names.keys).ask(channel, record) for channel, names in found.items()]
+    stated = await asyncio.gather(*asked)
     rows = [
         {"service": show((names.keys.name, *names.path)), **said}
         for names, said in zip(found.values(), stated, strict=True)
@@ -443,10 +448,10 @@ class Caller(Listener):
             if call.instance is instance:
                 call.end(ServiceLost(f"{call.where}: {why}; the request may or may not have been handled"))
 
-    async def ask(self, channel: str) -> dict[str, Any]:
+    async def ask(self, channel: str, record: float) -> dict[str, Any]:
         """Return what a server says of itself; None for each if it says nothing within a second."""
         await self._follow()
-        ping = Message(messages.PING, new_id(), self.id)
+        ping = Message(messages.PING, new_id(), self.id, record)
         answer = self._asked[ping.call] = asyncio.get_running_loop().create_future()
         said: dict[str, Any] = dict.fromkeys((*_STATED, "waiting"))
         try:

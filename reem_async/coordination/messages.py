@@ -71,7 +71,9 @@ class Message(NamedTuple):
     kind: str
     call: str  # the id of the call or of the ping
     sender: str  # the id of the caller or of the server
-    number: float = 0.0  # of a caller: seconds that are left; of a server: requests that wait or are handled there
+    # Of a CALL: seconds that are left; of a PING: for how many seconds calls are to be published, see `services.CALLS`;
+    # of a server: requests that wait or are handled there
+    number: float = 0.0
     # CALL, ANSWER: the sender's host, for shared memory, and its mailbox, if any; FAILED: type, message, traceback
     words: Sequence[str] = ()
     content: Content | None = None
@@ -181,16 +183,20 @@ def bare(message: Message) -> bytes:
 
 def failure(message: Message, error: BaseException, trace: str) -> bytes:
     """Return the message that a function raised."""
-    try:
-        text = str(error)
-    except BaseException:  # its __str__ is the user's
-        text = "(its text cannot be shown)"
-    words = [(type(error).__qualname__, 200), (text, 4096), (trace, LONGEST_TEXT)]
+    words = [(type(error).__qualname__, 200), (text_of(error), 4096), (trace, LONGEST_TEXT)]
     return bare(message._replace(kind=FAILED, words=[_shortened(*each) for each in words]))
 
 
+def text_of(error: BaseException) -> str:
+    """Return the text of an error, as JSON can hold it."""
+    try:
+        return str(error).encode("utf-8", "replace").decode()  # JSON has no halves of surrogate pairs
+    except BaseException:  # its __str__ is the user's
+        return "(its text cannot be shown)"
+
+
 def _shortened(text: str, longest: int) -> str:
-    text = text.encode("utf-8", "replace").decode()  # JSON has no halves of surrogate pairs
+    text = text.encode("utf-8", "replace").decode()
     return text if len(text) <= longest else f"...{text[3 - longest :]}"
 
 

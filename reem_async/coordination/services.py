@@ -17,6 +17,7 @@ import queue
 import socket
 import statistics
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -30,6 +31,7 @@ from ..errors import (
     BadType,
     InterfaceClosed,
     NotAllowed,
+    PathRefused,
     RedisError,
     ReemError,
     Refused,
@@ -40,10 +42,12 @@ from ..plan import Command, Reply
 from ..plan.arguments import whole
 from ..plan.keys import Keys
 from ..plan.paths import Path, shorten, show
+from ..plan.writes import make_parents
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import manager_of
 from ..session import Session
 from ..store.encoding import Encoder
+from ..store.publish import publisher
 from . import messages
 from .calls import explained, new_id, opened, publish
 from .direct import Post
@@ -57,6 +61,8 @@ _RETRY = 0.1  # seconds between tries to send an answer while the connection is 
 _PAUSE = 0.5  # seconds between tries to begin
 _PERIOD, _STALE = 0.25, 0.75  # seconds between probes whether messages arrive in time, and after which they do not
 _REMEMBERED = 20  # answers in shared memory that may have to be sent again
+_LONGEST_RECORD = 10.0  # seconds for which calls are published unless a recorder asks again
+CALLS = "_calls"  # the key under which calls are published while a recorder asks for them, by service
 _RECENT = 200  # calls whose time is remembered
 
 
@@ -112,14 +118,16 @@ def _hand_over(done: asyncio.Future[Any], outcome: Any) -> None:
 class Request:
     """One request, until it is answered or left."""
 
-    def __init__(self, message: Message, leave: Callable[[Request], None]) -> None:
+    def __init__(self, message: Message, leave: Callable[[Request], None], is_stale: bool) -> None:
         loop = asyncio.get_running_loop()
         self.message = message
         # The caller says how many seconds are left, since its clock is another one.
         self.deadline = loop.time() + message.number
         self.timer = loop.call_at(self.deadline, leave, self)
+        self.is_stale = is_stale  # it may have been on its way for long, and its caller may have left
         self.is_left = False  # nothing waits for the answer any more
         self.cancel: Callable[[], object] | None = None  # ends an asynchronous function
+        self.record: dict[str, Any] | None = None  # what is published of it for recorders
 
 
 class Served(Listener):
@@ -154,6 +162,7 @@ class Served(Listener):
         # All that was sent before this had arrived by now; see `_handle`.
         self._proved = self._loop.time()
         self._calls = self._errors = 0  # how many were answered, and with an exception
+        self._recorded_until = 0.0  # calls are published until then
         # When the last calls ended, and how many seconds they took
         self._times: collections.deque[tuple[float, float]] = collections.deque(maxlen=_RECENT)
 
@@ -198,6 +207,7 @@ class Served(Listener):
 
     def on_probe(self, kind: Reply, sent: float) -> None:
         """Note that what was sent until then has arrived."""
+        self._post.read()
         self._proved = sent
 
     def on_message(self, payload: bytes) -> None:
@@ -215,6 +225,8 @@ class Served(Listener):
                 elif request.message.sender == message.sender:
                     self._leave(request)
             case messages.PING:
+                if message.number:
+                    self._recorded_until = self._loop.time() + min(message.number, _LONGEST_RECORD)
                 self._reply_soon(message, messages.PONG)
             case messages.UNREAD:
                 for request, answer in self._shared:
@@ -233,8 +245,12 @@ class Served(Listener):
         elif message.content.is_missing:
             self._reply_soon(message, messages.UNREAD)
         else:
-            self._waiting[call] = Request(message, self._leave)
+            self._waiting[call] = Request(message, self._leave, self._is_stale)
             self._begin_next()
+
+    @property
+    def _is_stale(self) -> bool:
+        return self._loop.time() - self._proved > _STALE
 
     def _leave(self, request: Request) -> None:
         request.is_left = True
@@ -253,19 +269,23 @@ class Served(Listener):
 
     async def _handle(self, request: Request) -> None:
         """Call the function for a request, and send the answer."""
-        began = self._loop.time()
+        began = time.monotonic()  # an event loop's clock may count milliseconds
         try:
             # A stopped process, a busy event loop or a link that stood still gets old requests, with the message
             # behind them that their callers have left. So nothing is begun before all that waits has arrived.
-            if began - self._proved > _STALE:
+            if request.is_stale or self._is_stale:
                 try:
                     await self._manager.fence(())
+                    self._post.read()
                 except (ReemError, RedisError):
                     self._reply_soon(request.message, messages.CLOSED)
                     return
             if not request.is_left:
                 await self._answer(request)
-                self._times.append((self._loop.time(), self._loop.time() - began))
+                seconds = time.monotonic() - began
+                self._times.append((self._loop.time(), seconds))
+                if request.record is not None:
+                    await self._publish(request.record | {"seconds": seconds})
         except (ReemError, RedisError) as error:
             logger.warning("an answer of %s could not be sent: %s", self.where, error)
         except asyncio.CancelledError:
@@ -286,6 +306,8 @@ class Served(Listener):
             request.message = message = message._replace(content=None)  # its memory is the caller's
             if request.is_left:
                 return
+            if self._loop.time() < self._recorded_until:
+                request.record = {"arguments": given}
             result = await self._called(request, given)
             del given
             value = await Encoder(self._session, self._names.keys._replace(tag=prefix)).encoded(
@@ -298,9 +320,13 @@ class Served(Listener):
                 raise
             self._calls += 1
             self._errors += 1
+            if request.record is not None:
+                request.record["error"] = f"{type(error).__qualname__}: {messages.text_of(error)}"
             await self._send(request, self._failure(message, error))
         else:
             self._calls += 1
+            if request.record is not None:
+                request.record["answer"] = result
             slots = self._names.keys._replace(channel=messages.answers(self._names.keys, message.sender))
             local = self._session.local
             put = partial(local.put, slots) if local.host and message.words[0] == local.host else None
@@ -319,6 +345,18 @@ class Served(Listener):
             return await result
         finally:
             request.cancel = None
+
+    async def _publish(self, call: dict[str, Any]) -> None:
+        """Publish a call for recorders, before the function may use its arrays again."""
+        writer, place = publisher(self._session, CALLS, "raise"), (self.where,)
+        try:
+            try:
+                await writer.set(place, call)
+            except PathRefused:  # the first one
+                await self._session.run(make_parents(self._session.keys(CALLS), place))
+                await writer.set(place, call)
+        except (ReemError, RedisError) as error:
+            logger.warning("a call of %s is not in the recording: %s", self.where, error)
 
     # Answers.
 

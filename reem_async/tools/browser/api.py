@@ -171,6 +171,7 @@ _MOST_POINTS = 1200
 _MOST_FOUND = 60
 _LONGEST_TEXT = 200_000
 _MOST_PARAMETERS = 200
+_MOST_SERVERS = 200  # of services that the first page lists
 
 
 class Api:
@@ -183,7 +184,7 @@ class Api:
         self.key = secrets.token_urlsafe(24)
 
     def routes(self) -> list[Route]:
-        asked = self.tree, self.series, self.activity, self.search, self.parameters
+        asked = self.tree, self.series, self.activity, self.search, self.parameters, self.services
         routes = [Route(f"/{handler.__name__}", answered(handler), methods=["GET"]) for handler in asked]
         routes.append(Route("/node", told(self.node), methods=["GET"]))
         routes.append(Route("/json", answered(self.json), methods=["GET"]))
@@ -267,6 +268,11 @@ class Api:
     async def parameters(self, request: Request) -> Response:
         found = await self._source.parameters(path_in(request))
         return reply({"parameters": [_control(it) for it in found[:_MOST_PARAMETERS]]})
+
+    async def services(self, request: Request) -> Response:
+        """Return a row for each server of each service, as `reem services` shows it."""
+        rows = await self._source.services()
+        return reply({"services": [row | {"service": visible(row["service"])} for row in rows[:_MOST_SERVERS]]})
 
     async def write(self, request: Request) -> Response:
         """Publish a value, if that is allowed, and asked by a page from here."""

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...connection import RedisInterface
+from ...coordination.calls import statistics
 from ...coordination.parameters import SPECIFICATIONS, StoredParameter, publish, stored_parameters
 from ...errors import BadType, ConnectionLost, MissingKey, NotAllowed, NotConnected, ServerNotReady
 from ...plan.paths import Path, show
@@ -215,6 +216,12 @@ class LiveSource:
         except NotAllowed:  # to read `_parameters`: the page shows all the rest
             return []
         return list(found.values())
+
+    async def services(self) -> list[dict[str, Any]]:
+        try:
+            return await statistics(self.interface.session)
+        except NotAllowed:  # the page shows all the rest
+            return []
 
     async def write(self, path: Path, value: Any) -> None:
         """Publish a value in the place of a plain one; subscribers learn of it. Up to five round trips.

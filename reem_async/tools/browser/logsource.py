@@ -163,6 +163,9 @@ class LogSource:
     async def parameters(self, path: Path) -> list[StoredParameter]:
         return []  # they cannot be set; `_parameters` is shown as any key
 
+    async def services(self) -> list[dict[str, Any]]:
+        return []  # none of them runs any more
+
     async def write(self, path: Path, value: Any) -> None:
         raise ReadOnly("a recording cannot be changed; play it into a server with `reem play`")
 

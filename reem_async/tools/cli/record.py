@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import AbstractAsyncContextManager
+from collections.abc import AsyncIterator
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,10 @@ import typer
 
 from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
 from reem_async.connection import RedisInterface
-from reem_async.errors import BadValue
+from reem_async.coordination.calls import statistics
+from reem_async.coordination.services import CALLS
+from reem_async.errors import BadValue, RedisError, ReemError
+from reem_async.store.store import KeyValueStore
 from reem_async.tools.cli.following import progress
 from reem_async.tools.cli.options import (
     DEFAULT_URL,
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
 
 # Seconds between two lines that say how it is getting on.
 _SHOWN_EVERY = 0.5
+_ASKED_EVERY = 1.0  # seconds between two questions to the servers of services to publish their calls
 
 
 def record(
@@ -54,6 +59,7 @@ def record(
     compression: Annotated[str, typer.Option(metavar="NAME", help="zstd, lz4 or none.")] = "zstd",
     force: Force = False,
     ships: Ships = None,
+    services: Annotated[bool, typer.Option("--services", help="Record calls of services too, under _calls.")] = False,
     background: Annotated[bool, typer.Option("--background", help="Use only idle processor time.")] = False,
     as_json: AsJson = False,
     url: Url = DEFAULT_URL,
@@ -71,15 +77,21 @@ def record(
     everything that is published from then on. Ctrl-C before that leaves no file; the exit code is 130.
 
     The recorder gives way to the programs that it records, and uses the server's Unix socket where there is one.
+    With --services, the servers of services publish each call that they have answered, with arguments, answer (or
+    error) and seconds, under the key _calls, by service. It is removed at the end.
+
     With --background it disturbs them least, but drops and counts updates if they use all processors.
 
     Examples:
         reem record -o run.mcap
         reem record arm 'cam_*' --duration 60
         reem record --background            beside a tight control loop
+        reem record --services policy       its updates, and all calls
         reem record --sample keys.csv       its lines: arm.joint, 0.01
     """
     wanted = list(patterns or ()) or ([] if sample is not None else ["*"])
+    if services and "*" not in wanted:
+        wanted.append(CALLS)
 
     async def work(interface: RedisInterface) -> int:
         from reem_async.tools.recording import Recorder
@@ -107,7 +119,7 @@ def record(
             async with recorder:
                 begun = True
                 _begin(recorder, duration, as_json)
-                async with _progress(recorder, as_json):
+                async with _calls(interface) if services else nullcontext(), _progress(recorder, as_json):
                     await recorder.wait(duration)
         except asyncio.CancelledError:  # Ctrl-C is how a recording ends; it may have failed all the same
             if not begun:  # there is no recording
@@ -123,6 +135,26 @@ def record(
     with guarded("record"):
         own = named_ships(ships)
     run("record", work, url, namespace, ships=own)
+
+
+@asynccontextmanager
+async def _calls(interface: RedisInterface) -> AsyncIterator[None]:
+    """Have the servers of services publish their calls meanwhile."""
+
+    async def ask() -> None:
+        while True:
+            with suppress(ReemError, RedisError, OSError):  # an outage
+                await statistics(interface.session, record=3 * _ASKED_EVERY)
+            await asyncio.sleep(_ASKED_EVERY)
+
+    asking = asyncio.create_task(ask())
+    try:
+        yield
+    finally:
+        asking.cancel()
+        with suppress(ReemError, RedisError, OSError):
+            await statistics(interface.session, record=0.001)
+            await KeyValueStore(interface)[CALLS].delete()
 
 
 def _progress(recorder: Recorder, as_json: bool) -> AbstractAsyncContextManager[None]:

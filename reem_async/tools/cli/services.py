@@ -18,6 +18,8 @@ from reem_async.tools.cli.running import NOTHING, TIMED_OUT, USAGE, CommandFaile
 from reem_async.tools.cli.values import FILES, parse_value, preview, save
 from reem_async.tools.partfile import there_already
 
+HEADS = ("service", "host", "pid", "calls", "per second", "median", "errors", "waiting")
+
 
 def call(
     path: PathArgument,
@@ -77,9 +79,9 @@ def services(
 ) -> None:
     """List the services, with what each of their servers says.
 
-    A line for each server: where it runs, how many calls it has answered since it began and how often, the median of
-    the last 200 times, the calls that raised an exception, and the requests that wait or are being handled. A server
-    that does not answer within a second has none of these.
+    A line for each server: where it runs, how many calls it has answered since it began, the rate and median time of
+    the last 200, the calls that raised an exception, and the requests that wait or are being handled. A server that
+    does not answer within a second has none of these.
 
     Examples:
         reem services
@@ -94,13 +96,12 @@ def services(
         if not rows:
             note("no services")
             return
-        heads = ("service", "host", "pid", "calls", "per second", "median", "errors", "waiting")
-        columns([heads, *map(_cells, rows)], [""] * len(heads), right=frozenset(range(2, 8)))
+        columns([HEADS, *map(service_cells, rows)], [""] * len(HEADS), right=frozenset(range(2, 8)))
 
     run("services", work, url, namespace)
 
 
-def _cells(row: dict[str, Any]) -> list[str]:
+def service_cells(row: dict[str, Any]) -> list[str]:
     """Return a line of the table; a dash for what a server did not say."""
     said = [
         row["pid"],

@@ -11,7 +11,7 @@ import time
 import tty
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from statistics import fmean, pstdev
 from typing import Any, NamedTuple
@@ -22,11 +22,14 @@ from rich.table import Table
 from rich.text import Text
 
 from reem_async.connection import RedisInterface
+from reem_async.coordination.calls import statistics
+from reem_async.errors import RedisError, ReemError
 from reem_async.pubsub.monitor import Event
 from reem_async.tools.cli.following import Ending, follow
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Count, Namespace, Patterns, Timeout, Url
 from reem_async.tools.cli.output import emit, emit_json, is_terminal, note, size_text, typed
 from reem_async.tools.cli.running import run
+from reem_async.tools.cli.services import HEADS, service_cells
 
 _WINDOW = 1000  # updates of a path that count: five seconds of an IMU at 200 Hz, half a minute of a camera
 _DRAW_SECONDS = 0.25  # people can read numbers that change four times a second
@@ -180,6 +183,7 @@ class Board:
     def __init__(self, view: View) -> None:
         self.view = view
         self.windows: dict[str, Window] = {}
+        self.services: list[dict[str, Any]] = []  # of the view of `reem top`: what the servers say, see `statistics`
         self._reported: dict[str, int] = {}
 
     def take(self, event: Event, _: Ending | None = None) -> None:
@@ -204,7 +208,19 @@ class Board:
                 cells = zip(self.view.headers, self.view.cells(window), strict=True)
                 texts = [f"{title} {cell}" for title, cell in cells]
                 emit(f"{path}: {', '.join(texts)}, updates {window.total}, lost {window.lost}")
+        for row in self.services:
+            if as_json:
+                emit_json({**row, "time": time.time(), "final": final})
+            else:
+                emit(", ".join([f"{head} {cell}" for head, cell in zip(HEADS, service_cells(row), strict=True)]))
         sys.stdout.flush()
+
+    async def ask_services(self, interface: RedisInterface) -> None:
+        """Ask the servers of services each second how they are doing."""
+        while True:
+            with suppress(ReemError, RedisError, OSError):  # a missing right, or an outage: the updates are shown
+                self.services = await statistics(interface.session)
+            await asyncio.sleep(1.0)
 
     def doubled(self) -> dict[str, int]:
         """Return the paths that several programs publish at the same time, and how many they are."""
@@ -243,6 +259,16 @@ def table(board: Board, waiting: str, width: int, height: int) -> Group:
     return Group(drawn, *notes)
 
 
+def services_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Return a line for each server of each service."""
+    drawn = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for place, head in enumerate(HEADS):
+        drawn.add_column(head, no_wrap=True, justify="right" if place > 1 else "left")
+    for row in rows:
+        drawn.add_row(*map(Text, service_cells(row)), style="red" if row["errors"] else "")
+    return drawn
+
+
 def _line(text: str, style: str) -> Text:
     return Text(text, style=style, no_wrap=True, overflow="ellipsis")
 
@@ -254,7 +280,9 @@ def _drawing(board: Board, waiting: str) -> Iterator[Callable[[Ending | None], N
     with Live(console=console, auto_refresh=False, vertical_overflow="crop") as live:
 
         def draw(_: Ending | None = None) -> None:
-            live.update(table(board, waiting, console.width, console.height), refresh=True)
+            below = [services_table(board.services)] if board.services else []
+            room = console.height - sum(each.row_count + 1 for each in below)
+            live.update(Group(table(board, waiting, console.width, room), *below), refresh=True)
 
         draw()
         yield draw
@@ -303,6 +331,8 @@ def _command(name: str, view: View, text: str, *, stored: bool = False) -> Calla
             )
 
         async def work(interface: RedisInterface) -> int:
+            if view is ALL:
+                interface.session.tasks.start(board.ask_services(interface), "reem top of services")
             if is_terminal() and not as_json:
                 waiting = f"waiting for updates of {', '.join(wanted) or 'any key'}"
                 with _ended_by_q(), _drawing(board, waiting) as draw:
@@ -325,12 +355,12 @@ def _command(name: str, view: View, text: str, *, stored: bool = False) -> Calla
 top = _command(
     "top",
     ALL,
-    """Show what is published: a live table of keys, until q or Ctrl-C (exit code 0).
+    """Show what is published and served: live tables of keys and services, until q or Ctrl-C (exit code 0).
 
 The columns of a top-level key: updates a second, bytes a second, delay, seconds since the last update, and how many
 programs publish it. A key with several publishers at once is marked, since each overwrites the other. "shared" says
 that large updates also go through shared memory, to programs on the publisher's host that asked for them. Nothing is
-fetched. Writes of a KeyValueStore do not count.
+fetched. Writes of a KeyValueStore do not count. The table of services has a line for each server, as `reem services`.
 
 Examples:
     reem top

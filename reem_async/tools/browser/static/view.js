@@ -7,7 +7,7 @@ import { Tree } from "./tree.js";
 import { addressUrl, ageText, bodyOf, bytesText, copy, el, fetched, getJson, getPicture, nameOf, postWrite, query, setNumbers, setText, steps, swap, toast, visible } from "./util.js";
 
 const LONGEST = 16; // items of a list that are drawn over time
-const BUSY = 6, OF_EACH = 3, BUSY_PAUSE = 5000, FRESH = 10;
+const BUSY = 6, OF_EACH = 3, BUSY_PAUSE = 5000, SERVICES_PAUSE = 2000, FRESH = 10;
 // The keys on the first page, the panes of each, ms until others may take their place, s in which a number must have come.
 const SCALARS = ["str", "int", "float", "bool", "NoneType"];
 const NUMBERS = ["int", "float", "bool"];
@@ -238,6 +238,7 @@ class Home {
       el("p", {}, el("kbd", {}, "/"), " searches, ", el("kbd", {}, "?"), " shows the keyboard."));
     parent.append(this.title, this.hint);
     this.panes = new Panes(parent, app);
+    this.services = new Services(parent, app);
     this.panes.onPin = () => app.refresh();
     this.busy = [];
   }
@@ -249,6 +250,7 @@ class Home {
     this.hint.hidden = nodes.length > 0;
     this.panes.picturesFirst = !pins.length; // pinned ones stay in the order that the visitor gave them
     await this.panes.update(nodes, signal);
+    await this.services.update(signal);
   }
 
   async pinned(pins, signal) {
@@ -273,6 +275,27 @@ class Home {
       return this.panes.choose(below.sort((one, other) => (other.kind === "numpy") - (one.kind === "numpy"))).slice(0, OF_EACH);
     });
     return this.panes.choose(picked.sort((one, other) => (other.kind === "numpy") - (one.kind === "numpy")));
+  }
+}
+
+// On the first page, a line for each server of each service, as of now.
+class Services {
+  constructor(parent, app) {
+    this.app = app;
+    this.next = 0;
+    this.lines = el("tbody");
+    const heads = ["service", "host", "pid", "calls/s", "median", "errors"].map((text) => el("th", { scope: "col" }, text));
+    this.element = el("section", { class: "card services", hidden: true, "aria-label": "Services" }, el("table", {}, el("thead", {}, el("tr", {}, ...heads)), this.lines));
+    parent.append(this.element);
+  }
+
+  async update(signal) {
+    if (!this.app.config.live || performance.now() < this.next) return;
+    this.next = performance.now() + SERVICES_PAUSE;
+    const { services } = await getJson("services", {}, signal);
+    const cells = (it) => [it.service, it.host, it.pid, it.rate?.toFixed(1), it.median === null ? null : `${(it.median * 1000).toFixed(1)} ms`, it.errors];
+    this.lines.replaceChildren(...services.map((it) => el("tr", {}, ...cells(it).map((cell) => el("td", {}, `${cell ?? "-"}`)))));
+    this.element.hidden = !services.length;
   }
 }
 
