@@ -116,21 +116,20 @@ class Frames:
         paths, the least old in the sum that the bytes allow.
         """
         shortest = 1e-5 * self._seconds
-        while self.bytes > most:
+        while self.bytes > most and any(self._lines.values()):
             shortest *= 1.2
             for path, line in list(self._lines.items()):
                 # Without the first there would be nothing at all for a while: it counts for two spans.
                 left, kept = now - 3 * self._seconds, []
                 for frame in line:
-                    short = self.bytes > most and frame.time - left < shortest * frame.size**0.5
-                    if short and _has_both(frame):
-                        self._drop_whole(frame)
-                        short = False
-                    if short:
+                    is_soon = self.bytes > most and frame.time - left < shortest * frame.size**0.5
+                    if is_soon and not _has_both(frame):
                         self._empty(frame)
-                    else:
-                        kept.append(frame)
-                        left = frame.time
+                        continue
+                    if is_soon:
+                        self._drop_whole(frame)  # its preview stays
+                    kept.append(frame)
+                    left = frame.time
                 self._lines[path] = kept
         self._lines = {path: line for path, line in self._lines.items() if line}
 

@@ -36,7 +36,8 @@ def complete_path(ctx: typer.Context, incomplete: str) -> list[str]:
 
 async def _names(url: str, namespace: str, incomplete: str) -> list[str]:
     async with interface_to(url, namespace, _SECONDS) as interface:
-        store, (begun, dot, _) = KeyValueStore(interface), incomplete.rpartition(".")
+        store = KeyValueStore(interface)
+        begun, dot, _ = incomplete.rpartition(".")
         outer = parse(begun) if dot else ()
         if outer:  # nothing of the dict is fetched but its keys
             keys = await store.at(begun).keys()
