@@ -163,6 +163,8 @@ class TolerantKVSVar:
         self.node: Accessor = server[path]
         self.path: list[str | int] = list(self.node.full_path)
         self.refreshRate = refreshRate
+        # The variable that keeps the value, and this place in it.
+        self._keeper, self._below = self, list[str | int]()
         # The value, and until when on the monotonic clock it is taken for the server's.
         self._kept: tuple[Any, float] | None = None
 
@@ -172,15 +174,16 @@ class TolerantKVSVar:
         return copied(self._current())
 
     def _current(self) -> Any:
-        if self._kept is not None and time.monotonic() < self._kept[1]:
-            return self._kept[0]
-        value = self.node.read()
-        if self.refreshRate:
-            self._kept = value, time.monotonic() + self.refreshRate
-        return value
-
-    def _forget(self) -> None:
-        self._kept = None
+        if not self.refreshRate:
+            return self.node.read()
+        # The whole variable is read at once, and answers for all its places until its time is over.
+        keeper = self._keeper
+        if keeper._kept is None or time.monotonic() >= keeper._kept[1]:
+            keeper._kept = keeper.node.read(), time.monotonic() + self.refreshRate
+        try:
+            return extract_object(keeper._kept[0], self._below)
+        except (LookupError, TypeError):
+            raise MissingKey(f"nothing is stored at {'.'.join(map(str, self.path))}") from None
 
     def set(self, value: Any) -> None:
         """Store a value, creating the dicts on the way that are missing."""
@@ -195,11 +198,13 @@ class TolerantKVSVar:
             change()
         # Also when it failed: it may have been applied.
         finally:
-            self._forget()
+            self._keeper._kept = None
         return self
 
-    def __getitem__(self, key: str | int) -> TolerantKVSVarSubkey:
-        return TolerantKVSVarSubkey(self, key)
+    def __getitem__(self, key: str | int) -> TolerantKVSVar:
+        inner = TolerantKVSVar(self.server, [*self.path, key], self.refreshRate)
+        inner._keeper, inner._below = self._keeper, [*self._below, key]
+        return inner
 
     def __setitem__(self, key: str | int, value: Any) -> None:
         self[key].set(value)
@@ -230,25 +235,7 @@ class TolerantKVSVar:
         return f"{'.'.join(map(str, self.path))}={self.get()}"
 
 
-class TolerantKVSVarSubkey(TolerantKVSVar):
-    """A place below a variable: it answers from what the variable has kept."""
-
-    def __init__(self, parent: TolerantKVSVar, key: str | int) -> None:
-        super().__init__(parent.server, [*parent.path, key], parent.refreshRate)
-        self.parent = parent
-        self.key = key
-
-    def _current(self) -> Any:
-        if not self.refreshRate:
-            return super()._current()
-        try:
-            # The whole variable is read at once, and answers for all its places until its time is over.
-            return self.parent._current()[self.key]
-        except (LookupError, TypeError):
-            raise MissingKey(f"nothing is stored at {'.'.join(map(str, self.path))}") from None
-
-    def _forget(self) -> None:
-        self.parent._forget()
+TolerantKVSVarSubkey = TolerantKVSVar
 
 
 # --- paths as text, and nested dicts

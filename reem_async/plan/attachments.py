@@ -16,7 +16,7 @@ from .keys import Keys
 from .paths import Path, below, may_hold, parse_suffix, show
 from .placeholders import find
 from .reads import get_command
-from .replies import checked, diagnose, explained, full, loads, registered
+from .replies import diagnose, explained, full, loads, registered
 from .shapes import ShapeCache
 from .sizes import Staged
 
@@ -56,38 +56,39 @@ def _referred(text: Reply, keys: Keys) -> set[bytes]:
 
 
 def clean(
-    keys: Keys, cache: ShapeCache, then: Callable[[], Any], unfinished: Callable[[Exception], Exception] | None = None
+    keys: Keys,
+    cache: ShapeCache,
+    then: Callable[[list[bytes]], Any],
+    unfinished: Callable[[Exception], Exception] | None = None,
+    found: Sequence[bytes] = (),
 ) -> Plan:
-    """Plan to remove the attachments that the document does not refer to, then go on with `then`.
+    """Plan to remove the attachments that the document does not refer to, then go on with `then`, which gets them.
 
-    Under WATCH: if another client writes to the document in between, it starts again. `unfinished` is that of `Plan`.
+    Under WATCH: if another client writes to the document in between, it starts again. `unfinished` is that of `Plan`,
+    `found` that of `orphans`.
     """
 
     def look(replies: Sequence[Reply]) -> Any:
         permitted(replies[0], keys.document, keys.registry)
-        text = replies[1]
-        if isinstance(text, Exception):
-            if not isinstance(explained(text, keys, ()), WrongKind):  # so what the document refers to is unknown
-                return Plan([("UNWATCH",)], lambda _: then(), held=True)
-            text = None  # a foreign type refers to nothing
-        members = registered(replies[2], keys)
-        orphans = sorted(members - _referred(text, keys))
-        cache.of(keys.document).saw_members(members)
-        if not orphans:
-            return Plan([("UNWATCH",)], lambda _: then(), held=True)
+        text, gone, members = replies[1], list[bytes](), frozenset[bytes]()
+        # With another error it is unknown what the document refers to.
+        if not isinstance(text, Exception) or isinstance(explained(text, keys, ()), WrongKind):
+            members, gone = registered(replies[2], keys), _orphans(replies[1:], keys, found)
+            cache.of(keys.document).saw_members(members)
+        if not gone:
+            return Plan([("UNWATCH",)], lambda _: then(gone), held=True)
         tag = keys.tag.encode()
-        removal = [("UNLINK", *(tag + orphan for orphan in orphans)), ("SREM", keys.registry, *orphans)]
-        left = members - frozenset(orphans)
-        return Plan(removal, lambda replies: remove(replies, left), atomic=True, held=True, unfinished=unfinished)
+        removal = [("UNLINK", *(tag + orphan for orphan in gone)), ("SREM", keys.registry, *gone)]
+        left = members - frozenset(gone)
+        return Plan(removal, lambda replies: remove(replies, gone, left), atomic=True, held=True, unfinished=unfinished)
 
-    def remove(replies: Sequence[Reply] | None, left: frozenset[bytes]) -> Any:
+    def remove(replies: Sequence[Reply] | None, gone: list[bytes], left: frozenset[bytes]) -> Any:
         if replies is None:  # the document was changed in between
-            return clean(keys, cache, then, unfinished)
+            return clean(keys, cache, then, unfinished, found)
         cache.of(keys.document).saw_members(left)
-        return then()
+        return then(gone)
 
-    commands = [watch(keys), get_command(keys, ()), ("SMEMBERS", keys.registry)]
-    return Plan(commands, look, held=True, unfinished=unfinished)
+    return Plan([watch(keys), *_look_for_orphans(keys, found)], look, held=True, unfinished=unfinished)
 
 
 def place_of(member: bytes) -> Path:
@@ -117,30 +118,8 @@ def orphans(keys: Keys, found: Sequence[bytes]) -> Plan:
 
 
 def remove_orphans(keys: Keys, found: Sequence[bytes], cache: ShapeCache) -> Plan:
-    """Plan to remove what `orphans` finds; the result is what was removed.
-
-    Two round trips under WATCH, again if another client writes to the key in between.
-    """
-
-    def look(replies: Sequence[Reply]) -> Any:
-        permitted(replies[0], keys.document, keys.registry)
-        gone = _orphans(replies[1:], keys, found)
-        if not gone:
-            return Plan([("UNWATCH",)], lambda _: gone, held=True)
-        tag = keys.tag.encode()
-        removal = [("UNLINK", *(tag + suffix for suffix in gone)), ("SREM", keys.registry, *gone)]
-        return Plan(removal, lambda replies: done(replies, gone), atomic=True, held=True)
-
-    def done(replies: Sequence[Reply] | None, gone: list[bytes]) -> Any:
-        if replies is None:
-            return remove_orphans(keys, found, cache)
-        for reply in replies:
-            checked(reply, keys, ())
-        shape = cache.of(keys.document)
-        shape.saw_members(shape.members - frozenset(gone))
-        return gone
-
-    return Plan([watch(keys), *_look_for_orphans(keys, found)], look, held=True)
+    """Plan to remove what `orphans` finds; the result is what was removed. Two round trips, as `clean`."""
+    return clean(keys, cache, lambda gone: gone, found=found)
 
 
 def _look_for_orphans(keys: Keys, found: Sequence[bytes]) -> list[Command]:
@@ -211,7 +190,7 @@ class ChangeOutcome:
 
     def _settle(self, members: frozenset[bytes], judged: Any) -> Any:
         if self._suspects(members, judged):
-            return clean(self.it.keys, self.cache, lambda: self._finish(judged), lambda why: self._left(judged, why))
+            return clean(self.it.keys, self.cache, lambda _: self._finish(judged), lambda why: self._left(judged, why))
         return self._finish(judged)
 
     def _suspects(self, members: frozenset[bytes], judged: Any) -> bool:
