@@ -17,7 +17,7 @@ from conftest import assert_same, eventually, line_of
 import reem
 from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.snapshot import period
-from reem_async.tools.snapshots import files, portable, rdb
+from reem_async.tools.snapshots import files, portable
 
 
 def snapshot(*arguments, code=0, **changes):
@@ -187,30 +187,23 @@ def test_by_period_until_told_to_stop(kvs, env, tmp_path, number):
     assert all(re.fullmatch(r"reem-auto-\d{8}T\d{6}Z(-\d+)?\.zip", name) for name in kept)
 
 
-@pytest.mark.parametrize("options", [(), ("--force",), ("--rdb",)], ids=["portable", "force", "rdb"])
-def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(
-    kvs, env, tmp_path, monkeypatch, options
-):
+def test_one_named_by_time_takes_the_next_number_if_another_program_has_the_name(kvs, env, tmp_path, monkeypatch):
     """Which had begun in the same second: one of the two was lost, and both said that they had saved."""
     kvs["foo"] = 1
-    named, survey, place, given = files.new_name, portable.survey, rdb._place, []
+    named, survey, given = files.new_name, portable.survey, []
 
     def new_name(*words, **options):
         given.append(named(*words, **options))
         return given[-1]
 
-    def meanwhile(work):
-        async def done(*words):
-            if len(given) == 1:
-                given[0].write_text("another program's")
-            return await work(*words)
-
-        return done
+    async def meanwhile(*words):
+        if len(given) == 1:
+            given[0].write_text("another program's")
+        return await survey(*words)
 
     monkeypatch.setattr("reem_async.tools.cli.snapshot.new_name", new_name)
-    monkeypatch.setattr(portable, "survey", meanwhile(survey))
-    monkeypatch.setattr(rdb, "_place", meanwhile(place))
-    said, errors = snapshot("save", "-d", tmp_path, *options, **env)
+    monkeypatch.setattr(portable, "survey", meanwhile)
+    said, errors = snapshot("save", "-d", tmp_path, "--force", **env)
     assert said.startswith(f"{given[1]}: ")
     assert errors == ""
     assert given[0].read_text() == "another program's"

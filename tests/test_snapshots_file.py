@@ -16,7 +16,7 @@ from snapshotkit import everything, left_in
 import reem_async
 import reem_async.snapshots
 from reem_async.errors import BadData
-from reem_async.tools.snapshots import describe, rdb, restore, save, save_rdb
+from reem_async.tools.snapshots import describe, restore, save
 from reem_async.tools.snapshots.archive import Archive, ArchiveWriter, header
 from reem_async.tools.snapshots.files import new_name, prune
 from reem_async.tools.snapshots.plans import KeyContent, Value, joined, split
@@ -155,20 +155,9 @@ async def test_a_file_that_somebody_makes_meanwhile_is_not_overwritten_unasked(h
 
     with pytest.raises(FileExistsError, match="overwrite=True"):
         await save(here, tmp_path / "a.zip", progress=meanwhile)
-    asked = rdb._asked
-
-    async def while_asked(*words):
-        (tmp_path / "a.rdb").write_text("precious")
-        return await asked(*words)
-
-    monkeypatch.setattr(rdb, "_asked", while_asked)
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        await save_rdb(here, tmp_path / "a.rdb")
-    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a.zip": "precious", "a.rdb": "precious"}
-    await save_rdb(here, tmp_path / "a.rdb", overwrite=True)
+    assert (tmp_path / "a.zip").read_text() == "precious"
     await save(here, tmp_path / "a.zip", overwrite=True, progress=meanwhile)
     assert (await describe(tmp_path / "a.zip")).count == 1
-    assert (await describe(tmp_path / "a.rdb")).kind == "rdb"
 
 
 async def test_cancelled_or_failed_it_leaves_no_file(here, raws, tmp_path):

@@ -96,11 +96,10 @@ async def test_progress_of_the_blocking_front(servers, raws, tmp_path):
         assert reem.snapshots.describe(tmp_path / "a.zip") == saved
         assert_same(reem.KeyValueStore(there)["foo"].read(), {"x": np.arange(3)})
         assert (saved.count, done.names) == (1, ("foo",))
-        assert [(each.doing, each.done, each.total) for each in told if each.doing != "verify"] == [
+        assert told == [
             *(("save", 0, 1), ("save", 1, 1)),
             *(("restore", 0, 1), ("restore", 1, 1)),
         ]
-        assert ("verify", saved.size) in {(each.doing, each.total) for each in told}
         assert reem.snapshots.save_rdb(here, tmp_path / "a.rdb").kind == "rdb"
 
 

@@ -8,7 +8,7 @@ import typer
 
 from reem_async.connection import RedisInterface
 from reem_async.legacy import convert
-from reem_async.legacy.convert import Migrated, Migration
+from reem_async.legacy.convert import Migration
 from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Ships, Url, named_ships
 from reem_async.tools.cli.output import clean, columns, counted, emit, emit_json, named, note, progress_bar
 from reem_async.tools.cli.running import FAILED, guarded, run
@@ -59,7 +59,9 @@ def _show(done: Migration, as_json: bool) -> None:
             emit_json({**key._asdict(), "dry_run": done.dry_run})
         return
     good = [key for key in done.keys if not key.problem]
-    columns([[clean(key.name), clean(_what(key)), _removed(key)] for key in good], ["cyan", "", "dim"])
+    removed = [f"{counted(len(key.removed), 'old Redis key')} removed" if key.removed else "" for key in good]
+    rows = [[clean(key.name), clean(named(key.places)), more] for key, more in zip(good, removed, strict=True)]
+    columns(rows, ["cyan", "", "dim"])
     for key in done.problems:
         note(f"{key.name} is left as it is: {key.problem}")
     keys = counted(len(good), "key")
@@ -69,16 +71,3 @@ def _show(done: Migration, as_json: bool) -> None:
         emit(f"{keys} would be converted. Nothing was changed; `reem migrate --yes` does it.")
     else:
         emit(f"{keys} converted.")
-
-
-def _what(key: Migrated) -> str:
-    if key.was_text:
-        return "document of a server without JSON"
-    whole = "value taken out of a dict" if key.rooted else ""
-    inner = [place for place in key.places if "%%%%" not in place and place != "."]
-    shipped = "the whole value" if key.places and not inner else named(inner)
-    return "; ".join(filter(None, [shipped, whole])) or "leftovers only"
-
-
-def _removed(key: Migrated) -> str:
-    return f"{counted(len(key.removed), 'old Redis key')} removed" if key.removed else ""

@@ -123,8 +123,6 @@ async def migrate(
 
 
 class _Converter:
-    """Converts one top-level key: reads everything, makes the value, writes it, and removes what is old."""
-
     def __init__(self, session: Session, key: OldKey, dry_run: bool) -> None:
         self.session = session
         self._key = key
@@ -172,7 +170,6 @@ class _Converter:
         return replies
 
     async def _sealed(self) -> RawRead:
-        """Return the document as a new program reads it; an empty one if there is none."""
         try:
             raw_read: RawRead = await self.session.run(read(self.keys, (), self.session.ships, self.session.cache))
         except MissingKey as why:
@@ -180,7 +177,6 @@ class _Converter:
         return raw_read
 
     async def _value(self, place: str, label: str) -> Any:
-        """Return the value of the ship with a label; raises BadData."""
         where, key = self.keys.name + place.removesuffix("."), self.keys.document + place
         ships = self.session.ships
         ship = None

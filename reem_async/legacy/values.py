@@ -57,7 +57,6 @@ def _text(value: Any) -> str:
 
 
 def _description(dtype: str) -> str:
-    """Return the text of a dtype for the header of an .npy file."""
     if _NAMED.fullmatch(dtype):
         return repr(np.dtype(dtype).str)
     if found := _TIME.fullmatch(dtype):

@@ -140,8 +140,6 @@ def _orphans(replies: Sequence[Reply], keys: Keys, found: Sequence[bytes]) -> li
 
 @dataclass(slots=True)
 class ChangeOutcome:
-    """The outcome of a change: its result, or the next plan, which cleans up and then returns the result."""
-
     it: DocumentChange
     cache: ShapeCache
     commands: Sequence[Command]

@@ -31,7 +31,6 @@ class Announcement:
     __slots__ = ()
 
     def commands(self, path: Path) -> Sequence[Command]:
-        """Return the commands that announce a change at `path`."""
         return ()
 
     def unsent(self) -> None:
@@ -61,8 +60,6 @@ SILENT = Announcement()
 
 
 class DocumentChange(NamedTuple):
-    """One change of a document."""
-
     keys: Keys
     path: Path  # the place, below the top-level key. Where it counts from the end of a list, the document is watched
     command: Command

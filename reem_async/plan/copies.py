@@ -77,8 +77,6 @@ def applied(tree: Any, notice: Notice, followed: Path) -> Any:
 
 
 class Rest(NamedTuple):
-    """What is left of an update that later ones have touched."""
-
     value: Any  # its value without the places that were touched; MISSING if nothing is left
     # The lists (full paths) to take from the value read, and the position of the later update behind which.
     lists: dict[Path, int]

@@ -44,8 +44,6 @@ Fits = Callable[[Any], Any]  # returns the ship for a value that is not JSON, or
 
 
 class Attachment(NamedTuple):
-    """A value that a ship stores under a key of its own."""
-
     suffix: str
     ship: Any
     value: Any
@@ -160,8 +158,6 @@ def walk(
 
 
 class _Walker:
-    """Turns a value into a tree that orjson writes exactly, and collects attachments."""
-
     def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str]) -> None:
         self._place = place
         self._fits = fits
@@ -285,8 +281,6 @@ class _Walker:
 
 
 class _AskingWalker(_Walker):
-    """Offers values of the claimed types, which JSON could hold, to ships first."""
-
     def __init__(self, place: Path, fits: Fits, name: Callable[[Path], str], claimed: frozenset[type]) -> None:
         super().__init__(place, fits, name)
         self._claimed = claimed

@@ -15,8 +15,6 @@ from . import Command, Plan, Reply
 
 
 class Keys(NamedTuple):
-    """The server-side names of one top-level key."""
-
     name: str  # the key as the user knows it
     document: str  # the RedisJSON document, namespace included
     tag: str  # the beginning of every attachment's key: `{foo}`
@@ -33,7 +31,6 @@ class Keys(NamedTuple):
 
     @property
     def fence(self) -> str:
-        """The counter of acquisitions."""
         return f"{self.tag}:fence"
 
     @property

@@ -32,8 +32,6 @@ _RIGHTS = (
 
 
 class Claim(NamedTuple):
-    """Who acquired a lease."""
-
     number: int  # the fencing number, from 1; 0 if the lease is not of REEM
     name: str  # what the owner calls itself
     host: str
@@ -63,7 +61,6 @@ def claimed(text: Reply) -> Claim:
 
 
 def check_name(name: Any) -> str:
-    """Return the name of an owner; raises BadType or BadValue."""
     cure = f"use 1 to {_LONGEST_NAME} printable characters"
     if not isinstance(name, str):
         raise BadType(f"name={shorten(name)} is not a str; {cure}")
@@ -80,8 +77,6 @@ def check_ttl(ttl: Any) -> int:
 
 
 class HeldLease(NamedTuple):
-    """A lease that was acquired, and the commands about it."""
-
     claim: Claim
     text: bytes  # what the server holds as long as it is held
     renewal: Command

@@ -35,8 +35,6 @@ ANNOUNCED = object()  # in the place of a value that must be fetched
 
 
 class Notice(NamedTuple):
-    """One update, as a subscriber received it."""
-
     publisher: str  # an id that is unique per interface
     sequence: int  # counts this publisher's updates of this top-level key, from 1
     time: float  # seconds since 1970 on the publisher's clock
@@ -281,7 +279,6 @@ def _value(payload: bytes, start: int, size: int, parts: list[Any], ships: Ships
 
 
 def _value_in(slot: Slot, size: int, parts: list[Any], view: View, ships: Ships, deepest: int) -> Any:
-    """Return the value in a slot; ANNOUNCED if it cannot be read there."""
     try:
         sizes = [size, *(length for _, _, length in parts)]
         if not all(type(length) is int and 0 <= length < _MOST for length in sizes):

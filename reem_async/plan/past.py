@@ -95,9 +95,7 @@ class Past(ABC, Generic[C]):
         """Return `tree` after a change of `path` in it; unchanged where the server had refused it."""
 
     def _first(self, path: Path) -> Any:
-        """Return what was at a path before the first change."""
         return MISSING
 
     def _inside(self, tree: Any, path: Path) -> Any:
-        """Return what is at a path in a tree."""
         return get(tree, path)

@@ -156,7 +156,6 @@ def parse_suffix(text: str) -> Path:
 
 
 def _split(text: str, tokens: re.Pattern[str], added: int = 0) -> Path:
-    """Return the path in `text`; the user did not type the first `added` characters."""
     position, path = 0, []
     while position < len(text) and not (tokens is _TOKEN and text[position] == "~"):
         token = tokens.match(text, position)
@@ -263,7 +262,6 @@ class Pattern(NamedTuple):
 
     @property
     def glob(self) -> str:
-        """The server's form of `top`."""
         return _BRACKETS.sub(r"\\\1", self.top)
 
     def concerns(self, path: Path) -> bool:
@@ -277,7 +275,6 @@ def _alike(ours: str | int, theirs: str | int) -> bool:
 
 @lru_cache(maxsize=1024)
 def _literal(glob: str) -> str:
-    """Return a glob for fnmatch in which only `*` and `?` are special."""
     return _BRACKETS.sub(r"[\1]", glob)
 
 

@@ -163,8 +163,6 @@ def present(reply: Reply, keys: Keys, path: Path) -> bytes:
 
 @dataclass(slots=True)
 class _Fetch:
-    """Reads document and attachments in one transaction, again if the guess was wrong."""
-
     keys: Keys
     path: Path
     ships: Ships
@@ -203,7 +201,6 @@ class _Fetch:
         )
 
     def _unobtainable(self, it: Placeholder) -> Exception | None:
-        """Return why a tolerant read does not ask for an attachment; None if it does."""
         if not self.tolerant or it.size > self.largest:  # then no ship is needed
             return self.refused.get((it.label, it.suffix))
         if not self.ships.has(it.label):

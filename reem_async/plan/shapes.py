@@ -47,7 +47,6 @@ class Shape:
         self.forget_numbers()
 
     def layout(self, path: Path) -> tuple[Placeholder, ...]:
-        """Return the placeholders that the last read of `path` found."""
         return self._layouts.get(path, ())
 
     def saw_layout(self, path: Path, placeholders: tuple[Placeholder, ...]) -> None:
@@ -66,8 +65,6 @@ class Shape:
 
 
 class ShapeCache:
-    """The shapes of documents, by document key."""
-
     def __init__(self) -> None:
         self._shapes: dict[str, Shape] = {}
 

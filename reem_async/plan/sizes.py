@@ -68,8 +68,6 @@ KEPT = 60  # seconds until a staged value expires
 
 
 class Staged(NamedTuple):
-    """A staged value: its key, and the command that sends it there."""
-
     name: str
     upload: Command
 

@@ -271,7 +271,6 @@ def into_new(keys: Keys, it: EncodedAttachment) -> EncodedAttachment:
 
 
 def make_parents(keys: Keys, path: Path) -> Plan:
-    """Plan to put an empty dict wherever a parent of `path` is missing."""
     prefixes = [path[:length] for length in range(len(path))]
     # NX: existing values stay.
     commands = [("JSON.SET", keys.document, to_jsonpath(prefix), b"{}", "NX") for prefix in prefixes]
@@ -347,7 +346,6 @@ def together(changes: Sequence[DocumentChange], cache: ShapeCache) -> Plan:
 
 
 def _decoded(plan: Plan, replies: Sequence[Reply]) -> Any:
-    """Return the result of one change of a transaction, the next plan, or an error."""
     try:
         return plan.decode(replies)
     except (ReemError, RedisError) as error:

@@ -18,7 +18,7 @@ import hashlib
 import time
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -128,7 +128,7 @@ class ArchiveWriter:
         self._zip.writestr(zipfile.ZipInfo(name), data, method, 1)
 
 
-def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> None:
+def verify(path: Path) -> None:
     """Read the whole file and compare its digest; raises BadData if it was cut or changed."""
     total = path.stat().st_size
     # All but the digest itself, then zeros in its place: what the writer has counted.
@@ -137,8 +137,6 @@ def verify(path: Path, progress: Callable[[int, int], None] | None = None) -> No
         while left > 0 and (block := file.read(min(_BLOCK, left))):
             digest.update(block)
             left -= len(block)
-            if progress is not None:
-                progress(total - left, total)
         end = file.read()
     digest.update(_ZEROS)
     if digest.hexdigest().encode() != end:

@@ -101,7 +101,6 @@ def new_name(directory: Path, kind: str, moment: float, *, auto: bool) -> Path:
 
 
 def is_dated(path: Path) -> bool:
-    """Return whether `new_name` made the name."""
     return _NAME.fullmatch(path.name) is not None
 
 

@@ -21,8 +21,6 @@ _WORDS = 1000
 
 
 class Value(NamedTuple):
-    """What a ship holds under a key of its own."""
-
     suffix: str  # of the key's name, after the tag
     kind: str  # the Redis type
     pieces: tuple[Any, ...]  # byte strings: one for a string, several for what has parts
@@ -33,8 +31,6 @@ class Value(NamedTuple):
 
 
 class KeyContent(NamedTuple):
-    """One top-level key at one instant."""
-
     name: str  # without namespace
     text: bytes  # the document's JSON, as the server sent it
     registry: tuple[str, ...]  # suffixes, sorted
@@ -48,8 +44,6 @@ class KeyContent(NamedTuple):
 
 
 class RedisType(NamedTuple):
-    """How one Redis type is read and made again."""
-
     read: Command  # without the key, which comes second
     pieces: Callable[[Reply], Sequence[Any]]  # turns the reply into byte strings
     write: Callable[[str, Sequence[Any]], list[Command]]  # makes it under an empty key
@@ -247,6 +241,5 @@ def _value(suffix: str, kind: str, reply: Reply, keys: Keys) -> Value:
 
 
 def storing(keys: Keys, value: Value) -> EncodedAttachment:
-    """Return the value with the commands that store it again."""
     commands = redis_type(value.kind, keys.name + value.suffix).write(keys.tag + value.suffix, value.pieces)
     return EncodedAttachment(value.suffix, "", tuple(commands))

@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
-import anyio.from_thread
 import anyio.to_thread
 
 from ... import __version__
@@ -35,9 +34,9 @@ class Progress(NamedTuple):
     """How far a call has come.
 
     Attributes:
-        doing: "save", "verify" or "restore".
-        done: How much is done, and
-        total: of how much: keys, or bytes where it verifies.
+        doing: "save" or "restore".
+        done: How many keys are done, and
+        total: of how many.
     """
 
     doing: str
@@ -175,7 +174,7 @@ async def restore(
         OSError: The file cannot be read.
     """
     session, source = interface.session, Path(path)
-    await _check_file(source, progress)
+    await anyio.to_thread.run_sync(_check_file, source)
     archive = await anyio.to_thread.run_sync(Archive, source)
     with archive:
         pattern = Pattern(check_top_key(match))
@@ -193,19 +192,13 @@ async def restore(
     return Restored(tuple(done), size)
 
 
-async def _check_file(source: Path, progress: ProgressFunction | None) -> None:
-    if await anyio.to_thread.run_sync(sniff, source) == "rdb":
+def _check_file(source: Path) -> None:
+    if sniff(source) == "rdb":
         raise BadData(
             f"{source} is an RDB file, which only a server can read: start one with `reem up --from {source}`, "
             "and save a portable snapshot of that"
         )
-
-    # `verify` runs in a thread; the caller's function expects to be called on the event loop.
-    def report(done: int, total: int) -> None:
-        if progress is not None:
-            anyio.from_thread.run_sync(progress, Progress("verify", done, total))
-
-    await anyio.to_thread.run_sync(verify, source, report)
+    verify(source)
 
 
 async def _check_room(session: Session, keys: Sequence[Keys], *, replace: bool) -> None:
@@ -276,8 +269,6 @@ _SEARCHES = 3
 
 @dataclasses.dataclass
 class Survey:
-    """What was found in the namespace of one session."""
-
     names: list[str]  # of top-level keys
     unsaved: dict[str, str] = dataclasses.field(default_factory=dict)  # keys and arrays that cannot be saved, and why
     doubt: str = ""  # why keys may be missing, for people
