@@ -124,6 +124,9 @@ async def test_a_program_with_few_rights_can_save_and_restore(servers, raws, tmp
         await kvs["foo"].write({"x": 1})
         await restore(interface, tmp_path / "a.zip", replace=True)
         assert everything(admin) == before
+        await kvs["foo"].delete()
+        await restore(interface, tmp_path / "a.zip")
+        assert everything(admin) == before
         denied = {row["object"] for row in admin.acl_log()}
         assert denied <= {"info"}, "new connections ask who the server is, and do without the answer"
         with pytest.raises(RdbUnavailable, match="CONFIG GET"):

@@ -229,7 +229,7 @@ async def _put(session: Session, archive: Archive, keys: Keys, done: list[str], 
 
     async def send(turn: Turn, content: KeyContent, text: bytes, attachments: tuple[EncodedAttachment, ...]) -> None:
         it = set_change(keys, (), text, attachments, turn.reserve())
-        absent = [("EXISTS", keys.document)], (0,)
+        absent = [("TYPE", keys.document)], (b"none",)
         await session.run(change(it, session.cache) if replace else exchange(it, *absent, session.cache))
         # A document that was replaced still has its expiry.
         if replace or content.expires is not None:
