@@ -314,6 +314,32 @@ def test_a_callback_that_always_raises_is_logged_once_and_then_counted(interface
     assert "has raised ZeroDivisionError 10 times by now" in caplog.text
 
 
+def test_a_slow_callback_holds_up_nobody_else(interface, kvs, pspace, key):
+    """Neither other subscribers nor calls; and it may close its own subscriber when it gets on."""
+    go_on, closed, seen = threading.Event(), threading.Event(), []
+
+    def slow(data, updated_path):
+        go_on.wait(PATIENCE)
+        seen.append(data)
+        subscriber.close()
+        closed.set()
+
+    subscriber = CallbackSubscriber(key(), interface, slow, {})
+    subscriber.listen()
+    with SilentSubscriber(key(), interface) as mirror:
+        for number in range(50):
+            pspace[key()] = number
+        eventually(lambda: mirror.value() == 49)
+        assert (kvs[key()].read(), seen) == (49, [])
+        go_on.set()
+        assert closed.wait(PATIENCE)
+        before = len(seen)
+        pspace[key()] = 50
+        eventually(lambda: mirror.value() == 50)
+        time.sleep(0.1)
+        assert len(seen) == before
+
+
 def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):
     kvs[key()] = 1
     with SilentSubscriber(key(), interface) as mirror:
