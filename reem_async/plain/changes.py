@@ -107,6 +107,7 @@ class _Change:
         self, commands: Sequence[Command], documents: dict[bytes, TextDocument | Exception], error: MakeError
     ) -> None:
         self._commands, self._documents = commands, documents
+        self._asking = [ASKING] if asks(commands) else []
         self._answers: list[Reply] = [b"OK"] * len(commands)
         self._others: list[int] = []
         last: dict[bytes, int] = {}
@@ -130,20 +131,16 @@ class _Change:
     def commands(self, held: bool) -> list[Command]:
         """Return the commands: a transaction, and behind it those that were not in one."""
         inside = sorted([*self._last, *self._others]) if self.is_whole else list(self._last)
-        asking = [ASKING] if asks(self._commands) else []
         if inside:
-            self._sent = [*asking, MULTI]
-            for place in inside:
-                self._add(place)
+            self._sent = [*self._asking, MULTI]
+            self._add(inside)
             self.end = len(self._sent)
             self._sent.append(EXEC)
         # Nothing is changed after all (NX, or nothing to delete), but keys are watched.
         elif not held or self.is_whole:
             self._sent = [UNWATCH]
         if not self.is_whole:
-            for place in self._others:
-                self._sent += asking
-                self._add(place)
+            self._add(self._others, self._asking)
         return self._sent
 
     def only_deletes(self) -> bool:
@@ -158,16 +155,15 @@ class _Change:
     def alone(self) -> list[Command]:
         """Return the commands without a transaction: a Redis that is out of memory accepts only single deletions."""
         self._sent, self.end = [], 0
-        asking = [ASKING] if asks(self._commands) else []
-        for place in sorted(self._places):
-            self._sent += asking
-            self._add(place)
+        self._add(sorted(self._places), self._asking)
         return self._sent
 
-    def _add(self, place: int) -> None:
-        self._places[place] = len(self._sent)
-        key = self._last.get(place)
-        self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
+    def _add(self, places: Sequence[int], asking: Sequence[Command] = ()) -> None:
+        for place in places:
+            self._sent += asking
+            self._places[place] = len(self._sent)
+            key = self._last.get(place)
+            self._sent.append(self._commands[place] if key is None else _storing(key, self._documents[key]))
 
     def answers(self, replies: Sequence[Reply], known: Known) -> list[Reply]:
         replies, answers = list(replies), self._answers

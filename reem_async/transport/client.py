@@ -58,30 +58,25 @@ class _AsyncioClient(redis.asyncio.Redis):
             raise _in_words(error, command_name) from None
 
 
-def _settings(options: Options) -> tuple[str, dict[str, Any]]:
-    """Return the class of connections and how they are made: replies are str, in the shapes of protocol 2."""
+def _settings(options: Options) -> dict[str, Any]:
+    """Return how connections are made: replies are str, in the shapes of protocol 2."""
     if type(options) is not Options:
         raise Misuse(
             f"{options.address}: interface.client is for one server; use redis.RedisCluster or redis.sentinel.Sentinel"
         )
     # As redis-py comes: programs of REEM 0.1, and its documentation, expect these shapes.
     limits = {"socket_timeout": options.timeout, "socket_connect_timeout": options.handshake_timeout}
-    settings = {**limits, **options.settings, "protocol": 2, "decode_responses": True}
-    if options.socket_path is not None:
-        return "UnixDomainSocketConnection", {**settings, "path": options.socket_path}
-    return "SSLConnection" if options.tls else "Connection", settings
+    return {**limits, **options.settings, "protocol": 2, "decode_responses": True}
 
 
 def client(options: Options) -> Any:
     """Return a blocking client; nothing is connected yet."""
-    kind, settings = _settings(options)
-    settings = {"command_packer": Packer(), **settings}
-    pool = redis.ConnectionPool(connection_class=getattr(redis.connection, kind), **settings)
-    return _Client.from_pool(pool)
+    kind = getattr(redis.connection, options.connection_class)
+    settings = {"command_packer": Packer(), **_settings(options)}
+    return _Client.from_pool(redis.ConnectionPool(connection_class=kind, **settings))
 
 
 def asyncio_client(options: Options) -> Any:
     """Return an asyncio client; nothing is connected yet."""
-    kind, settings = _settings(options)
-    pool = redis.asyncio.ConnectionPool(connection_class=getattr(redis.asyncio.connection, kind), **settings)
-    return _AsyncioClient.from_pool(pool)
+    kind = getattr(redis.asyncio.connection, options.connection_class)
+    return _AsyncioClient.from_pool(redis.asyncio.ConnectionPool(connection_class=kind, **_settings(options)))

@@ -93,6 +93,7 @@ class Options:
         if self.socket_path is not None:
             self.settings.pop("host", None)
             self.settings.pop("port", None)
+            self.settings["path"] = self.socket_path
         if self.tls:
             self._check_tls()
         try:
@@ -158,15 +159,20 @@ class Options:
             return f"unix://{self.socket_path}" + (f"?db={self.database}" if self.database else "")
         return f"{'rediss' if self.tls else 'redis'}://{self.address}" + (f"/{self.database}" if self.database else "")
 
+    @property
+    def connection_class(self) -> str:
+        """The name of redis-py's class of connections, which takes `settings`."""
+        if self.socket_path is not None:
+            return "UnixDomainSocketConnection"
+        return "SSLConnection" if self.tls else "Connection"
+
     def asynchronous_connection(self) -> Any:
         """Return a fresh connection of redis.asyncio, not yet connected."""
         module: Any = redis.asyncio.connection
         # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12, and it counts what
         # other tasks of the loop do.
         settings = {"socket_timeout": None, "socket_connect_timeout": None, **self.settings}
-        if self.socket_path is not None:
-            return _greeted(module.UnixDomainSocketConnection(path=self.socket_path, **settings))
-        return _greeted((module.SSLConnection if self.tls else module.Connection)(**settings))
+        return _greeted(getattr(module, self.connection_class)(**settings))
 
     def blocking_connection(self) -> Any:
         """Return a fresh connection of redis, not yet connected."""
@@ -174,10 +180,7 @@ class Options:
         # redis-py's time limit is for the handshake only; then the transport sets its own on the socket.
         limit = self.handshake_timeout
         settings = {"socket_timeout": limit, "socket_connect_timeout": limit, "command_packer": Packer()}
-        settings |= self.settings
-        if self.socket_path is not None:
-            return module.UnixDomainSocketConnection(path=self.socket_path, **settings)
-        return (module.SSLConnection if self.tls else module.Connection)(**settings)
+        return getattr(module, self.connection_class)(**(settings | self.settings))
 
     def refused(self, error: Exception) -> Exception:
         """Return the error to raise when connecting failed with `error`; it never shows what was sent."""
