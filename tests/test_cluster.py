@@ -46,6 +46,7 @@ def test_a_cluster_takes_writes_when_it_has_started_and_is_gone_when_it_has_stop
         _ = cluster.url
 
 
+@pytest.mark.long
 def test_a_cluster_ends_with_its_owner_however_it_ends():
     code = """
 import os, signal

@@ -219,6 +219,7 @@ async def test_a_cancelled_change_is_done_once_or_not_at_all(server):
 # --- a cluster, and servers of the other kind -------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_cluster_without_the_module():
     with EmbeddedCluster(replicas=0, json=False) as cluster, contextlib.closing(reem.RedisInterface(cluster)) as at:
         assert not cluster.json

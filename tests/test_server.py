@@ -654,6 +654,7 @@ class TestPrograms:
             program.chmod(0o755)
         assert re.match(said, self.run(self.SHOW, REEM_SERVER=str(program)), re.DOTALL)
 
+    @pytest.mark.long
     def test_path_is_tried_in_order_and_passed_over_without_json(self, wrapped, tmp_path):
         wrapped("redis-server", "exit 1")
         marker = tmp_path / "ran"
