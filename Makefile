@@ -9,7 +9,7 @@ LONG := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-all test-plain test-cluster modes fuzz coverage check chaos hunt watching slots week mcap recording bench bench-recorder scale clean docs dist floors
+.PHONY: demo test test-all test-plain test-cluster modes coverage check chaos hunt watching slots week mcap recording bench bench-recorder scale clean docs dist floors
 
 demo: $(VENV)/ready  ## run the image processing system on a real photograph
 	$(BIN)/python -m examples.image_system
@@ -50,9 +50,6 @@ dist: $(VENV)/ready  ## sdist and wheel in dist/, checked; then the README, foll
 	$(BIN)/uv venv -q --python $(BIN)/python out/wheel
 	$(BIN)/uv pip install -q --python out/wheel "$$(ls dist/*.whl)[server,tools]"
 	REEM_TEST_PYTHON=$(CURDIR)/out/wheel/bin/python $(BIN)/python -m pytest -q tests/test_docs.py -k "followed and README"
-
-fuzz: $(VENV)/ready  ## random bytes against everything that decodes, for a minute each
-	$(BIN)/python -m tests.fuzz
 
 coverage: $(VENV)/ready  ## branches that the tests take, without those that run in other processes
 	$(BIN)/python -m coverage run --branch --source=reem,reem_async -m pytest -q

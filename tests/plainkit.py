@@ -1,6 +1,5 @@
 """Generated JSON commands, done by the module of a server and by REEM's own text; and clients for plain servers."""
 
-import argparse
 import random
 import re
 import string
@@ -222,21 +221,3 @@ def _as_text(reply):
     if isinstance(reply, bytes):
         return reply.decode()
     return [_as_text(item) for item in reply] if isinstance(reply, list) else reply
-
-
-def main():
-    from reem_async.server import EmbeddedServer
-
-    options = argparse.ArgumentParser()
-    options.add_argument("--count", type=int, default=100_000)
-    options.add_argument("--seed", type=int, default=1)
-    given = options.parse_args()
-    with EmbeddedServer() as server:
-        comparison = Comparison(f"unix://{server.socket_path}", "compared", given.seed)
-        difference = comparison.run(given.count)
-        print(difference or f"{given.count} commands, {comparison.refused} of them refused by both: all the same")
-    raise SystemExit(difference is not None)
-
-
-if __name__ == "__main__":
-    main()

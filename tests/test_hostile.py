@@ -159,7 +159,7 @@ def watched():
 
 @pytest.mark.parametrize("name", list(TARGETS))
 def test_mutants_of_what_is_valid_cost_nothing_but_bad_data(name, watched):
-    """A seventh of HOSTILE for each decoder, always the same ones; see tests/fuzz for more."""
+    """A seventh of HOSTILE for each decoder, always the same ones."""
     inputs = list(mutants(name, HOSTILE // len(TARGETS), seed=1))
     assert len(set(inputs)) > len(inputs) * 0.5
     TARGETS[name](inputs[0])  # what is imported or built at first use

@@ -93,7 +93,7 @@ def check_no_orphans(raw, key):
 @with_module
 @pytest.mark.parametrize("seed", range(3))
 def test_generated_commands_are_answered_as_by_the_module(with_json, seed):
-    """Replies, refusals and what is stored, one by one; `python tests/plainkit.py` does it 100,000 times."""
+    """Replies, refusals and what is stored, one by one; REEM_TEST_EXAMPLES says how many."""
     comparison = Comparison(f"unix://{with_json.socket_path}", f"compared{seed}", seed)
     assert comparison.run(int(os.environ.get("REEM_TEST_EXAMPLES", "2000")) // 2) is None
     assert comparison.refused > 10

@@ -1,6 +1,5 @@
 """The targets: each takes any bytes and raises something only if a decoder does what it must not."""
 
-import argparse
 import random
 
 import numpy as np
@@ -198,20 +197,3 @@ def mutants(name, count, seed):
                 case _:
                     data[place:place] = data[place : place + 40] * dice.choice((1, 2, 20))
         yield bytes(data[:200_000])
-
-
-def main(arguments):
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz")
-    parser.add_argument("target", nargs="?", choices=list(TARGETS))
-    parser.add_argument("--runs", type=int, default=100_000)
-    parser.add_argument("--seed", type=int, default=random.SystemRandom().randrange(10**9))
-    given = parser.parse_args(arguments)
-    print(f"seed {given.seed}")
-    for name in [given.target] if given.target else list(TARGETS):
-        for data in mutants(name, given.runs, given.seed):
-            try:
-                TARGETS[name](data)
-            except BaseException:
-                print(f"{name}: {data!r}")
-                raise
-        print(f"{name}: {given.runs} inputs, nothing found")
