@@ -333,11 +333,11 @@ def test_a_slow_callback_holds_up_nobody_else(interface, kvs, pspace, key):
         assert (kvs[key()].read(), seen) == (49, [])
         go_on.set()
         assert closed.wait(PATIENCE)
-        before = len(seen)
+        eventually(lambda: seen == list(range(50)))  # what waited is still told
         pspace[key()] = 50
         eventually(lambda: mirror.value() == 50)
         time.sleep(0.1)
-        assert len(seen) == before
+        assert seen == list(range(50))
 
 
 def test_a_pickled_subscriber_listens_anew(interface, pspace, kvs, key):
