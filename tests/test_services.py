@@ -46,6 +46,7 @@ from reem_async.errors import (
     WrongLoop,
 )
 from reem_async.local.mailbox import Mailbox
+from reem_async.plan.changes import EncodedAttachment
 from reem_async.server import EmbeddedServer
 
 VALUES = {
@@ -507,6 +508,14 @@ async def test_a_missing_right_is_named(key, right):
         await kvs[key()].serve(lambda: 1).listen()
         with pytest.raises(NotAllowed, match=right.replace("|", r"\|")):
             await place.call(timeout=5)
+
+
+def test_a_large_value_expires_from_the_moment_it_is_stored():
+    """Also one that its sender does not live to announce: no plain SET, which may be staged for a minute."""
+    value = b"x" * 100_000, [EncodedAttachment(".a", "numpy", (("SET", "p.a", bytes(100_000)),), (bytes(100_000),))]
+    message = messages.Message(messages.CALL, "a" * 16, "b" * 16, 1.0, ["", ""])
+    commands = messages.packed(message, value, "p", 1.0, None).commands
+    assert [(command[1], command[3:]) for command in commands] == [("p.a", ("PX", "6000")), ("p:text", ("PX", "6000"))]
 
 
 def mutations(payload, seed):

@@ -159,8 +159,12 @@ def packed(message: Message, value: Encoded, prefix: str, left: float, put: Put 
     if is_bytes and put is not None and (slot := put(pieces, sizes)) is not None:
         return Packed(_header(message, [*slot, sizes[0]], sizes, attachments), [], is_shared=True)
     kept = str(math.ceil((left + MARGIN) * 1000))
-    commands = [command for each in attachments for command in each.commands]
-    commands += [("PEXPIRE", prefix + each.suffix, kept) for each in attachments]
+    commands: list[Command] = []
+    for each in attachments:
+        if each.blob is not None:  # each expires by itself: a plain SET may be staged, for a minute
+            commands += [(*command, "PX", kept) for command in each.commands]
+        else:  # the ship of a user chose the commands
+            commands += [*each.commands, ("PEXPIRE", prefix + each.suffix, kept)]
     if len(text) > LARGEST_INLINE:
         commands.append(("SET", _text_key(prefix), text, "PX", kept))
         text = b""
