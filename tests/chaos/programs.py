@@ -10,6 +10,7 @@ import collections
 import contextlib
 import gc
 import os
+import resource
 import sys
 import time
 import zlib
@@ -20,8 +21,9 @@ from slotkit import in_slot, resident
 
 import reem
 import reem_async
+from reem_async.concurrency.queues import Last
 
-from .tools import background, became, descriptors, heard, say
+from .tools import Log, background, became, descriptors, heard, rss, say
 
 SIZE = 100_000
 """Bytes of an image."""
@@ -49,6 +51,39 @@ def segments() -> float:
                 found = os.stat(f"/proc/self/fd/{entry}")
                 sizes[found.st_ino] = found.st_size
     return sum(sizes.values()) / 2**20
+
+
+# --- row 10 ----------------------------------------------------------------------------------------
+
+
+def stalled(url: str) -> None:
+    """Subscribe to `flood`; stand still when told; then say how long the copy took to be right again."""
+    asyncio.run(_stalled(url))
+
+
+async def _stalled(url: str) -> None:
+    async with reem_async.RedisInterface(url) as interface:
+        mirror = reem_async.SilentSubscriber("flood", interface)
+        log = Log(mirror.watch(Last(1000)))
+        await mirror.listen()
+        await log.updates.listen()
+        async with background(log.follow()):
+            say(ready=True)
+            await asyncio.to_thread(heard)
+            before, gaps, told = rss(), log.gaps, log.told
+            say(stalled=True, told=told)
+            end = int(heard())  # on the loop's own thread: nothing is read meanwhile
+            begun = time.monotonic()
+            settled = await became(lambda: (mirror.value() or {}).get("end") == end and log.gaps > gaps, 20)
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            say(
+                settled=settled,
+                took=time.monotonic() - begun,
+                gaps=log.gaps - gaps,
+                grown=max(peak, rss()) - before,
+                silent=log.silent,
+                disordered=[repr(it) for it in log.repeated + log.backward],
+            )
 
 
 # --- row 22 ----------------------------------------------------------------------------------------
