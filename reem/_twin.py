@@ -67,7 +67,15 @@ def _forwarded(method: Any, finish: Callable[[Any], Any], inner: Callable[[Any],
 
 def runs(method: Waiting[Arguments, Result]) -> Method[Arguments, Result]:
     """Return the blocking form of a coroutine method, which runs on the calling thread."""
-    return _forwarded(method, attrgetter("_interface._run"), _CORE)  # type: ignore[no-any-return]
+    name = method.__name__
+
+    # Written out: reads and writes are called so often that each step counts.
+    @functools.wraps(method)
+    def forward(self: Any, /, *args: Any, **options: Any) -> Any:
+        return self._interface._run(getattr(self._core, name)(*args, **options))
+
+    forward.__doc__ = for_plain_code(method.__doc__ or "")
+    return forward
 
 
 def waits(method: Waiting[Arguments, Result], inner: Callable[[Any], Any] = _CORE) -> Method[Arguments, Result]:
