@@ -197,8 +197,13 @@ def _waits_for_the_long_run(item):
     return fronts != {("blocking", "asyncio")[chosen]}
 
 
+FIRST = {"docs", "migration", "hunt", "local_mailboxes", "exit", "recording_file", "cli", "cli_odd", "cli_record"}
+FIRST |= {"fork", "presence", "hostile", "slot_moves", "local_memory", "browser_page", "expiry", "watch_model", "demo"}
+"""Files that take longest, begun first: else the processes wait for one of them at the end."""
+
+
 def pytest_collection_modifyitems(config, items):
-    """In the fast run, leave out long tests and one of two fronts.
+    """In the fast run, leave out long tests and one of two fronts, and begin with the files that take longest.
 
     On a cluster, keep the tests of the shared server, but skip what only one server has; on a plain server, skip what
     only the module does.
@@ -206,6 +211,7 @@ def pytest_collection_modifyitems(config, items):
     if not LONG:
         config.hook.pytest_deselected(items=[item for item in items if _waits_for_the_long_run(item)])
         items[:] = [item for item in items if not _waits_for_the_long_run(item)]
+        items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in FIRST)
     if PLAIN:
         for item in items:
             reason = WITH_MODULE.get(item.originalname) or WITH_MODULE.get(item.path.name)

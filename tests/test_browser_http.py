@@ -259,8 +259,12 @@ def test_what_is_only_stored_in_a_key_that_is_published_all_the_time_is_noticed(
         eventually(lambda: was_running(time.time()))  # since the document has arrays it is read once more
         assert mode(earlier) == '"idle"'
     assert writes() == before + 1
-    items = [node["text"] for node in ask.rows(f"{key()}.items", at=time.time()).values()]
-    assert items == [str(item) for item in kvs[key()]["items"].read()]
+    items = [str(item) for item in kvs[key()]["items"].read()]
+
+    def shown():  # an append is only announced, so the page has it once it has read the list
+        return [node["text"] for node in ask.rows(f"{key()}.items", at=time.time()).values()]
+
+    eventually(lambda: shown() == items)
 
 
 def content(ask, name, at):

@@ -55,7 +55,7 @@ COMMANDS = (
     Entry("services", "services", "services", LOOK, "List the services, with what each of their servers says."),
     Entry("call", "services", "call", CHANGE, "Call a service, and print its answer."),
     Entry("echo", "echo", "echo", LIVE, "Print changes as they are published or stored."),
-    Entry("top", "top", "top", LIVE, "Show what is published: a live table of keys."),
+    Entry("top", "top", "top", LIVE, "Show what is published and served: live tables of keys and services."),
     Entry("hz", "top", "hz", LIVE, "Measure how often paths are published or stored."),
     Entry("bw", "top", "bw", LIVE, "Measure how many bytes are published."),
     Entry("delay", "top", "delay", LIVE, "Measure the time from publishing to receiving."),
