@@ -52,6 +52,7 @@ HEADERS = {
     "types in types": header("[('a', " * 50 + "'<f8'" + ")]" * 50, "(1,)", b"x" * 8),
     "types in types in types": header("[('a', " * 5000 + "'<f8'" + ")]" * 5000, "(1,)", b"x" * 8, version=3),
     "many fields": header("[" + "".join(f"('f{n}','|u1')," for n in range(4000)) + "]", "(1,)", version=3),
+    "many numbers": header("(" + "1," * 30_000 + "1)", "(1,)"),
     "subarrays of subarrays": header("[('a', '|u1', (99999, 99999))]", "(1,)"),
     "a subarray of nothing": header("[('a', '|u1', (0,))]", "(9,)"),
     "a field without a name": header("[(None, '<f8')]", "(1,)", b"x" * 8),

@@ -31,6 +31,7 @@ _KINDS = "biufcSUVMm"
 _CODE = re.compile(r"[<>|=][biufcSUVMm]\d{1,9}(\[\d{0,9}[a-zA-Zμ]{1,2}\])?")
 # Limits for foreign arrays: they bound the memory and the recursion that a header can cost.
 _MOST_FIELDS = 1000
+_MOST_COMMAS = 8 * _MOST_FIELDS  # a name, a type and a shape of five dimensions for each field
 _MOST_DIMENSIONS = 64  # numpy's own limit
 _DEEPEST = 30  # types in types
 _LARGEST_ITEM = 1 << 20  # bytes: a record of many fields, or a long text
@@ -197,6 +198,8 @@ def _literal(text: str) -> Any:
 
     Python 3.11 raises SystemError at times when several threads parse (https://github.com/python/cpython/issues/106905).
     """
+    if text.count(",") > _MOST_COMMAS:  # 64 KB of numbers would take 90 ms
+        raise ValueError(text)
     for _ in range(_TRIES):
         with contextlib.suppress(SystemError):
             return ast.literal_eval(text)
