@@ -472,3 +472,11 @@ def test_threads_that_meet_new_shapes_at_once_read_them():
             list(pool.map(parse, range(4)))
     finally:
         gc.set_threshold(*before)
+
+
+@pytest.mark.parametrize(
+    "fields", [[(f"{'x' * 100}{n}", "f4") for n in range(1000)], [(f"f{n}", "u1", (2,) * 9) for n in range(1000)]]
+)
+def test_a_dtype_that_is_too_long_to_be_read_back_is_refused(kvs, key, fields):
+    with pytest.raises(BadType, match="fewer fields or shorter names"):
+        kvs[key()] = np.zeros(2, np.dtype(fields))

@@ -136,6 +136,8 @@ def _header(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     version, length_size = (b"\x01\x00", 2) if text.isascii() and len(data) < 60_000 else (b"\x03\x00", 4)
     size = -(-(len(_MAGIC) + 2 + length_size + len(data) + 1) // 64) * 64
     length = size - len(_MAGIC) - 2 - length_size
+    if size > _LARGEST_HEADER or text.count(",") > _MOST_COMMAS:
+        raise BadType(f"the dtype {str(dtype)[:60]}... is too long to be read back; use fewer fields or shorter names")
     return _MAGIC + version + length.to_bytes(length_size, "little") + data.ljust(length - 1) + b"\n"
 
 
