@@ -2,6 +2,8 @@
 
 import tempfile
 
+import pytest
+
 from benchmarks import measure_host, page
 from benchmarks.measure import Bench
 from benchmarks.measure_host import LOOP, ControlLoopCase, HostCase
@@ -14,6 +16,7 @@ WAYS = ("reem-host-early", "datagram")
 """Two that need nothing installed."""
 
 
+@pytest.mark.long
 def test_a_tiny_run_fills_the_tables_of_the_page(tmp_path, monkeypatch):
     monkeypatch.setattr(measure_host, "SIZES", {"image": (6, 0.001)})
     monkeypatch.setattr(measure_host, "SETTLED", 0.1)

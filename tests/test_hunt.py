@@ -10,10 +10,10 @@ from conftest import ROOT, sized
 @pytest.mark.parametrize(
     ("seed", "steps", "faults", "options"),
     [
-        (7, sized(1500, 6000), 0.0, []),
-        (25, sized(1500, 4000), 0.3, []),
-        (47, sized(1000, 4000), 0.15, ["--plain"]),
-        (61, sized(600, 3000), 0.1, ["--secured"]),
+        (7, sized(700, 6000), 0.0, []),
+        (25, sized(700, 4000), 0.3, []),
+        (47, sized(500, 4000), 0.15, ["--plain"]),
+        (61, sized(300, 3000), 0.1, ["--secured"]),
     ],
     ids=["whole", "broken off", "without the module", "with TLS and few rights"],
 )
