@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Three processes, each with a server of its own, take the test files in turns: tests also wait. The order is that of conftest.py.
-TOGETHER := -n 3 --dist loadfile --no-loadscope-reorder
+# Four processes, each with a server of its own, take the test files in turns: tests also wait. The order is that of conftest.py.
+TOGETHER := -n 4 --dist loadfile --no-loadscope-reorder
 # The long run has more that needs the processor in time.
 LONG := -n 2 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.

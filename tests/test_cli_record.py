@@ -50,7 +50,9 @@ def recorded(key, server_url, pspace, file, tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_IDLE"), reason="only Linux has a scheduling class for what can wait")
-@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize(
+    "background", [pytest.param(True, marks=pytest.mark.long), False]
+)  # the fast run leaves nothing
 def test_in_the_background_it_takes_only_what_nobody_else_wants(background, key, server_url, pspace, file, tmp_path):
     """What reads and what writes; without --background it only does not take the processor from others."""
     pspace[key("a")] = 1
