@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 TOGETHER := -n 4 --dist loadfile --no-loadscope-reorder
 # The long run has more that needs the processor in time.
 LONG := -n 2 --dist loadfile
+VARIANT := -n 3 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
 
@@ -23,10 +24,10 @@ test-all: $(VENV)/ready  ## the long run: every test at full size, then those th
 	$(MAKE) test-plain test-cluster modes
 
 test-plain: $(VENV)/ready  ## the fast run on servers without the JSON module
-	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q $(TOGETHER)
+	REEM_TEST_SERVER=plain $(BIN)/python -m pytest -q $(VARIANT)
 
 test-cluster: $(VENV)/ready  ## what the fast run does on its shared server, on a cluster of three
-	REEM_TEST_SERVER=cluster $(BIN)/python -m pytest -q $(TOGETHER)
+	REEM_TEST_SERVER=cluster $(BIN)/python -m pytest -q $(VARIANT)
 
 modes: $(VENV)/ready  ## tests once in Python's development mode and once without assert statements
 	$(BIN)/python -X dev -m pytest -q tests/test_store.py tests/test_subscribe.py tests/test_following.py tests/test_connection.py tests/test_facade_store.py

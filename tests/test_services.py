@@ -9,6 +9,7 @@ import random
 import signal
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import orjson
@@ -403,6 +404,7 @@ def test_a_stopped_server_is_noticed_and_begins_nothing_later(caller, server_url
     with program("serve", server_url, key()) as process:
         caller[key()].call(number=3)
         process.send_signal(signal.SIGSTOP)
+        eventually(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
         with pytest.raises(CallTimeout):
             caller[key()].call(number=4, timeout=0.3, done=str(tmp_path / "done"))
         began = time.monotonic()
