@@ -6,6 +6,7 @@ BIN := $(VENV)/bin
 TOGETHER := -n 4 --dist loadfile --no-loadscope-reorder
 # The long run has more that needs the processor in time.
 LONG := -n 2 --dist loadfile
+# A cluster has three servers for each process, so one process fewer.
 VARIANT := -n 3 --dist loadfile
 # Programs are started by the hundred, and keep their bytecode: else each would compile all of REEM anew.
 export PYTHONDONTWRITEBYTECODE :=
