@@ -21,6 +21,7 @@ from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.pubsub.callbacks import Caller
 from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
+from reem_async.transport.client import client
 from reem_async.transport.composite import NewTransport
 
 from ._portal import LastPortal, Portal, Threads, finish
@@ -55,8 +56,6 @@ class _OnThread(reem_async.RedisInterface):
     _new_transport: NewTransport = BlockingTransport
 
     def _new_client(self) -> Any:
-        from reem_async.transport.client import client
-
         return client(self.session.options)
 
     async def _close_client(self) -> None:

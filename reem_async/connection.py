@@ -12,6 +12,7 @@ from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport.aio import AsyncTransport
+from .transport.client import asyncio_client
 from .transport.composite import NewTransport
 from .transport.state import State, StateChange, StateChanges
 
@@ -118,8 +119,6 @@ class RedisInterface:
         return self._client
 
     def _new_client(self) -> Any:
-        from .transport.client import asyncio_client
-
         return asyncio_client(self.session.options)
 
     @property

@@ -97,7 +97,8 @@ class Robot:
         self._over = False
         self.longest_pause = 0.0  # between two turns of its loop
         self._turned = time.monotonic()
-        self.arrived = 0.0  # when the last command arrived
+        # When the last command arrived: one of them alone may be in the middle of a read when the link is cut.
+        self.arrived = 0.0
         with contextlib.ExitStack() as stack:
             if front == "blocking":
                 self._follow(stack, url)
@@ -114,11 +115,15 @@ class Robot:
         self.mirror.note(mirror.value(default=None))
 
     def _watched(self, update):
-        self.arrived = update.arrived or self.arrived
+        self._heard(update)
         self.watch.note(update.data)
 
-    def _called(self, data, updated_path):
+    def _called(self, data, updated_path, update):
+        self._heard(update)
         self.callback.note(data)
+
+    def _heard(self, update):
+        self.arrived = max(self.arrived, update.arrived or 0.0)
 
     def _silent(self):
         self.callback.note(None)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import getpass
 import os
 import platform
+import pwd
 import time
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
@@ -400,6 +400,6 @@ def description(
 
 def _user() -> str:
     try:
-        return getpass.getuser()
-    except (OSError, KeyError, ImportError):  # this user has no name
+        return pwd.getpwuid(os.getuid()).pw_name
+    except KeyError:  # this user has no name
         return ""
