@@ -5,6 +5,7 @@ import fcntl
 import gc
 import mmap
 import os
+import signal
 import socket
 
 import numpy as np
@@ -31,8 +32,8 @@ pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memor
 KEYS = keys_of("k")
 
 
-def put(segment, data):
-    number, stamp = segment.put([data], [len(data)])
+def put(segment, data, pieces=None):
+    number, stamp = segment.put(pieces or [data], [len(data)])
     return Slot(host(), os.getpid(), segment.descriptor, segment.inode, number, stamp)
 
 
@@ -154,6 +155,23 @@ def test_an_interrupt_in_the_middle_of_writing_leaves_every_slot_free():
             continue
     assert place > 50
     check_all_slots(segment)
+
+
+def test_a_child_forked_in_the_middle_of_writing_leaves_the_slot_to_its_readers():
+    segment, children = Segment(1000), []
+
+    class Buffers:
+        def __iter__(self):
+            children.append(os.fork())
+            if not children[-1]:
+                signal.pause()
+            return iter([b"x" * 6])
+
+    try:
+        assert bytes(LocalReader().view(put(segment, b"x" * 6, Buffers()), 6)) == b"x" * 6
+    finally:
+        os.kill(children[0], signal.SIGKILL)
+        os.waitpid(children[0], 0)
 
 
 @pytest.mark.usefixtures("uncollected")

@@ -130,7 +130,10 @@ class Segment:
         with io.FileIO(f"/proc/self/fd/{self.descriptor}", "r+") as file:
             for number in self._oldest:
                 if lock_for_writing(file.fileno(), number):
-                    stamp = self._write(number, pieces, sizes)
+                    try:
+                        stamp = self._write(number, pieces, sizes)
+                    finally:  # a child that was forked meanwhile has the description open, too
+                        _set(file.fileno(), fcntl.F_UNLCK, number)
                     self._oldest = [*(other for other in self._oldest if other != number), number]
                     return number, stamp
         return None
