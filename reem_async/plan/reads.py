@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from ..errors import BadData, Conflict, MissingDocument, MissingKey, NotAllowed, WrongKind, WrongType, is_of_command
-from ..legacy.olddata import first_read as first_read
+from ..legacy.olddata import first_read as first_read  # for all that read: only this module imports it
 from ..legacy.olddata import look_first as look_first
 from ..ships.registry import Registered, Ships
 from . import Command, Plan, Reply

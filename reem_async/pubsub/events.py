@@ -20,10 +20,10 @@ class Origin(StrEnum):
     """How an update came to be known."""
 
     PUBLISHED = "published"
-    """Somebody published it: it has a publisher, a number and a time, and each one is told."""
+    """A client published it. It has a publisher, a number and a time, and each one is delivered."""
 
     STORED = "stored"
-    """Somebody changed what is stored, and published nothing: several changes may be told as what they led to."""
+    """A client changed what is stored without publishing. Several such changes may arrive as one update."""
 
     FOUND = "found"
     """It was there when following began, or after a loss."""
@@ -53,8 +53,8 @@ class Update:
         origin: Whether it was published, only stored, or found at the beginning or after a loss; or that there is
             silence.
         deleted: Nothing is there any more: `value` is None because of that.
-        early: It was told before the server had it (`RedisInterface(local="early")` of its publisher): the server has
-            it soon, or what it has then is told, with `gap`.
+        early: It arrived before the server had it (`RedisInterface(local="early")` of its publisher). If the server
+            never gets it, what the server has then is delivered, with `gap`.
         late: For how many seconds an outage delayed it at its publisher (`PublishSpace(outage="newest")`), on that
             one's monotonic clock.
         silent: No update: silence has begun, with `ttl`. `data` and `value` are None.

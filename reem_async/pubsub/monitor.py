@@ -48,7 +48,7 @@ class Event:
         gap: Something was lost before: `missed` are known, or the connection broke, or a message was unreadable.
         namespace: Where the top-level key is: the interface's namespace, or the one of many that it was found in.
         stored: It was not published: it was found to be stored, at `time`, which is that of `received`. A `Monitor`
-            tells of no such changes; commands that also follow the store do.
+            yields none of these; commands that also follow the store do.
         local: Programs of the publisher's user and host can take the value from its memory.
     """
 
@@ -205,7 +205,7 @@ class Monitor(PatternStream[Event]):
         return _PatternListener(self, topic)
 
     async def watch_changes(self) -> None:
-        """Be told by `changed` of keys that were read over a connection of notices and then changed."""
+        """Have `changed` called for keys that were read over a connection of notices and then changed."""
         assert self._manager is not None
         await self._manager.watch(self._listeners[0])
 

@@ -27,7 +27,7 @@ which of the updates that were heard meanwhile are in what was read.
 
 With CLIENT TRACKING the server reports once (`changed`) that a key was modified which was read over the connection of
 the notices, in order with notices and replies. The next snapshot shows what was changed, and has the next change
-reported. What it differs in from the copy, the notices in it applied, is reported as `Stored`.
+reported. The notices in it are applied to the old copy. What differs from that in the snapshot is reported as `Stored`.
 
 - READING in order: a change that is reported before the reply is in the reply.
 - ARMING: keys that are read over another connection are touched over this one first. What is reported between that and

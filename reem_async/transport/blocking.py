@@ -203,7 +203,7 @@ class _Line:
             self._out.close()
 
 
-_kept: ContextVar[list[Any]] = ContextVar("_kept")
+_open_at_exit: ContextVar[list[Any]] = ContextVar("_open_at_exit")
 
 
 def keep_open_at_exit() -> None:
@@ -212,7 +212,7 @@ def keep_open_at_exit() -> None:
     Python finalizes all modules and their objects as one heap of garbage, in any order: it would close a connection
     before it calls the `__del__` that sends the last command over it. The context of the main thread outlives that.
     """
-    _kept.set([line.kept_open() for transport in _all for line in list(transport._idle)])
+    _open_at_exit.set([line.kept_open() for transport in _all for line in list(transport._idle)])
 
 
 class BlockingTransport(OneServer):

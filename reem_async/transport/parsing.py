@@ -32,7 +32,7 @@ _STEP = 1 << 24  # how much more memory a string may be given than has arrived o
 _DEEPEST = 128
 _MOST_ELEMENTS = 1 << 24
 _LONG, _DIGITS = 8, b"0123456789"
-"""Where a digit stands in the first line of a reply if it announces much: at least ten million of anything."""
+"""A reply such as `$12345678` has a digit at this place if it announces ten million bytes or elements, or more."""
 _MUCH = 1 << 24  # bytes after which is asked, again and again, how many of them wait for the end of one string
 _BULK = b"$="
 
@@ -73,7 +73,7 @@ class SmallReader:
         self.fed += count
         if self.fed == count:
             self._look_at = _MUCH
-        # Perhaps with a long number, something begins here: the parser holds no beginning of it.
+        # A reply may begin here, with a long number: the parser holds no unfinished one.
         if self._buffer[_LONG] in _DIGITS and not self._has_data():
             _check_announced(bytes(self._view[:32]), self._largest)
         self._feed(self._buffer, 0, count)
