@@ -108,23 +108,24 @@ class Activities:
 
     def __init__(self, namespace: str) -> None:
         self._namespace = namespace
-        self._serves: list[str] = []  # each name as often as it was added; each step is one of C
+        # By process, each name as often as it was added; each step is one of C. A forked child serves nothing.
+        self._serves: list[tuple[int, str]] = []
         self.publishers: WeakList[PublisherIdentity] = WeakList()
         self.leases: WeakList[Any] = WeakList()  # of coordination/lease.py
 
     def add_service(self, name: str) -> None:
-        self._serves.append(name)
+        self._serves.append((os.getpid(), name))
 
     def remove_service(self, name: str) -> None:
         with contextlib.suppress(ValueError):
-            self._serves.remove(name)
+            self._serves.remove((os.getpid(), name))
 
     def told(self, seconds: float, most: int) -> dict[str, list[str]]:
         """Return what the program serves and owns, and the top-level keys that it published in the last seconds."""
         channels = [channel for publisher in self.publishers for channel in publisher.recent(seconds)]
         names = {
             "publishes": [channel[1 : channel.index("}")].removeprefix(self._namespace) for channel in channels],
-            "serves": self._serves,
+            "serves": [name for pid, name in list(self._serves) if pid == os.getpid()],
             "owns": [lease.keys.name for lease in self.leases if lease.is_held],
         }
         return {kind: sorted({*found[:most]}) for kind, found in names.items()}

@@ -289,7 +289,8 @@ def test_what_is_no_name_is_refused(package, name):
 
 
 def test_a_forked_child_is_a_node_of_its_own_once_it_calls(server):
-    with reem.RedisInterface(server, name="planner") as interface:
+    with reem.RedisInterface(server, name="planner") as interface, reem.KeyValueStore(interface)["cmd"].own(ttl=60):
+        reem.KeyValueStore(interface)["plan"].serve(lambda: None)
         eventually(interface.nodes)
         child = os.fork()
         if not child:
@@ -298,7 +299,8 @@ def test_a_forked_child_is_a_node_of_its_own_once_it_calls(server):
                 time.sleep(1000)
             os._exit(1)
         try:
-            eventually(lambda: {node.pid for node in interface.nodes()} == {os.getpid(), child})
+            roles = {(os.getpid(), ("plan",), ("cmd",)), (child, (), ())}
+            eventually(lambda: {(node.pid, node.serves, node.owns) for node in interface.nodes()} == roles)
         finally:
             os.kill(child, signal.SIGKILL)
             os.waitpid(child, 0)

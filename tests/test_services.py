@@ -173,6 +173,8 @@ def test_bad_input_is_refused_before_anything_is_sent(front, key):
             served(front, place, act, **wrong)
     with pytest.raises(BadType, match="give serve"):
         served(front, place, 5)
+    with pytest.raises(BadValue, match="500 arrays, or other values of ships, are too many"):
+        front.wait(place.call(**{f"{'x' * 300}{number}": np.zeros(1) for number in range(500)}))
     with pytest.raises(NoService, match="no program serves"):
         front.wait(place.call())
 
@@ -375,6 +377,19 @@ async def test_closing_sends_waiting_calls_elsewhere(akvs, binterface, key):
         outcomes = await asyncio.gather(*calls, return_exceptions=True)
     assert [type(outcome) for outcome in outcomes].count(ServiceLost) == 1
     assert outcomes.count("here") == 2
+
+
+@pytest.mark.parametrize("turns", range(6))
+async def test_a_service_that_is_closed_while_it_begins_does_not_serve(akvs, key, turns):
+    service = akvs[key()].serve(lambda: 1)
+    waiting = asyncio.create_task(service.wait())
+    for _ in range(turns):
+        await asyncio.sleep(0)
+    assert not waiting.done()
+    await service.close()
+    await asyncio.wait_for(waiting, PATIENCE)
+    with pytest.raises(NoService):
+        await akvs[key()].call()
 
 
 @pytest.fixture(params=["auto", "early"])

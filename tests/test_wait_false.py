@@ -341,6 +341,40 @@ def test_the_queue_of_a_forked_child_is_empty(server, reader):
         assert (reader["a"].read(), reader["b"].read(), space.dropped) == ({"n": 5}, "child", 0)
 
 
+def test_a_forked_child_does_not_raise_the_errors_of_its_parent(server):
+    with reem.RedisInterface(server.url) as interface:
+        space = reem.PublishSpace(interface, wait=False)
+        space["a"] = {"x": 1}
+        space["a"]["x"]["y"] = 1
+        eventually(lambda: space.dropped == 1)
+        child = os.fork()
+        if child == 0:
+            status = 1
+            with contextlib.suppress(BaseException):
+                assert space.dropped == 0
+                space["b"] = 1
+                space.flush(PATIENCE)
+                status = 0
+            os._exit(status)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        with pytest.raises(PathRefused):
+            space.flush()
+
+
+def test_plain_code_on_the_thread_of_an_event_loop_does_not_wait_either(server_url, kvs, key):
+    """As in a notebook."""
+
+    async def publish():
+        with reem.RedisInterface(server_url) as interface:
+            space = reem.PublishSpace(interface, wait=False)
+            for number in range(20):
+                space[key()] = {"n": number}
+            space.flush(PATIENCE)
+
+    asyncio.run(publish())
+    assert kvs[key()].read() == {"n": 19}
+
+
 def test_ctrl_c_queues_a_call_whole_or_not_at_all(server_url, key, kvs, monkeypatch):
     """At random instants, beside another thread that publishes: nothing is lost, torn, or sent twice."""
     monkeypatch.setattr(sys, "unraisablehook", lambda _: None)  # an interrupt in a callback of a weak reference

@@ -40,7 +40,7 @@ class Tasks:
 
     @property
     def place(self) -> object:
-        return os.getpid(), id(asyncio.get_running_loop())
+        return os.getpid(), asyncio.get_running_loop()
 
     async def pause(self, seconds: float) -> None:
         await asyncio.sleep(seconds)

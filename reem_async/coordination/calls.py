@@ -135,6 +135,13 @@ def explained(error: Exception) -> Exception:
     )
 
 
+async def encoded(session: Session, names: Names, prefix: str, value: Any) -> Encoded:
+    """Return a value for keys that begin with `prefix`; raises BadInput."""
+    found = await Encoder(session, names.keys._replace(tag=prefix)).encoded(names.path, value)
+    messages.check_parts(show((names.keys.name, *names.path)), found)
+    return found
+
+
 async def opened(session: Session, content: Content | None, prefix: str, where: str) -> Any:
     """Return the value of a message; a round trip if it is stored under keys that begin with `prefix`.
 
@@ -318,7 +325,7 @@ class Caller(Listener):
             directory = self._directories[path] = Directory(Names(self._keys, path))
         call = PendingCall(show((self._keys.name, *path)), directory, asyncio.get_running_loop().time() + limit)
         prefix = directory.names.values(messages.CALL, call.id)
-        value = await Encoder(self._session, self._keys._replace(tag=prefix)).encoded(path, arguments)
+        value = await encoded(self._session, directory.names, prefix, arguments)
         self._pending[call.id] = call
         try:
             async with asyncio.timeout_at(call.deadline):

@@ -59,7 +59,8 @@ class Lease:
     @property
     def is_held(self) -> bool:
         """Whether the program owns the key, as far as is known. Another thread may ask, so nothing is noted."""
-        return not self._lost and time.monotonic() - self._renewed <= self._milliseconds / 1000
+        is_own = self._pid == os.getpid()
+        return is_own and not self._lost and time.monotonic() - self._renewed <= self._milliseconds / 1000
 
     def _reason(self) -> str:
         if not self._lost and time.monotonic() - self._renewed > self._milliseconds / 1000:

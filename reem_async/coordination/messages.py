@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import orjson
 
 from ..concurrency.timeouts import LONGEST
-from ..errors import BadData, BadKey
+from ..errors import BadData, BadKey, BadValue
 from ..plan import Command, Plan, Reply, blamed
 from ..plan.changes import EncodedAttachment
 from ..plan.keys import Keys
@@ -169,6 +169,16 @@ def packed(message: Message, value: Encoded, prefix: str, left: float, put: Put 
         commands.append(("SET", _text_key(prefix), text, "PX", kept))
         text = b""
     return Packed(_header(message, _STORED, sizes, attachments) + text, commands)
+
+
+def check_parts(where: str, value: Encoded) -> None:
+    """Raise BadValue if a value has more attachments than a message can name."""
+    parts = [[each.label, each.suffix, _MOST] for each in value[1]]
+    if len(orjson.dumps(parts)) > _LARGEST - 2 * LARGEST_INLINE:  # a text may travel beside them
+        raise BadValue(
+            f"{where}: {len(parts)} arrays, or other values of ships, are too many for one call; "
+            "put them together into fewer arrays"
+        )
 
 
 def keys_of(prefix: str, value: Encoded) -> list[str]:

@@ -46,10 +46,9 @@ from ..plan.writes import make_parents
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import manager_of
 from ..session import Session
-from ..store.encoding import Encoder
 from ..store.publish import publisher
 from . import messages
-from .calls import explained, new_id, opened, publish
+from .calls import encoded, explained, new_id, opened, publish
 from .direct import Post
 from .messages import Encoded, Message, Names, Put
 
@@ -310,9 +309,7 @@ class Served(Listener):
                 request.record = {"arguments": given}
             result = await self._called(request, given)
             del given
-            value = await Encoder(self._session, self._names.keys._replace(tag=prefix)).encoded(
-                self._names.path, result
-            )
+            value = await encoded(self._session, self._names, prefix, result)
         except BaseException as error:
             # The function may also raise CancelledError by itself. Ctrl-C ends the program, where it comes at all.
             was_cancelled = isinstance(error, asyncio.CancelledError) and (request.is_left or is_being_cancelled())
@@ -464,14 +461,16 @@ class Service:
         concurrency: int = 1,
         queue: int = QUEUE,
     ) -> None:
+        self._where = show((keys.name, *path))
         if not callable(function):
-            raise BadType(f"{show((keys.name, *path))}: cannot serve {shorten(function)}; give serve() a function")
+            raise BadType(f"{self._where}: cannot serve {shorten(function)}; give serve() a function")
         self.function = function
         self._session = session
         self._names = Names(keys, path)
         self._concurrency = whole("concurrency", concurrency, "give a number of calls at a time, at least 1")
         self._queue = whole("queue", queue, "give a number of requests that may wait, at least 1")
         self._served: Served | None = None
+        self._begun: asyncio.Task[None] | None = None  # what begins in the background
         self._is_closed = False
         self._beginning = asyncio.Lock()
         functools.update_wrapper(self, function, updated=())
@@ -490,7 +489,7 @@ class Service:
             raise WrongLoop(
                 "serve() of reem_async needs a running event loop: use it inside of a coroutine, or use reem"
             ) from None
-        manager_of(self._session).tasks.start(self._begin(), "reem serve")
+        self._begun = manager_of(self._session).tasks.start(self._begin(), "reem serve")
 
     async def _begin(self) -> None:
         while not self._is_closed:
@@ -498,7 +497,8 @@ class Service:
                 await self.listen()
                 return
             except (NotAllowed, InterfaceClosed) as error:
-                logger.error("cannot serve: %s", error)
+                if not self._is_closed:
+                    logger.error("cannot serve: %s", error)
                 return
             except (ReemError, RedisError) as error:
                 logger.warning("not serving yet: %s", error)
@@ -510,12 +510,18 @@ class Service:
         Raises:
             NotConnected: No server.
             NotAllowed: The user lacks a right; says which.
+            InterfaceClosed: It was closed before.
         """
         async with self._beginning:
+            if self._is_closed:
+                raise InterfaceClosed(f"{self._where}: this service is closed; call serve() again")
             if self._served is None or self._served.closed.is_set():
                 served = Served(self._session, self._names, self.function, self._concurrency, self._queue)
                 await served.follow()
                 self._served = served
+                if self._is_closed:
+                    await served.close()
+                    raise InterfaceClosed(f"{self._where}: this service was closed before it began")
 
     async def close(self) -> None:
         """Stop serving. Idempotent; one round trip for each request that waits or is being handled.
@@ -529,6 +535,8 @@ class Service:
 
     async def wait(self) -> None:
         """Wait until it has stopped serving: `await service.wait()` is the last line of a program that only serves."""
+        if self._begun is not None:
+            await asyncio.wait([self._begun])
         if self._served is not None:
             await self._served.closed.wait()
 

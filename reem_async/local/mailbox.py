@@ -179,7 +179,7 @@ class Subscribers:
     def __init__(self) -> None:
         self._mailbox: Mailbox | None = None
         self._reported = ""  # the last warning
-        # Until when the answer of each address holds; of the channels that were asked for, the latest last
+        # By channel, in the order in which they were first asked for: until when the answer of each address holds
         self._known: collections.OrderedDict[bytes, dict[str, float]] = collections.OrderedDict()
 
     def ask(self, channel: bytes) -> bytes:

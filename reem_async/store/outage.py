@@ -267,15 +267,13 @@ class Outage:
         """Start a task that asks whether the server is back, if there is none."""
         if not self._out or self._is_asking:
             return
-        is_thread = asyncio._get_running_loop() is None
-        if is_thread:
-            self._asking = True  # before it begins
+        self._asking = True  # before it begins
         try:
             task = self._session.tasks.start(self._until_back(), self._task_name)
         except BaseException:
             self._asking = False
             raise
-        if not is_thread:
+        if task is not None:  # else it is a thread
             self._asking = task
 
     async def _until_back(self) -> None:
@@ -415,7 +413,7 @@ class Outage:
             logger.warning("closed: %d kept updates were not sent", total)
 
 
-_every = Inherited(Outage.forget)
+_every = Inherited[Outage](lambda outage: outage.forget())
 
 
 def own_copies(assignments: Sequence[Assignment]) -> tuple[Assignment, ...]:

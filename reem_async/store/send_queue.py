@@ -17,7 +17,6 @@ It is an outage that begins with the first call (`Outage`): the same queue, boun
 
 from __future__ import annotations
 
-import asyncio
 import collections
 import logging
 import queue
@@ -54,11 +53,11 @@ def outages(
         BadValue, BadType: They mean nothing, or not together.
     """
     if policy not in _POLICIES:
-        raise BadValue(f"outage={policy!r:.40}: say 'raise', 'drop' or 'newest'")
+        raise BadValue(f"outage={policy!r:.40}: use 'raise', 'drop' or 'newest'")
     if not isinstance(wait, bool):
-        raise BadType(f"wait={wait!r:.40}: say True or False")
+        raise BadType(f"wait={wait!r:.40}: use True or False")
     if on_error is not None and not callable(on_error):
-        raise BadType(f"on_error={on_error!r:.40} cannot be called: give a function that takes the error")
+        raise BadType(f"on_error={on_error!r:.40} cannot be called: use a function that takes the error")
     if not wait:
         return SendQueue(session, policy, on_error)
     if on_error is not None:
@@ -92,8 +91,7 @@ class SendQueue(Outage):
         self._wakeups: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._is_exit = False  # the program ends: calls send by themselves
         self._is_outage = False
-        # The event loop in which the server has answered; None for the blocking front.
-        self._reached: asyncio.AbstractEventLoop | bool | None = False
+        self._reached: object = None  # where the server has answered: the process and the event loop, if any
 
     @property
     def dropped(self) -> int:
@@ -126,8 +124,8 @@ class SendQueue(Outage):
         document = writer.keys.document
         # First the sender asks whether the server is there: what is under way when a connection fails, or when an event
         # loop ends, is lost.
-        loop, state = asyncio._get_running_loop(), self._session.transport.states.last.state
-        away = self._reached is not loop or state != "connected"
+        state = self._session.transport.states.last.state
+        away = self._reached != self._session.tasks.place or state != "connected"
         out = self._out.setdefault(document, UnsentUpdates(writer, away=away))
         dropped = out.put(it, merge=self._is_outage or len(out.kept) >= LAG)
         while len(out.kept) > 1 and self._is_full:  # the newest always stays
@@ -213,7 +211,7 @@ class SendQueue(Outage):
         if out.away:
             out.away = not await super()._answers(out)
             if not out.away:
-                self._reached = asyncio._get_running_loop()
+                self._reached = self._session.tasks.place
         return not out.away
 
     async def _flush(self, turn: Turn, out: UnsentUpdates) -> None:
