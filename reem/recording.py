@@ -8,9 +8,13 @@ from typing import Any, Self
 from reem_async.errors import InterfaceClosed
 from reem_async.tools import recording as core
 from reem_async.tools.recording import (
+    AlignedBlock,
+    AlignedCounts,
+    Alignment,
     ArrayHandle,
     ChannelSummary,
     DamagedRecording,
+    Episode,
     Log,
     LogPath,
     LogUpdate,
@@ -24,9 +28,13 @@ from ._twin import documented_by, shares, takes_interface, waits
 from .connection import RedisInterface
 
 __all__ = [
+    "AlignedBlock",
+    "AlignedCounts",
+    "Alignment",
     "ArrayHandle",
     "ChannelSummary",
     "DamagedRecording",
+    "Episode",
     "Log",
     "LogPath",
     "LogUpdate",

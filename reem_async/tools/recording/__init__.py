@@ -12,6 +12,8 @@ Needs the extra `tools`.
 """
 
 try:
+    from .align import AlignedBlock, AlignedCounts, Alignment
+    from .episodes import Episode
     from .format import DamagedRecording, RecordingFailed
     from .log import ArrayHandle, ChannelSummary, Log, LogPath, LogUpdate, open_log
     from .recorder import Recorder, RecorderStatus
@@ -23,9 +25,13 @@ except ModuleNotFoundError as error:
     raise ModuleNotFoundError(f"recordings need {package}: pip install 'reem-async[tools]'", name=package) from None
 
 __all__ = [
+    "AlignedBlock",
+    "AlignedCounts",
+    "Alignment",
     "ArrayHandle",
     "ChannelSummary",
     "DamagedRecording",
+    "Episode",
     "Log",
     "LogPath",
     "LogUpdate",

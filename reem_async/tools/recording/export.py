@@ -19,8 +19,9 @@ from ...errors import BadData, BadValue
 from ...plan.paths import Path, suffix
 from ...plan.trees import MISSING
 from ..partfile import PartFile, there_already
+from .align import EXACT, stacked
 from .format import Kind
-from .log import EXACT, Log, stacked
+from .log import Log
 from .stored import Reference, is_inline
 
 # Rows of a group in a Parquet file, and those that are in memory at once.

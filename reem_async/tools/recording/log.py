@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path as FilePath
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from ...errors import MissingKey
-from ...plan.paths import Path, parse, parse_pattern, show
+from ...errors import BadType, BadValue, MissingKey
+from ...plan.arguments import check_number
+from ...plan.paths import Path, parse, parse_pattern, shorten, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
 from ...ships.registry import Ships, default_ships
 from ...transport.packing import CommandRecorder
+from .align import Alignment, at_rate, stacked
 from .container import Container, Ref, Totals
+from .episodes import Episode, episodes_of
 from .format import NEWS, Role
 from .log_reader import RecordedPast, RecordedStream
 from .stored import LOST, Reference, pruned, resolve
@@ -28,8 +31,7 @@ from .times import Instant, nanoseconds, seconds
 # again.
 _CACHED_TREES = 256
 _END = 2**63 - 1
-EXACT = 2**53
-"""Integers up to this size are floats without loss."""
+_NAMED = 10  # top-level keys that an error lists
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +258,9 @@ class Log:
         return resolve(pruned(tree, (name,), [parse_pattern(text) for text in patterns]), self._whole)
 
     def _whole(self, tree: Any) -> Any:
-        """Return a past tree; MISSING, and it is counted, if something in it cannot be read."""
+        """Return a past tree; MISSING if nothing is there, or, and it is counted, if something in it cannot be read."""
+        if tree is MISSING:
+            return tree
         try:
             return resolve(tree, self._past.value)
         except ValueError:  # damaged, or never recorded
@@ -358,6 +362,74 @@ class Log:
             seconds(ref.time), stream.path, value, deleted, seconds(published), sequence, stream.kind.value
         )
 
+    def align(
+        self,
+        paths: Sequence[str],
+        *,
+        rate: float | None = None,
+        on: str | None = None,
+        method: str | Mapping[str, str] = "nearest",
+        tolerance: float | Mapping[str, float] | None = None,
+        start: Instant | None = None,
+        end: Instant | None = None,
+    ) -> Alignment:
+        """Return the values of several paths at common instants: a loop over it yields blocks of rows.
+
+        Times are those at which the recorder received the updates, on its clock.
+
+        Args:
+            paths: The paths, such as ["arm.q", "cam.rgb"].
+            rate: Rows per second, from `start` on.
+            on: A path at each update of which there is a row, in place of `rate`.
+            method: For all paths, or a dict by path. "nearest": the value nearest in time. "previous": the last one
+                before the row or at it. "linear": between the two around the row; of numbers, lists and arrays of
+                numbers only.
+            tolerance: Seconds that such a value may be away from the row, for all paths, or a dict by path. A row
+                without one has no value. No limit if not given.
+            start: The first instant; the beginning of the recording if not given.
+            end: The last instant; the end of the recording if not given.
+
+        Raises:
+            BadType, BadValue: An argument that means nothing, or "linear" for what is no number.
+            MissingKey: Nothing was recorded at a path.
+        """
+        if isinstance(paths, str) or not paths:
+            raise BadType(f'paths={shorten(paths)}: use a list of paths, such as ["arm.q", "cam.rgb"]')
+        if (rate is None) == (on is None):
+            raise BadValue('give either rate, in rows per second, or on, a path such as "cam.rgb"')
+        if rate is not None:
+            check_number("rate", rate, "use rows per second, over 0", above=0, most=1e6)
+        places = {path: self._known(path) for path in paths}
+        first, last = nanoseconds(self.start if start is None else start), nanoseconds(self.end if end is None else end)
+        if rate is not None:
+            instants = partial(at_rate, rate, first, last)
+        else:
+            instants = partial(self._instants, self._known(on or ""), first, last)
+        return Alignment(self._past, self._whole, places, instants, first, method=method, tolerance=tolerance)
+
+    def _instants(self, path: Path, start: int, end: int) -> Iterator[int]:
+        """Yield when there was an update of a path, in ns."""
+        for ns, tree in self._past.changes(path, start - 1, end):
+            if tree is not MISSING:
+                yield ns
+
+    def _known(self, text: str) -> Path:
+        """Return a path of which something was recorded; raises MissingKey."""
+        path = self[text].path
+        if not path or not self._past.concerning(path):
+            there = ", ".join(self.names()[:_NAMED]) or "nothing"
+            raise MissingKey(f"nothing was recorded at {shorten(text)}; the recording has {there}")
+        return path
+
+    def episodes(self, path: str = "episode") -> list[Episode]:
+        """Return the spans in which a path held a dict, in order; none if it never did.
+
+        An episode begins when a dict is written there, and ends when the dict is deleted, when something else is
+        written, such as None, or another whole dict. A whole dict that only adds fields, or changes `outcome` or
+        `discard`, belongs to the running episode, and so does every change of a field.
+        """
+        return episodes_of(self._past, self._whole, self[path].path, self.end)
+
     def channels(self, progress: Callable[[int, int], None] | None = None) -> list[ChannelSummary]:
         """Return what each channel of the file holds, by topic.
 
@@ -434,48 +506,10 @@ class LogPath:
         """Yield what `history` returns one by one, for what is larger than memory."""
         after = -1 if start is None else nanoseconds(start) - 1
         until = _END if end is None else nanoseconds(end)
-        for ns, repeats, value in self._log._past.following(self.path, after, until):
-            whole = MISSING if repeats or value is MISSING else self._log._whole(value)
+        for ns, tree in self._log._past.changes(self.path, after, until):
+            whole = self._log._whole(tree)
             if whole is not MISSING:
                 yield seconds(ns), whole
 
     def __repr__(self) -> str:
         return f"<{show(self.path)} of {self._log!r}>"
-
-
-def stacked(values: list[Any]) -> np.ndarray[Any, Any] | list[Any]:
-    """Return values as one array if they are all numbers, arrays of one kind, or lists of as many numbers; else as is.
-
-    Numbers become bool, int64, uint64 or float64, whichever holds them all exactly.
-    """
-    if not values:
-        return np.empty(0)
-    kinds = set(map(type, values))
-    if kinds == {np.ndarray}:
-        forms = {(value.dtype, value.shape) for value in values}
-        return np.stack(values) if len(forms) == 1 else values
-    if kinds == {list}:
-        lengths = {len(value) for value in values}
-        if len(lengths) != 1 or lengths == {0}:
-            return values
-        flat = numbers([item for value in values for item in value])
-        return values if flat is None else flat.reshape(len(values), -1)
-    flat = numbers(values)
-    return values if flat is None else flat
-
-
-def numbers(values: list[Any]) -> np.ndarray[Any, Any] | None:
-    """Return numbers as an array that holds them all exactly, None if there is none."""
-    kinds = set(map(type, values))
-    if kinds == {bool}:
-        return np.array(values, bool)
-    if kinds == {int}:
-        low, high = min(values), max(values)
-        if low >= -(2**63) and high < 2**63:
-            return np.array(values, np.int64)
-        return np.array(values, np.uint64) if low >= 0 else None
-    if kinds == {float}:
-        return np.array(values, np.float64)
-    if kinds == {int, float} and all(type(value) is float or abs(value) <= EXACT for value in values):
-        return np.array(values, np.float64)
-    return None

@@ -269,6 +269,12 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
                 last = value
                 yield refs[0].time, repeats, value
 
+    def changes(self, path: Path, after: int, until: int = 2**63 - 1) -> Iterator[tuple[int, Any]]:
+        """Yield the instants (ns) of news on a full path, and what was there, MISSING if nothing was."""
+        for ns, repeats, tree in self.following(path, after, until):
+            if not repeats:
+                yield ns, tree
+
     def missed(self, ref: Ref) -> int | None:
         """Return how many updates were lost in a gap, None if their publisher's numbers did not tell."""
         message, missed = self._container.message(ref), None
