@@ -10,6 +10,7 @@ from reem_async.concurrency.streams import next_on_thread
 from reem_async.coordination.presence import NodeWatch as NodeWatchCore
 from reem_async.errors import InterfaceClosed
 from reem_async.pubsub import subscribers as core
+from reem_async.pubsub.join import Join as JoinCore
 from reem_async.transport.state import StateChanges
 
 from ._twin import documented_by, shares, waits
@@ -68,6 +69,14 @@ class Watch(Following):
             return update
         except Ended:
             raise StopIteration from None
+
+
+@documented_by(JoinCore)
+class Join(Watch):
+    """Yields the time of each update of a first path, and the nearest values of all: an iterator."""
+
+    skipped = shares(JoinCore.skipped)
+    paths = property(lambda self: self._core.paths, doc="The paths, the first one first.")
 
 
 @documented_by(StateChanges)

@@ -11,6 +11,7 @@ from reem_async.store import store as core
 from ._twin import FOLLOWER, calls, documented_by, makes, runs, shares
 from .accessor import Accessor, PublishAccessor, known_keys
 from .connection import RedisInterface
+from .following import Join
 from .subscribe import PatternWatch
 
 
@@ -65,6 +66,7 @@ class KeyValueStore:
     setdefault = runs(core.KeyValueStore.setdefault)
     set = runs(core.KeyValueStore.set)
     watch = makes(core.KeyValueStore.watch, PatternWatch, FOLLOWER)
+    join = makes(core.KeyValueStore.join, Join, FOLLOWER)
     track_schema_changes = calls(core.KeyValueStore.track_schema_changes)
     _ipython_key_completions_ = known_keys
 
@@ -98,6 +100,7 @@ class PublishSpace(KeyValueStore):
     dropped = shares(space.PublishSpace.dropped)
     waiting = shares(space.PublishSpace.waiting)
     watch = calls(space.PublishSpace.watch)
+    join = calls(space.PublishSpace.join)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface, *self._core._chosen)

@@ -127,5 +127,9 @@ class PublishSpace(KeyValueStore):
         """Raise WriteOnly."""
         raise WriteOnly(_cannot_read(patterns or ("*",)))
 
+    def join(self, *paths: str, slop: float, policy: Any = None) -> NoReturn:
+        """Raise WriteOnly."""
+        raise WriteOnly(_cannot_read(paths or ("*",)))
+
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface, *self._chosen)

@@ -10,6 +10,7 @@ from ..connection import RedisInterface
 from ..errors import BadType, MissingDocument, MissingKey
 from ..plan.arguments import cannot_wait
 from ..plan.paths import parse
+from ..pubsub.join import Join
 from ..pubsub.pattern_watch import PatternWatch
 from ..session import Session
 from .accessor import _NOTHING as _NOTHING
@@ -151,6 +152,32 @@ class KeyValueStore:
             BadKey: Not a pattern.
         """
         return PatternWatch(self.interface.session, patterns, policy, largest=largest)
+
+    def join(self, *paths: str, slop: float, policy: Policy | None = None) -> Join:
+        """Return an async iterator over the updates of several paths that arrive together.
+
+        Example:
+            async for t, (image, q) in kvs.join("cam.rgb", "arm.q", slop=0.01):
+                ...
+
+        For each published update of the first path there is one, with the value of each other path whose update is
+        nearest in time, before it or after it. `t` is when the update of the first path arrived. All times are those at
+        which updates arrived at this program, on its `time.monotonic()`: clocks of publishers may differ. It is yielded
+        as soon as no nearer update can arrive, after `slop` seconds at the latest. Plain writes are not joined.
+
+        Name the path of the largest values first: on another host they are fetched, and those of the other paths that
+        arrived meanwhile are kept for it. `skipped` says, by path, why there is none for an update of the first path.
+
+        Args:
+            paths: Two paths or more, such as "cam.rgb".
+            slop: Seconds that updates may be apart.
+            policy: What to keep for a loop that is slower: `Last(10)` if not given.
+
+        Raises:
+            BadKey, BadType, BadValue: A path or argument that means nothing.
+        """
+        places = [self.at(path) for path in paths]
+        return Join(self.interface.session, [(it._reader.keys, it._path) for it in places], slop, policy)
 
     async def setdefault(self, key: str, default: Any = None) -> Any:
         """Return the value of a top-level key; where it is not there, store `default` first.
