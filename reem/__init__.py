@@ -20,8 +20,8 @@ from reem_async.pubsub.events import Origin, Update
 
 from .accessor import Accessor, Publisher, Reader, Writer
 from .connection import RedisInterface
+from .coordination import Parameter
 from .errors import *
-from .parameters import Parameter
 from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
 from .store import KeyValueStore, PublishSpace
 from .subscribe import CallbackSubscriber, SilentSubscriber

@@ -14,14 +14,13 @@ from reem_async.errors import BadType, RedisError, ReemError
 from reem_async.plan.arguments import Handle
 from reem_async.plan.paths import Path, show
 from reem_async.store import accessor as core
-from reem_async.store import space as core_space
+from reem_async.store import store as core_store
 
 from ._twin import FOLLOWER, calls, documented_by, makes, runs, shares, waits
 from .connection import RedisInterface
+from .coordination import Service, declared
 from .following import Watch
 from .mirror import Mirror
-from .parameters import declared
-from .service import Service
 
 
 class OneKey:
@@ -51,11 +50,11 @@ class Writer(OneKey):
     send_to_redis = runs(core.Writer.send_to_redis)
 
 
-@documented_by(core_space.Publisher)
+@documented_by(core_store.Publisher)
 class Publisher(Writer):
     """Writes one top-level key and notifies its subscribers, in the same transaction."""
 
-    _kind = core_space.Publisher
+    _kind = core_store.Publisher
 
 
 class Edit:
@@ -248,7 +247,7 @@ class PublishAccessor(Accessor):
 
     __slots__ = ()
     _how_to_read = "a KeyValueStore"
-    _refuse: Any = calls(core_space.PublishAccessor._refuse)
+    _refuse: Any = calls(core_store.PublishAccessor._refuse)
     mirror = parameter = watch = _refuse
     reader = property(_refuse)
 

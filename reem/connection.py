@@ -16,13 +16,13 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import reem_async
 from reem_async.concurrency.queues import BoundedQueue
-from reem_async.concurrency.scheduling import take_short_turns
+from reem_async.concurrency.tasks import take_short_turns
 from reem_async.connection import rebuilt
 from reem_async.errors import SELF_EXPLANATORY, InterfaceClosed, Stale
 from reem_async.pubsub.callbacks import Caller
+from reem_async.transport import NewTransport
 from reem_async.transport.blocking import BlockingTransport, keep_open_at_exit
 from reem_async.transport.client import client
-from reem_async.transport.composite import NewTransport
 
 from ._portal import LastPortal, Portal, Threads, finish
 from ._twin import calls, documented_by, makes, runs, shares, takes

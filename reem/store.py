@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from reem_async.store import space
 from reem_async.store import store as core
 
 from ._twin import FOLLOWER, calls, documented_by, makes, runs, shares
@@ -77,7 +76,7 @@ class KeyValueStore:
         return f"<reem.{type(self).__name__} {self.interface.hostname}>"
 
 
-@documented_by(space.PublishSpace)
+@documented_by(core.PublishSpace)
 class PublishSpace(KeyValueStore):
     """A store that can only be written, and that notifies subscribers of every change."""
 
@@ -94,13 +93,13 @@ class PublishSpace(KeyValueStore):
         super().__init__(interface, **options)
         self.outage = outage
         # In place of the one that KeyValueStore has made, which knows no outages; neither has sent anything.
-        self._core: space.PublishSpace = space.PublishSpace(self.interface._core, outage, wait, on_error)
+        self._core: core.PublishSpace = core.PublishSpace(self.interface._core, outage, wait, on_error)
 
-    flush = runs(space.PublishSpace.flush)
-    dropped = shares(space.PublishSpace.dropped)
-    waiting = shares(space.PublishSpace.waiting)
-    watch = calls(space.PublishSpace.watch)
-    join = calls(space.PublishSpace.join)
+    flush = runs(core.PublishSpace.flush)
+    dropped = shares(core.PublishSpace.dropped)
+    waiting = shares(core.PublishSpace.waiting)
+    watch = calls(core.PublishSpace.watch)
+    join = calls(core.PublishSpace.join)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.interface, *self._core._chosen)

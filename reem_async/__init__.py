@@ -23,8 +23,7 @@ if TYPE_CHECKING:
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
     from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
     from .store.accessor import Reader, Writer
-    from .store.space import Publisher, PublishSpace
-    from .store.store import KeyValueStore
+    from .store.store import KeyValueStore, Publisher, PublishSpace
     from .transport.state import StateChange
 
 __all__ = [

@@ -11,9 +11,9 @@ from .errors import SELF_EXPLANATORY
 from .local.path import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
+from .transport import NewTransport
 from .transport.aio import AsyncTransport
 from .transport.client import asyncio_client
-from .transport.composite import NewTransport
 from .transport.state import State, StateChange, StateChanges
 
 __all__ = ["RedisInterface"]

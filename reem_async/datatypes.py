@@ -2,8 +2,7 @@
 
 from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber, Update
 from .store.accessor import Accessor, Reader, Writer
-from .store.space import Publisher, PublishSpace
-from .store.store import KeyValueStore
+from .store.store import KeyValueStore, Publisher, PublishSpace
 
 __all__ = [
     "Accessor",

@@ -25,11 +25,10 @@ from .plan.paths import LONGEST_TOP_KEY, Pattern, check_namespace, check_top_key
 from .plan.shapes import ShapeCache
 from .ships.base import SpecialDatatypeShip
 from .ships.registry import Ships, default_ships
-from .transport import Transport, drive, scanned
-from .transport.composite import NewTransport
+from .transport import NewTransport, Transport, drive, scanned
 from .transport.options import Options, look_nearby
-from .transport.packing import CommandRecorder
-from .transport.startup import StartupWait
+from .transport.protocol import CommandRecorder
+from .transport.state import StartupWait
 
 _FRESH = 3.0  # seconds for which the first notices of a publisher about a key go to all nodes of a cluster
 _QUIET = 60.0

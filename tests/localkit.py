@@ -12,7 +12,7 @@ import numpy as np
 from slotkit import in_slot
 
 import reem
-from reem_async.local import host, path, reader, segment  # noqa: F401 - users without rights cannot import them later
+from reem_async.local import path, segment  # users without rights cannot import them later
 from reem_async.store import publish
 
 PATIENCE = 30.0
@@ -197,7 +197,7 @@ def another_user(url, key, user):
         until(lambda: mirror.value() is not None and mirror.value()["n"] == 1)
         say(in_slot(mirror.value()["image"]), is_whole(mirror.value()))
         process, descriptor, inode, number, stamp = map(int, sys.stdin.readline().split())
-        slot = path.Slot(host.host(), process, descriptor, inode, number, stamp)
+        slot = path.Slot(segment.host(), process, descriptor, inode, number, stamp)
         say(interface._followers.session.local.reader.view(slot, 1))
         try:
             os.close(os.open(f"/proc/{process}/fd/{descriptor}", os.O_RDONLY))
@@ -259,7 +259,7 @@ STEPS = {
 
 def killed_at(url, key, mode):
     """Have children publish, and end at the step that is said."""
-    assert host.host()  # what is tried for that is none of the steps
+    assert segment.host()  # what is tried for that is none of the steps
     for line in sys.stdin:
         step = line.strip()
         pid = os.fork()

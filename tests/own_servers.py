@@ -13,8 +13,7 @@ from conftest import PATIENCE
 
 import reem
 import reem_async
-from reem_async.server.process import HOST, PortTaken, ServerProcess, ServerProgram
-from reem_async.server.programs import find_program
+from reem_async.server.process import HOST, PortTaken, ServerProcess, ServerProgram, find_program
 
 
 class Configured(ServerProcess):

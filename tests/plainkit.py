@@ -9,8 +9,7 @@ import hiredis
 import orjson
 import redis
 
-from reem_async.plain.documents import MARK, TextDocument
-from reem_async.plain.paths import Refusal
+from reem_async.plain.documents import MARK, Refusal, TextDocument
 from reem_async.plan.paths import to_jsonpath
 from reem_async.tools.snapshots.plans import settable
 

@@ -8,7 +8,7 @@ from conftest import eventually
 from own_servers import free_port
 
 from reem_async.server import EmbeddedServer
-from reem_async.server.programs import find_program
+from reem_async.server.process import find_program
 
 SERVICE = "mymaster"
 

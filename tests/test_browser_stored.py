@@ -15,7 +15,7 @@ import reem_async
 from reem_async.errors import ConnectionLost
 from reem_async.plan.placeholders import Unreadable
 from reem_async.plan.trees import MISSING
-from reem_async.pubsub import finder
+from reem_async.pubsub import refresh
 from reem_async.pubsub.monitor import Monitor
 from reem_async.server.embedded import EmbeddedServer
 from reem_async.tools.browser import LiveSource
@@ -68,7 +68,7 @@ def alike(one, other):
 @pytest.fixture
 def nobody_looks(monkeypatch):
     """The keys are listed at the beginning only: what is seen is what the server has told."""
-    monkeypatch.setattr(finder, "_PERIOD", 600.0)
+    monkeypatch.setattr(refresh, "_PERIOD", 600.0)
 
 
 @pytest.mark.long
@@ -402,7 +402,7 @@ async def test_after_a_connection_that_nobody_missed_all_is_read_again(key, akvs
 
     The next search for keys is far, as after one that had no answer.
     """
-    monkeypatch.setattr(finder, "_PERIOD", 600.0)
+    monkeypatch.setattr(refresh, "_PERIOD", 600.0)
     async with followed_all(binterface, key(), akvs) as (follower, history):
         follower.monitor.broken = lambda: None
         for connection in subscribed(raw):
@@ -422,7 +422,7 @@ async def test_calls_that_waited_long_for_a_dead_link_delay_no_later_ones(key, a
 
     clock = SimpleNamespace(monotonic=lambda: time.monotonic() + waited, time=time.time)
     monkeypatch.setattr(follower_module, "time", clock)
-    monkeypatch.setattr(finder, "time", clock)
+    monkeypatch.setattr(refresh, "time", clock)
     async with followed_all(binterface, key(), akvs) as (follower, history):
         with monkeypatch.context() as patched:
             patched.setattr(binterface.session.transport, "roundtrip", lost)

@@ -11,7 +11,7 @@ import pickle
 import pytest
 
 import reem
-from reem_async.concurrency.wakeup import wakeups
+from reem_async.concurrency.locks import wakeups
 
 
 @dataclasses.dataclass

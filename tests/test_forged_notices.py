@@ -22,7 +22,7 @@ from reem_async.plan import notices
 from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.notices import Notice
 from reem_async.plan.paths import LONGEST_TOP_KEY, fits, names_key
-from reem_async.pubsub.gaps import GapDetector, Numbers
+from reem_async.pubsub.division import GapDetector, Numbers
 from reem_async.recording import Recorder, open_log
 from reem_async.store.catalog import names
 

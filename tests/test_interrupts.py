@@ -19,7 +19,7 @@ from reem_async.plan.keys import keys_of
 from reem_async.plan.replies import decoded
 from reem_async.pubsub.events import Update
 from reem_async.transport.options import Options
-from reem_async.transport.packing import Packer
+from reem_async.transport.protocol import Packer
 
 SEED = int(os.environ.get("REEM_TEST_SEED", time.time_ns() % 10**6))
 PATIENCE = 30.0

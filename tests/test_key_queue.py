@@ -14,8 +14,7 @@ from reem_async.errors import Conflict, NotConnected
 from reem_async.plan.copies import concerns, is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
 from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
-from reem_async.pubsub.division import Division, Heard, divided_read
-from reem_async.pubsub.gaps import Numbers
+from reem_async.pubsub.division import Division, Heard, Numbers, divided_read
 from reem_async.tools.recording.key_queue import Item, KeyQueue, settled
 from reem_async.tools.recording.stored import New, Unchanged, applied
 
@@ -365,7 +364,7 @@ def test_who_never_hears_of_what_is_published_gives_up():
 
 def test_the_queue_does_no_input_or_output():
     """It knows no loop, socket or client."""
-    for name in ("tools/recording/key_queue", "pubsub/division", "pubsub/gaps"):
+    for name in ("tools/recording/key_queue", "pubsub/division"):
         path = ROOT / "reem_async" / f"{name}.py"
         assert roots(path) <= set(sys.stdlib_module_names) | {"reem_async"}
         assert not roots(path) & {"asyncio", "socket", "time", "threading"}

@@ -9,9 +9,7 @@ from slotkit import in_slot
 
 import reem
 import reem_async
-from reem_async.local.host import reason_against
-from reem_async.local.reader import LocalReader
-from reem_async.local.segment import SLOTS, Segment
+from reem_async.local.segment import SLOTS, LocalReader, Segment, reason_against
 from reem_async.plan.notices import Slot
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")

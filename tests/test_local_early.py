@@ -11,7 +11,7 @@ from conftest import PATIENCE, aeventually, assert_same
 
 import reem_async
 from reem_async.errors import ServerFull, Stale
-from reem_async.local.host import reason_against
+from reem_async.local.segment import reason_against
 from reem_async.server import EmbeddedServer
 from reem_async.store import publish
 

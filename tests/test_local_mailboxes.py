@@ -20,8 +20,8 @@ from conftest import PATIENCE, ROOT, aeventually, eventually, line_of
 import reem
 import reem_async
 from reem_async.local import mailbox
-from reem_async.local.host import host, reason_against
 from reem_async.local.mailbox import FOLLOWS, JOINED, PUBLISHER, SUBSCRIBER, UPDATE, Mailbox, Subscribers
+from reem_async.local.segment import host, reason_against
 from reem_async.plan.keys import keys_of
 from reem_async.pubsub.early import EarlyInbox
 

@@ -13,19 +13,28 @@ import orjson
 import pytest
 from slotkit import at_step
 
-from reem_async.local import host as local_host
 from reem_async.local import path as local_path
-from reem_async.local import reader as local_reader
-from reem_async.local.host import host, reason_against
+from reem_async.local import segment as local_segment
 from reem_async.local.path import LocalPath
-from reem_async.local.reader import LocalReader
-from reem_async.local.segment import HEAD, IDENTITY, MARK, SEALS, SLOTS, STAMP, Segment, stamp_at
+from reem_async.local.segment import (
+    HEAD,
+    IDENTITY,
+    MARK,
+    SEALS,
+    SLOTS,
+    STAMP,
+    LocalReader,
+    Segment,
+    host,
+    reason_against,
+    stamp_at,
+)
 from reem_async.plan.changes import EncodedAttachment
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import ANNOUNCED, LARGEST_INLINE, Slot, announce, decode, in_slot
 from reem_async.plan.placeholders import Placeholder
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.transport.packing import CommandRecorder
+from reem_async.transport.protocol import CommandRecorder
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
 
@@ -87,7 +96,7 @@ def test_a_slot_that_cannot_be_mapped_is_left_to_the_server(monkeypatch):
     segment = Segment(1000)
     slot = put(segment, b"x")
     with monkeypatch.context() as patched:
-        patched.setattr("reem_async.local.reader.mmap.mmap", refused)
+        patched.setattr("reem_async.local.segment.mmap.mmap", refused)
         assert LocalReader().view(slot, 1) is None
     assert bytes(LocalReader().view(slot, 1)) == b"x"
 
@@ -112,18 +121,18 @@ def test_a_program_that_may_not_look_at_its_host_any_more_goes_through_the_serve
     def gone(_):
         raise FileNotFoundError
 
-    monkeypatch.setattr(local_host, "_named", gone)
+    monkeypatch.setattr(local_segment, "_named", gone)
     assert host() == ""
 
 
 def test_what_was_short_for_a_moment_is_tried_again(monkeypatch):
-    local_host._found_against.cache_clear()
+    local_segment._found_against.cache_clear()
 
     def full(_):
         raise OSError(errno.EMFILE, "too many open files")
 
     with monkeypatch.context() as patched:
-        patched.setattr(local_host, "Segment", full)
+        patched.setattr(local_segment, "Segment", full)
         assert "too many open files" in reason_against()
     assert reason_against() == ""
 
@@ -209,7 +218,7 @@ def test_a_view_outlives_its_reader_and_its_publisher():
 def test_a_segment_whose_views_are_kept_is_not_forgotten_and_its_views_stay_counted(monkeypatch):
     """Else one slow reader would take a few slots more each time, and in the end all."""
     segment, reader = Segment(1000), LocalReader()
-    monkeypatch.setattr(local_reader, "_IDLE", -1.0)
+    monkeypatch.setattr(local_segment, "_IDLE", -1.0)
     views = []
     for number in range(SLOTS + 2):
         views.append(reader.view(put(segment, b"%d" % number), 1))

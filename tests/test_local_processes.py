@@ -12,8 +12,8 @@ from localkit import EXITS, STEPS, frame, is_whole
 from slotkit import in_slot
 
 import reem
-from reem_async.local import reader as local_reader
-from reem_async.local.host import reason_against
+from reem_async.local import segment as local_segment
+from reem_async.local.segment import reason_against
 from reem_async.plan.keys import keys_of
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
@@ -96,7 +96,7 @@ def test_a_publisher_that_is_killed_at_any_step_leaves_nothing_and_spoils_nothin
     mode, server_url, key, pspace, kvs, mirror, following, monkeypatch
 ):
     """Readers have what the server has, others publish, and no memory of it is looked into any more."""
-    monkeypatch.setattr(local_reader, "_IDLE", 0.0)
+    monkeypatch.setattr(local_segment, "_IDLE", 0.0)
     mappings, killed = following._followers.session.local.reader._mappings, set()
     with started("killed_at", server_url, key("cam"), mode) as process:
         for step in STEPS:

@@ -6,7 +6,7 @@ import sys
 import pytest
 from conftest import ROOT, sized
 
-from reem_async.local.host import reason_against
+from reem_async.local.segment import reason_against
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
 

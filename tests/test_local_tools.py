@@ -12,7 +12,7 @@ from conftest import PATIENCE
 
 import reem
 import reem_async
-from reem_async.local.host import reason_against
+from reem_async.local.segment import reason_against
 from reem_async.pubsub.monitor import Event, Monitor
 from reem_async.tools.cli import doctor
 from reem_async.tools.cli.checks import OK, WARN

@@ -10,7 +10,7 @@ from slotkit import in_slot
 import reem
 import reem_async
 from reem.server import EmbeddedServer
-from reem_async.local.host import reason_against
+from reem_async.local.segment import reason_against
 from reem_async.ships.registry import default_ships
 
 pytestmark = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")

@@ -16,11 +16,10 @@ import reem.migration
 import reem.snapshots
 import reem_async
 from reem.server import EmbeddedCluster, EmbeddedServer
-from reem_async.plain.batches import Known
 from reem_async.plain.documents import MARK, TextDocument
-from reem_async.plain.translation import directly, looked_at, translated
+from reem_async.plain.translation import Known, directly, looked_at, translated
 from reem_async.store.catalog import names
-from reem_async.transport.parsing import error_of
+from reem_async.transport.protocol import error_of
 from reem_async.transport.text import HeldText
 
 with_module = pytest.mark.skipif(PLAIN, reason="compares with a server that has the module")

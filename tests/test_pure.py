@@ -22,8 +22,7 @@ from reem_async.plan.replies import decoded
 from reem_async.plan.shapes import ShapeCache
 from reem_async.ships import NumpyShip
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.transport.packing import CommandRecorder, pack
-from reem_async.transport.parsing import MORE, LargeReader, SmallReader
+from reem_async.transport.protocol import MORE, CommandRecorder, LargeReader, SmallReader, pack
 
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=12)
 PATHS = st.lists(st.one_of(TEXT, st.integers(0, 99)), max_size=5).map(tuple)

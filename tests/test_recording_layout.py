@@ -26,7 +26,7 @@ from reem_async.tools.recording.sample import read_key_file
 from reem_async.tools.recording.sink import OPEN, fits, schema_text, signature
 from reem_async.tools.recording.stored import Reference, extract, planted, pruned, resolve
 from reem_async.tools.recording.times import AFTER, STEP, nanoseconds, seconds
-from reem_async.transport.packing import CommandRecorder
+from reem_async.transport.protocol import CommandRecorder
 
 SHIPS = Ships(default_ships(), CommandRecorder)
 TIME = 1_700_000_000_123_456_000

@@ -40,7 +40,7 @@ from reem_async.pubsub.replica import (
     Updated,
 )
 from reem_async.ships.registry import Ships, default_ships
-from reem_async.transport.packing import CommandRecorder
+from reem_async.transport.protocol import CommandRecorder
 
 KEYS = keys_of("k")
 PATHS = [(), ("a",), ("a", "b"), ("a", "n"), ("a", "n", "x"), ("l",), ("l", 0), ("l", 1, "x"), ("z",)]

@@ -9,7 +9,7 @@ import pytest
 
 _FAULTS = """
 import resource
-from reem_async.concurrency.scheduling import keep_memory
+from reem_async.concurrency.tasks import keep_memory
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     for _ in range(100):
@@ -29,7 +29,7 @@ def test_memory_that_is_kept_is_not_taken_page_by_page_again() -> None:
 
 _TURN = """
 import ctypes, os, struct, threading
-from reem_async.concurrency.scheduling import take_short_turns
+from reem_async.concurrency.tasks import take_short_turns
 def turn():
     "Policy, flags, niceness and turn in nanoseconds of this thread, as Linux tells them."
     got = ctypes.create_string_buffer(48)

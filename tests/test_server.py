@@ -37,7 +37,6 @@ from reem_async.errors import BadData, BadValue, Misuse, ServerFailed, ServerFul
 from reem_async.server import EmbeddedServer
 from reem_async.server import embedded as server_module
 from reem_async.server import process as _server_process
-from reem_async.server import programs as _server_programs
 
 ROOT = pathlib.Path(__file__).parents[1]
 ONCE = Retry(NoBackoff(), 0)
@@ -69,7 +68,7 @@ def sees(word: str) -> bool:
 @pytest.fixture
 def wrapped(tmp_path):
     """Make a script that runs the real server program in some other way."""
-    program = _server_programs.find_program()
+    program = _server_process.find_program()
 
     def make(name: str, body: str) -> pathlib.Path:
         script = tmp_path / name
@@ -613,13 +612,13 @@ class TestPrograms:
     @pytest.mark.long
     def test_reem_server_with_json(self, wrapped, tmp_path):
         marker = tmp_path / "ran"
-        modules = "".join(f"loadmodule {m}\\n" for m in _server_programs.find_program().modules)
+        modules = "".join(f"loadmodule {m}\\n" for m in _server_process.find_program().modules)
         script = wrapped("custom", f"echo >>{marker}; (printf '{modules}'; cat) | exec SERVER -")
         assert self.run(self.BLOCKED, self.SHOW, REEM_SERVER=str(script)) == "up\n"
         assert marker.read_text() == "\n" * 3  # asked once, started twice
 
     def test_reem_server_without_json_and_no_module_keeps_documents_as_text(self, wrapped):
-        if not _server_programs.find_program().modules:
+        if not _server_process.find_program().modules:
             pytest.skip("the server at hand has JSON built in")
         use = """
             import reem
@@ -658,13 +657,13 @@ class TestPrograms:
     def test_path_is_tried_in_order_and_passed_over_without_json(self, wrapped, tmp_path):
         wrapped("redis-server", "exit 1")
         marker = tmp_path / "ran"
-        modules = "".join(f"loadmodule {m}\\n" for m in _server_programs.find_program().modules)
+        modules = "".join(f"loadmodule {m}\\n" for m in _server_process.find_program().modules)
         wrapped("valkey-server", f"echo >>{marker}; (printf '{modules}'; cat) | exec SERVER -")
         assert self.run(self.BLOCKED, self.SHOW, PATH=f"{tmp_path}:/usr/bin:/bin") == "up\n"
         assert marker.exists()
 
     def test_the_module_of_the_same_installation_is_used(self, wrapped, tmp_path):
-        modules = _server_programs.find_program().modules
+        modules = _server_process.find_program().modules
         if not modules:
             pytest.skip("the server at hand has JSON built in")
         for folder in ("bin", "lib/redis/modules"):
@@ -676,7 +675,7 @@ class TestPrograms:
     def test_permissions_that_an_installer_dropped_are_given_back(self, tmp_path):
         file = tmp_path / "program"
         file.touch(mode=0o644)
-        assert os.access(_server_programs._executable(file), os.X_OK)
+        assert os.access(_server_process._executable(file), os.X_OK)
 
     def test_windows_is_told_what_to_do(self, monkeypatch):
         monkeypatch.setattr(sys, "platform", "win32")

@@ -20,7 +20,7 @@ from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.writes import append_change, change, delete_change, set_change, takes, together
 from reem_async.ships.registry import Ships, default_ships
 from reem_async.store.publish import PublishTurn
-from reem_async.transport.packing import CommandRecorder
+from reem_async.transport.protocol import CommandRecorder
 
 
 async def test_edit_writes_back_what_the_block_changed(akvs, key, raw):

@@ -25,7 +25,7 @@ from reem_async.plan.reads import read
 from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.writes import change, set_change
 from reem_async.store.publish import DocumentPublisher, PublishTurn
-from reem_async.transport.packing import pack
+from reem_async.transport.protocol import pack
 from reem_async.transport.route import keys_in
 
 from .kinds import ARM

@@ -13,7 +13,7 @@ from typing import Any
 
 from ..errors import QueueFull
 from ..plan.arguments import check_instance, whole
-from .wakeup import Wakeups, wakeups
+from .locks import Wakeups, wakeups
 
 
 class Policy:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import os
 import random
 import secrets
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from enum import Enum
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..concurrency.timeouts import check_timeout, time_limit
 from ..errors import (
@@ -35,13 +36,16 @@ from ..plan.keys import Keys
 from ..plan.notices import assembled
 from ..plan.paths import Path, escaped, show
 from ..plan.reads import with_bytes
+from ..pubsub.early import LoopMailbox
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import SubscriptionManager, manager_of
 from ..session import Session
 from ..store.encoding import Encoder
 from . import messages
-from .direct import Post
 from .messages import ID, Content, Encoded, Message, Names
+
+if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
+    from ..local.mailbox import Datagram, is_address
 
 DEFAULT_TIMEOUT = 10.0  # seconds for which a call waits if neither it nor `reem.timeout` says
 _PERIOD = 0.3  # seconds between pings to the servers from which answers are due
@@ -52,6 +56,8 @@ _SHARED = 2
 """Calls in progress to one server up to which the answer may be in shared memory: it has six slots for a caller, who
 may look into three."""
 _DEEPEST = 128  # levels of a document
+_MESSAGE = b"M"  # the kind of datagrams that carry messages
+_LARGEST = 100_000  # bytes of a message that goes directly: a mailbox takes a little more
 _STATED = {"host": str, "pid": int, "calls": int, "rate": float, "median": float, "errors": int}
 """What the words of a PONG are."""
 
@@ -167,6 +173,55 @@ async def opened(session: Session, content: Content | None, prefix: str, where: 
         raise
     except Exception as error:  # a ship may raise anything over foreign bytes
         raise BadData(f"{where}: a value cannot be rebuilt: {error!s:.200}") from error
+
+
+class Post(LoopMailbox):
+    """Messages of services between programs of one user on one host, by datagrams in place of the server.
+
+    A caller with `local="early"` names its mailbox in each request. The server then names its own in the answer, and
+    later requests and answers go from mailbox to mailbox. What a mailbox cannot take at once goes through the server.
+    So do pings, and so a program that ends, stops or loses its connection is noticed as before.
+
+    Args:
+        session: Says whether the direct path is allowed, and counts what cannot be read.
+        take: Called with each message. It may raise BadData.
+    """
+
+    def __init__(self, session: Session, take: Callable[[bytes], None]) -> None:
+        # At once more than the kernel queues: the word that a caller has left may wait behind its request.
+        super().__init__(self._take_message, 1000)
+        self._session = session
+        self._take = take
+
+    @property
+    def address(self) -> str:
+        """Where others can send to; empty if that cannot be."""
+        mailbox = self._opened()
+        return mailbox.address if mailbox is not None else ""
+
+    def _opened(self) -> Any:
+        return super()._opened() if self._mailbox is not None or self._session.local.host else None
+
+    def send(self, address: str, payload: bytes) -> bool:
+        """Send a message without waiting; return False if its receiver is gone, or has no room for it now."""
+        if not address or not is_address(address) or len(payload) > _LARGEST or (mailbox := self._opened()) is None:
+            return False
+        try:
+            mailbox.try_send(address, _MESSAGE, b"", payload)
+        except OSError:
+            return False
+        return True
+
+    def _take_message(self, it: Datagram) -> None:
+        try:
+            self._take(it.content)
+        except BadData:
+            self._session.transport.states.unreadable += 1
+
+    def close(self) -> None:
+        """Close the mailbox: what is sent to it from now on goes through the server."""
+        self.read()
+        super().close()
 
 
 class Instance:

@@ -41,9 +41,8 @@ from ..pubsub.follower import Follower
 from ..pubsub.manager import manager_of
 from ..pubsub.subscribers import Link
 from ..session import Session
-from ..store.document import DocumentWriter, retried
+from ..store.document import DocumentReader, DocumentWriter, retried
 from ..store.publish import publisher
-from ..store.reader import DocumentReader
 from .specification import Specification, as_json, equal, from_stored, specified
 
 logger = logging.getLogger("reem.parameters")

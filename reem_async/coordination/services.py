@@ -24,8 +24,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
-from ..concurrency.scheduling import take_short_turns
-from ..concurrency.tasks import is_being_cancelled
+from ..concurrency.tasks import is_being_cancelled, take_short_turns
 from ..errors import (
     BadData,
     BadType,
@@ -48,8 +47,7 @@ from ..pubsub.manager import manager_of
 from ..session import Session
 from ..store.publish import publisher
 from . import messages
-from .calls import encoded, explained, new_id, opened, publish
-from .direct import Post
+from .calls import Post, encoded, explained, new_id, opened, publish
 from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")

@@ -21,9 +21,8 @@ from ..plan.reads import RawRead, nothing, read
 from ..plan.sizes import STAGED
 from ..plan.writes import exchange, set_change
 from ..session import Session
-from ..store.document import Turn
+from ..store.document import Turn, opened
 from ..store.publish import DocumentPublisher
-from ..store.reader import opened
 from ..tools.snapshots.plans import settable
 from ..transport import scanned
 from .finding import OldKey, asked, find

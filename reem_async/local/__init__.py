@@ -2,7 +2,7 @@
 
 The server still gets every update; its notice also says where the bytes are in the publisher's memory, and a
 subscriber that can reach them there need not fetch them. `path.py` is what an interface has of it, `segment.py` the
-memory of a publisher and the locks on its slots, `reader.py` the views of a subscriber.
+memory of a publisher, the locks on its slots, and the views of a subscriber.
 
     publisher                                          subscriber
     segment.put(): lock a slot that no reader has

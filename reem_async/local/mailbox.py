@@ -26,9 +26,8 @@ import time
 import weakref
 from typing import NamedTuple
 
-from ..concurrency.locks import Inherited
-from ..concurrency.wakeup import Descriptor
-from .host import host
+from ..concurrency.locks import Descriptor, Inherited
+from .segment import host
 
 logger = logging.getLogger("reem.publish")
 

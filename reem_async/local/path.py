@@ -17,10 +17,8 @@ from ..plan.keys import Keys
 from ..plan.notices import Slot, starts
 
 if TYPE_CHECKING or hasattr(os, "memfd_create"):  # Linux
-    from .host import host
     from .mailbox import Subscribers
-    from .reader import LocalReader
-    from .segment import HEAD, SLOTS, Segment
+    from .segment import HEAD, SLOTS, LocalReader, Segment, host
 
 LEAST = 1 << 16  # bytes from which a value goes through shared memory: below, a fetch from the server takes no longer
 MEMORY = 256 << 20  # bytes of shared memory of one interface, unless another number is given

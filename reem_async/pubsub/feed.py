@@ -28,8 +28,7 @@ from ..plan.keys import Keys
 from ..plan.placeholders import Unreadable
 from ..plan.reads import RawRead
 from ..plan.replies import decoded
-from .division import Division, Heard, Phase
-from .gaps import GapDetector, Numbered
+from .division import Division, GapDetector, Heard, Numbered, Phase
 
 U = TypeVar("U", bound=Numbered)
 

@@ -25,9 +25,9 @@ from ..plan.notices import Notice
 from ..plan.paths import fits
 from ..transport import Transport, scanned
 from ..transport.wire import Wire
-from .finder import find_regularly
-from .gaps import Stamp
+from .division import Stamp
 from .listeners import Beginning, Listener, Topic
+from .refresh import find_regularly
 
 logger = logging.getLogger("reem.subscribe")
 

@@ -29,8 +29,7 @@ from ..transport import Transport
 from ..transport.route import Moved, is_unapplied
 from ..transport.wire import Wire, close_all
 from .key_watcher import KeyWatcher
-from .listeners import NO_LISTENERS, Beginning, Inbox, Listener, ListenerGroup, Topic
-from .subscription_commands import Invalidations, Subscribing
+from .listeners import NO_LISTENERS, Beginning, Inbox, Invalidations, Listener, ListenerGroup, Subscribing, Topic
 
 if TYPE_CHECKING:
     from ..transport.aio import AsyncTransport

@@ -18,7 +18,7 @@ from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, Pattern, channel_pattern, fits, is_namespace, name_of, parse_patterns, show
 from ..session import Session
 from ..transport.wire import Wire
-from .gaps import Numbers
+from .division import Numbers
 from .listeners import Beginning, Listener, Topic, contained
 from .manager import SubscriptionManager, manager_of
 

@@ -18,11 +18,11 @@ from ..plan.notices import Notice
 from ..plan.paths import Path, name_of, parse_patterns, parse_shown, show, spelled_out
 from ..session import Session
 from .events import Update
-from .finder import find_regularly, present_keys
 from .follower import Follower, checked_largest
 from .listeners import Listener, Topic
 from .manager import SubscriptionManager
 from .monitor import PatternStream
+from .refresh import find_regularly, present_keys
 
 logger = logging.getLogger("reem.subscribe")
 

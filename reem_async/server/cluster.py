@@ -12,9 +12,7 @@ from contextlib import suppress
 from functools import partial
 
 from ..errors import BadValue, ServerFailed
-from .process import HOST, PortTaken, ServerProcess, ServerProgram, bindable, packed
-from .programs import find_program
-from .startable import Startable
+from .process import HOST, PortTaken, ServerProcess, ServerProgram, Startable, bindable, find_program, packed
 
 SLOTS = 16384
 ATTEMPTS = 10  # to find ports that no other program takes just before the server does

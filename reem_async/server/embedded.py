@@ -11,9 +11,7 @@ from typing import Any
 from urllib.parse import quote
 
 from reem_async.errors import BadValue, Misuse
-from reem_async.server.process import HOST, PortTaken, ServerProcess, bindable, has_data
-from reem_async.server.programs import find_program
-from reem_async.server.startable import Startable
+from reem_async.server.process import HOST, PortTaken, ServerProcess, Startable, bindable, find_program, has_data
 
 ATTEMPTS = 10  # to find a port that no other program takes just before the server does
 FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored

@@ -23,8 +23,7 @@ from ..plan.paths import Path, check_element, check_name, parse, show
 from ..pubsub.mirror import Mirror
 from ..pubsub.subscribers import Watch
 from .catalog import Outline, outline
-from .document import DocumentWriter, retried
-from .reader import DocumentReader, opened
+from .document import DocumentReader, DocumentWriter, opened, retried
 
 if TYPE_CHECKING:
     from ..plan.reads import RawRead

@@ -17,10 +17,9 @@ from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, W
 from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
-from . import Guard, Held, document_of
-from .composite import OneServer
+from . import Guard, Held, OneServer, document_of
 from .options import Options, server_run_id
-from .parsing import error_of
+from .protocol import error_of
 from .state import States
 from .text import HeldText, Text
 from .wire import BUFFER, Wire, close_all, open_wire

@@ -19,16 +19,14 @@ from typing import Any
 import redis.exceptions
 
 from ..concurrency.locks import Inherited, Locks, ThreadLock, WeakList
-from ..concurrency.scheduling import give_way
+from ..concurrency.tasks import give_way
 from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
-from . import Guard, Held
-from .composite import OneServer
+from . import Guard, Held, OneServer
 from .options import INFO_SERVER, Options, server_run_id
-from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader, error_of
+from .protocol import MORE, NOT_THE_PROTOCOL, SLOW, LargeReader, Piece, ReplyReader, SmallReader, error_of, pack
 from .state import States
 from .text import PROBE, HeldText, Text, is_plain, lists_json
 

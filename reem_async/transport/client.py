@@ -9,7 +9,7 @@ import redis.asyncio
 
 from ..errors import Misuse, NoJsonSupport
 from .options import Options
-from .packing import Packer
+from .protocol import Packer
 
 _NO_JSON = "UNKNOWN COMMAND 'JSON."
 """How the error of a server without JSON begins, in capitals; redis-py has taken its `ERR` away."""

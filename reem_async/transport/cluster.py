@@ -24,10 +24,8 @@ import redis.exceptions
 from ..errors import BadValue, ConnectionLost, InterfaceClosed, NotAllowed, NotConnected, TlsRefused
 from ..plan import Command, Reply
 from ..plan.sizes import are_missing, as_given, is_large, looks_at, stage
-from . import Contention, Guard, Held, Transport
-from .addresses import address_of, listed
-from .composite import CompositeTransport, NewTransport
-from .options import Address, NodeOptions, Options
+from . import CompositeTransport, Contention, Guard, Held, NewTransport, Transport
+from .options import Address, NodeOptions, Options, address_of, listed
 from .route import (
     Ask,
     HeldAcross,

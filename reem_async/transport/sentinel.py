@@ -21,10 +21,8 @@ import redis.exceptions
 
 from ..errors import BadValue, ConnectionLost, NotConnected, ReemError, Refused, TlsRefused
 from ..plan import Command, Reply
-from . import Guard, Held, Transport
-from .addresses import address_of, listed
-from .composite import CompositeTransport, NewTransport
-from .options import Address, NodeOptions, Options
+from . import CompositeTransport, Guard, Held, NewTransport, Transport
+from .options import Address, NodeOptions, Options, address_of, listed
 from .state import States
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The state of an interface's connection: to look at, to be called about, to iterate over."""
+"""The state of an interface's connection, and how long calls wait for a server that is not up yet."""
 
 from __future__ import annotations
 
@@ -8,13 +8,44 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from ..concurrency.locks import Inherited, WeakList
 from ..concurrency.queues import BoundedQueue, Last, noop
 from ..concurrency.streams import Stream
-from ..errors import InterfaceClosed
-from .startup import StartupWait
+from ..errors import InterfaceClosed, NotConnected, ServerNotReady
+
+_PAUSE = 0.1  # seconds between two attempts
+
+
+class StartupWait:
+    """How long the calls of one interface wait for a server that is not up yet.
+
+    Nothing is asked or counted while calls succeed. The time begins with the first call that finds no server.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._deadline: float | None = None
+
+    async def allows(self, transport: Any, error: Exception) -> bool:
+        """Pause and return True if a call over a `Transport` that ended in `error`, unapplied, is to be tried again."""
+        if not self._seconds or not isinstance(error, NotConnected | ServerNotReady):
+            return False
+        now, opened = time.monotonic(), transport.states.first_opened
+        # A server that has been reached is lost, and not starting: but it may still load its data, and a cluster may
+        # have nodes that start later than the first one.
+        if opened is not None and not isinstance(error, ServerNotReady) and not transport.sharded:
+            return False
+        if self._deadline is None:
+            self._deadline = (now if opened is None else opened) + self._seconds
+            if now < self._deadline:
+                logger.warning("waiting up to %g s for the server: %s", self._deadline - now, error)
+        if now >= self._deadline:
+            return False
+        await transport.pause(min(_PAUSE, self._deadline - now))
+        return True
+
 
 logger = logging.getLogger("reem.connection")
 

@@ -14,13 +14,11 @@ from zlib import crc32
 
 from ..concurrency.timeouts import time_limit
 from ..errors import ConnectionLost, NoJsonSupport, NotConnected
-from ..plain.batches import Known, Steps, Watched, concerns, is_json
-from ..plain.changes import after_look
-from ..plain.translation import directly, looked_at, translated
+from ..plain.translation import Known, Steps, Watched, after_look, concerns, directly, is_json, looked_at, translated
 from ..plan import Command, Reply
 from ..plan.sizes import KEPT, Staged, as_given, stage
 from . import Contention, Held
-from .parsing import error_of
+from .protocol import error_of
 
 PROBE: Command = ("JSON.GET",)
 """Refused by every server: for its number of words by one that knows the command, else as an unknown one."""

@@ -19,14 +19,13 @@ from typing import Any
 import hiredis
 
 from ..concurrency.locks import Inherited
-from ..concurrency.scheduling import give_way
+from ..concurrency.tasks import give_way
 from ..concurrency.timeouts import LOOKS, confirmed, moved_last, server_timeout, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plan import Command, Reply
 from ..plan.sizes import LARGE
 from .options import INFO_SERVER, Options, is_this_machine
-from .packing import SLOW, Piece, pack
-from .parsing import MORE, NOT_THE_PROTOCOL, LargeReader, ReplyReader, SmallReader
+from .protocol import MORE, NOT_THE_PROTOCOL, SLOW, LargeReader, Piece, ReplyReader, SmallReader, pack
 from .text import PROBE, is_plain, lists_json, over_wire
 
 _BUSY = 2.5  # the connection is busy if three reads come within so many times `pace`

@@ -17,8 +17,7 @@ import orjson
 import test_local_memory as memory
 
 import reem
-from reem_async.local.host import host, reason_against
-from reem_async.local.segment import HEAD, SLOTS, Segment
+from reem_async.local.segment import HEAD, SLOTS, Segment, host, reason_against
 from reem_async.plan.notices import Slot
 
 from .programs import SIZE, shot

@@ -14,7 +14,7 @@ from pathlib import Path
 import redis
 from own_servers import Configured
 
-from reem_async.server.programs import find_program
+from reem_async.server.process import find_program
 
 # Below the ports that the kernel gives to clients: while the server is down, one of them could be given its port.
 PORTS = range(20_000, 32_000)

@@ -12,8 +12,7 @@ from reem_async.plan.replies import loads, refusal
 from reem_async.ships.base import BytesShip
 from reem_async.ships.numpy import NumpyShip
 from reem_async.ships.registry import Ships
-from reem_async.transport.packing import CommandRecorder
-from reem_async.transport.parsing import MORE, NOT_THE_PROTOCOL, LargeReader, SmallReader
+from reem_async.transport.protocol import MORE, NOT_THE_PROTOCOL, CommandRecorder, LargeReader, SmallReader
 
 SHIPS = Ships([NumpyShip(), BytesShip()], CommandRecorder)
 KEYS = keys_of("foo")

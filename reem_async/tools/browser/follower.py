@@ -23,14 +23,12 @@ from ...plan.paths import Path, below
 from ...plan.placeholders import Unfetched, Unreadable, marked
 from ...plan.reads import RawRead, read
 from ...plan.trees import MISSING, changed, get, walk
-from ...pubsub.division import Division, Heard
+from ...pubsub.division import Division, GapDetector, Heard
 from ...pubsub.feed import Arm, Fence, KeyFeed, Open, Read, Step
-from ...pubsub.finder import find_regularly, present_keys
-from ...pubsub.gaps import GapDetector
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event, Monitor
-from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
-from ...store.reader import opened
+from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, find_regularly, present_keys
+from ...store.document import opened
 from .history import LARGEST_TEXT, History
 from .timeline import PENDING
 from .trees import framed, is_kept, same, weight

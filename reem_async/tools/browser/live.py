@@ -14,8 +14,8 @@ from ...plan.paths import Path, show
 from ...plan.placeholders import Unfetched
 from ...plan.trees import MISSING, walk
 from ...store.catalog import outline
-from ...store.reader import DocumentReader
-from ...store.space import PublishSpace
+from ...store.document import DocumentReader
+from ...store.store import PublishSpace
 from .follower import Follower
 from .history import History
 from .partial_reads import keys_at, peek

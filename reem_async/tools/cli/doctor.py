@@ -18,8 +18,7 @@ from reem_async._installation import CURE, original_reem
 from reem_async.connection import RedisInterface
 from reem_async.errors import BadKey, NoJsonSupport, RedisError, ReemError
 from reem_async.legacy.finding import find
-from reem_async.local.host import reason_against
-from reem_async.local.segment import Segment
+from reem_async.local.segment import Segment, reason_against
 from reem_async.plan.attachments import orphans, remove_orphans
 from reem_async.plan.paths import check_top_key, parse_suffix
 from reem_async.plan.sizes import STAGED
@@ -45,7 +44,7 @@ _FIRST_NAMESPACE = 0xEFFFFFFC
 """The inode of a machine's own process numbers (PROC_PID_INIT_INO of <linux/proc_ns.h>): a container has another."""
 _LOOK = """
 import sys
-from reem_async.local.reader import LocalReader
+from reem_async.local.segment import LocalReader
 from reem_async.plan.notices import Slot
 view = LocalReader().view(Slot("", *map(int, sys.argv[1:])), 1)
 sys.exit(0 if view is not None and bytes(view) == b"R" else 3)

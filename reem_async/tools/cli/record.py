@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reem_async.concurrency.scheduling import come_second, keep_memory, stand_back
+from reem_async.concurrency.tasks import come_second, keep_memory, stand_back
 from reem_async.connection import RedisInterface
 from reem_async.coordination.calls import statistics
 from reem_async.coordination.services import CALLS

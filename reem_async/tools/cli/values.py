@@ -22,9 +22,8 @@ from reem_async.plan.paths import show
 from reem_async.plan.trees import walk
 from reem_async.store.accessor import Accessor
 from reem_async.store.catalog import Outline, outline
-from reem_async.store.reader import DocumentReader
-from reem_async.store.space import PublishSpace
-from reem_async.store.store import KeyValueStore
+from reem_async.store.document import DocumentReader
+from reem_async.store.store import KeyValueStore, PublishSpace
 from reem_async.tools.cli.listing import as_data
 from reem_async.tools.cli.options import DEFAULT_URL, Force, Namespace, PathArgument, Publish, Text, Url, Value
 from reem_async.tools.cli.output import (

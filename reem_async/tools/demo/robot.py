@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 
 from reem_async.connection import RedisInterface
-from reem_async.store.space import PublishSpace
-from reem_async.store.store import KeyValueStore
+from reem_async.store.store import KeyValueStore, PublishSpace
 from reem_async.tools.demo.scene import BALL_RADIUS, REACH, Array, Camera, angles_to, points_of
 
 ARM_HZ, CAMERA_HZ, CONTROL_HZ = 50, 12, 25

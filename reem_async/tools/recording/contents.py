@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from ...concurrency.scheduling import give_way
+from ...concurrency.tasks import give_way
 
 # 64 KiB: about 50 us of compression, so that other threads wait for the processor no longer.
 _SLICE = 1 << 16

@@ -16,8 +16,7 @@ from ...plan.copies import is_own, rest_of
 from ...plan.notices import ANNOUNCED
 from ...plan.paths import Path, below, has_index
 from ...plan.trees import MISSING, get
-from ...pubsub.division import Division, Heard, Phase
-from ...pubsub.gaps import GapDetector, Numbered
+from ...pubsub.division import Division, GapDetector, Heard, Numbered, Phase
 from .format import Role
 from .stored import carried
 from .times import AFTER

@@ -17,7 +17,7 @@ from ...pubsub.division import Phase, divided_read
 from ...pubsub.feed import KeyFeed, last_note
 from ...pubsub.manager import manager_of
 from ...session import Session
-from ...store.reader import opened
+from ...store.document import opened
 from .key_queue import KeyQueue
 from .stored import New, Unchanged
 

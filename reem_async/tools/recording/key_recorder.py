@@ -19,10 +19,9 @@ from ...errors import BadData, Conflict, NotAllowed, RedisError, WrongKind
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
-from ...pubsub.finder import present_keys
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
-from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer
+from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, present_keys
 from ...session import Session
 from .format import Kind, Role
 from .key_queue import Item, KeyQueue

@@ -18,7 +18,7 @@ from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING
 from ...ships.base import SpecialDatatypeShip
 from ...ships.registry import Ships, default_ships
-from ...transport.packing import CommandRecorder
+from ...transport.protocol import CommandRecorder
 from .align import Alignment, at_rate, stacked
 from .container import Container, Ref, Totals
 from .episodes import Episode, episodes_of

@@ -18,15 +18,15 @@ import numpy as np
 
 from ... import __version__
 from ...concurrency.queues import Last
-from ...concurrency.scheduling import give_way
 from ...concurrency.streams import arrived
+from ...concurrency.tasks import give_way
 from ...connection import RedisInterface
 from ...errors import BadValue, InterfaceClosed, RedisError
 from ...plan.arguments import check_instance, check_number
 from ...plan.paths import parse_patterns
-from ...pubsub.finder import find_regularly
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import Monitor
+from ...pubsub.refresh import find_regularly
 from ...session import Session
 from .format import RecordingFailed
 from .key_recorder import RecordedKeys

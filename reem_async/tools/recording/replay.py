@@ -13,7 +13,7 @@ from ...errors import BadKey, BadValue, MissingKey, PathRefused
 from ...plan.paths import Path, Pattern, check_top_key, has_index, parse, parse_pattern
 from ...plan.trees import MISSING
 from ...plan.writes import make_parents
-from ...store.space import PublishSpace
+from ...store.store import PublishSpace
 from .format import Kind
 from .log import Log, LogUpdate
 from .times import Instant, nanoseconds, seconds

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...concurrency.scheduling import give_way
+from ...concurrency.tasks import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, CannotApply, difference, get, replaced, same, walk
