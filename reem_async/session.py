@@ -92,14 +92,11 @@ class PublisherIdentity:
         return last is not None and time.monotonic() < last[3]
 
     def recent(self, seconds: float) -> list[str]:
-        """Return the channels of the keys published in the last seconds, the newest first."""
         since = time.monotonic() - seconds
         if self._pid != os.getpid():  # what is there was published by the parent
             return []
-        for _ in range(3):
-            with contextlib.suppress(RuntimeError):  # another thread publishes meanwhile
-                return [channel for channel, last in reversed(self._last.items()) if last[2] >= since]
-        return []
+        # A list first: another thread may publish meanwhile.
+        return [channel for channel, last in reversed([*self._last.items()]) if last[2] >= since]
 
 
 class Activities:
@@ -120,7 +117,6 @@ class Activities:
             self._serves.remove((os.getpid(), name))
 
     def told(self, seconds: float, most: int) -> dict[str, list[str]]:
-        """Return what the program serves and owns, and the top-level keys that it published in the last seconds."""
         channels = [channel for publisher in self.publishers for channel in publisher.recent(seconds)]
         names = {
             "publishes": [channel[1 : channel.index("}")].removeprefix(self._namespace) for channel in channels],

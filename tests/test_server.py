@@ -35,7 +35,6 @@ import reem.server
 import reem.snapshots
 from reem_async.errors import BadData, BadValue, Misuse, ServerFailed, ServerFull, ServerMissing
 from reem_async.server import EmbeddedServer
-from reem_async.server import embedded as server_module
 from reem_async.server import process as _server_process
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -280,12 +279,12 @@ class TestPort:
         with socket.create_server(("127.0.0.1", 0)) as other:
             taken = other.getsockname()[1]
             ports = [taken, taken]
-            look = server_module.bindable
-            monkeypatch.setattr(server_module, "bindable", lambda port: ports.pop() if ports else look(port))
+            look = _server_process.bindable
+            monkeypatch.setattr(_server_process, "bindable", lambda port: ports.pop() if ports else look(port))
             with EmbeddedServer() as server:
                 assert server.port != taken
                 assert ports == []
-            monkeypatch.setattr(server_module, "bindable", lambda port: port)
+            monkeypatch.setattr(_server_process, "bindable", lambda port: port)
             with pytest.raises(ServerFailed, match=f"port {taken} .* taken"):
                 EmbeddedServer(port=taken).start()
 

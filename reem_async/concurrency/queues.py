@@ -203,5 +203,4 @@ def noop() -> None:
 
 
 def total(missed: list[int | None]) -> int | None:
-    """Return how many updates were lost in all, None if that is not known of each loss."""
     return None if None in missed else sum(number for number in missed if number is not None)

@@ -119,7 +119,6 @@ class Stream(Following, Generic[Item]):
 
 
 def next_on_thread(queue: BoundedQueue, timeout: float | None) -> Any:
-    """Return the next update of a queue, for which this thread waits; see `Stream.next`."""
     limit = waiting_limit(timeout)
     try:
         item = queue.take_waiting() if limit is None else queue.take_within(limit)
@@ -139,7 +138,6 @@ def _timed_out(seconds: float | None) -> TimeoutError:
 
 
 def arrived(stream: Stream[Item]) -> Iterator[Item]:
-    """Take out what has arrived by now, without waiting."""
     with suppress(Ended):
         while (item := stream.queue.take()) is not EMPTY:
             yield item

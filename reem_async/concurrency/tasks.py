@@ -37,8 +37,6 @@ def is_being_cancelled() -> bool:
 
 
 class Tasks:
-    """The background tasks of one owner, which ends them when it is closed."""
-
     def __init__(self) -> None:
         self._running: set[asyncio.Task[Any]] = set()
 

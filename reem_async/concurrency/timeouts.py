@@ -85,12 +85,10 @@ def waiting_limit(seconds: float | None) -> float | None:
 
 
 def forget() -> None:
-    """Go back to the interfaces' own limits in this context."""
     _given.set(None)
 
 
 def check_timeout(seconds: float) -> float:
-    """Return `seconds` if it can be a time limit, else raise BadType or BadValue."""
     check_number("timeout", seconds, "use seconds above 0, up to a million", above=0, most=LONGEST)
     return float(seconds)
 

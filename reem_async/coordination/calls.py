@@ -11,7 +11,7 @@ import inspect
 import os
 import random
 import secrets
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from ..errors import (
     ServiceError,
     ServiceLost,
 )
-from ..plan import Command, Plan, Reply, blamed
+from ..plan import Command, Plan, Reply, raise_refused
 from ..plan.keys import Keys
 from ..plan.notices import assembled
 from ..plan.paths import Path, escaped, show
@@ -110,35 +110,35 @@ async def statistics(session: Session, record: float = 0.0) -> list[dict[str, An
 async def _channels(node: Any, pattern: str, *, sharded: bool) -> list[str]:
     """Ask a server which channels have a subscriber; one round trip."""
     command: Command = ("PUBSUB", "SHARDCHANNELS" if sharded else "CHANNELS", pattern)
-    (reply,) = await node.roundtrip([command])
-    if isinstance(reply, Exception):
-        raise explained(blamed(reply, command))
-    return [name.decode(errors="replace") for name in reply if type(name) is bytes]
+    replies = await node.roundtrip([command])
+    with naming_rights():
+        raise_refused(replies, [command])
+    return [name.decode(errors="replace") for name in replies[0] if type(name) is bytes]
 
 
 async def publish(session: Session, keys: Keys, channel: str, payload: bytes, store: Iterable[Command] = ()) -> int:
     """Publish a message, and store its value in the same transaction; return how many have received it."""
     commands: list[Command] = [*store, (keys.publish, channel, payload)]
-    plan = Plan(commands, partial(_receivers, commands), atomic=len(commands) > 1)
-    count: int = await session.run(plan)
+
+    def receivers(replies: list[Reply]) -> Reply:
+        raise_refused(replies, commands)
+        return replies[-1]
+
+    with naming_rights():
+        count: int = await session.run(Plan(commands, receivers, atomic=len(commands) > 1))
     return count
 
 
-def _receivers(commands: list[Command], replies: list[Reply]) -> Reply:
-    for reply, command in zip(replies, commands, strict=True):
-        if isinstance(reply, Exception):
-            raise explained(blamed(reply, command[:2]))
-    return replies[-1]
-
-
-def explained(error: Exception) -> Exception:
-    """Return an error about a right with what services need."""
-    if not isinstance(error, NotAllowed):
-        return error
-    return NotAllowed(
-        f"{error}; services need +publish, +subscribe, +pubsub|channels (in a cluster +spublish, +ssubscribe, "
-        "+pubsub|shardchannels) and the channels &{robot1:*:serve@* and &{robot1:*:answers@*"
-    )
+@contextlib.contextmanager
+def naming_rights() -> Iterator[None]:
+    """Say in an error about a right what services need."""
+    try:
+        yield
+    except NotAllowed as error:
+        raise NotAllowed(
+            f"{error}; services need +publish, +subscribe, +pubsub|channels (in a cluster +spublish, +ssubscribe, "
+            "+pubsub|shardchannels) and the channels &{robot1:*:serve@* and &{robot1:*:answers@*"
+        ) from None
 
 
 async def encoded(session: Session, names: Names, prefix: str, value: Any) -> Encoded:
@@ -195,7 +195,6 @@ class Post(LoopMailbox):
 
     @property
     def address(self) -> str:
-        """Where others can send to; empty if that cannot be."""
         mailbox = self._opened()
         return mailbox.address if mailbox is not None else ""
 
@@ -225,8 +224,6 @@ class Post(LoopMailbox):
 
 
 class Instance:
-    """One server of a service, as its callers in this event loop see it."""
-
     def __init__(self, channel: str) -> None:
         self.id = channel[-ID:]
         self.channel = channel
@@ -245,8 +242,6 @@ class Instance:
 
 
 class Directory:
-    """The servers of one service, as far as they are known here."""
-
     def __init__(self, names: Names) -> None:
         self.names = names
         self.instances: dict[str, Instance] = {}
@@ -278,8 +273,6 @@ class State(Enum):
 
 
 class PendingCall:
-    """A call that waits for its answer."""
-
     def __init__(self, where: str, directory: Directory, deadline: float) -> None:
         self.id = new_id()
         self.where = where
@@ -403,10 +396,8 @@ class Caller(Listener):
         if not self._follows:
             async with self._following:
                 if not self._follows:
-                    try:
+                    with naming_rights():
                         await self._manager.follow_here(self)
-                    except NotAllowed as error:
-                        raise explained(error) from None
 
     async def _result(self, call: PendingCall, value: Encoded, prefix: str) -> Message:
         """Return the answer of a server that has taken the request: a value, or what its function raised."""

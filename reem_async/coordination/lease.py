@@ -29,7 +29,7 @@ from ..plan.leases import Claim, HeldLease, acquisition, check_name, check_ttl, 
 from ..plan.replies import checked
 from ..session import PublisherIdentity, Session
 from ..store.publish import DocumentPublisher, PublishTurn
-from ..transport import Contention, Held
+from ..transport import Contention, Held, give_back
 from ..transport.route import keys_in
 from ..transport.state import States
 
@@ -134,12 +134,10 @@ class Lease:
                 await self.connection.leave(LeaseLost("released"))
 
     def run(self, plan: Plan) -> Coroutine[Any, Any, Any]:
-        """Run a plan and those that follow from it over the owner's connection."""
         return self._session.run(plan, self.connection)  # type: ignore[arg-type]  # as much of a transport as plans need
 
 
 def _program() -> str:
-    """Return the name of this program, for an owner that has none."""
     name = os.path.basename(sys.argv[0] if sys.argv else "")[:64]
     return name if name and name.isprintable() else "python"
 
@@ -216,14 +214,8 @@ class LeaseConnection:
         return self._guard
 
     async def leave(self, error: BaseException | None = None) -> None:
-        """Give the connection back; after an error it is closed."""
         leaving, self._exit, self._held, self._guard = self._exit, None, None, None
-        if leaving is not None:
-            try:
-                await leaving.__aexit__(type(error) if error else None, error, None)
-            except BaseException as again:
-                if again is not error:
-                    raise
+        await give_back(leaving, error)
 
 
 class LeaseGuard:
@@ -301,8 +293,6 @@ class LeaseGuard:
 
 
 class OwnedPublisher(DocumentPublisher):
-    """Publishes to a top-level key as its owner: each change renews the lease, and is not made without it."""
-
     def __init__(self, lease: Lease, session: Session) -> None:
         super().__init__(session, lease.keys.name)
         self.lease = lease

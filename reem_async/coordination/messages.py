@@ -16,10 +16,10 @@ import orjson
 
 from ..concurrency.timeouts import LONGEST
 from ..errors import BadData, BadKey, BadValue
-from ..plan import Command, Plan, Reply, blamed
+from ..plan import Command, Plan, Reply, raise_refused
 from ..plan.changes import EncodedAttachment
 from ..plan.keys import Keys
-from ..plan.notices import Slot, View, named, sizes_of_parts, starts
+from ..plan.notices import Slot, View, named, named_parts, sizes_of_parts, starts
 from ..plan.paths import Path, escaped, parse_suffix, suffix
 from ..ships.registry import Ships
 
@@ -52,8 +52,6 @@ Put = Callable[[Sequence[Any], Sequence[int]], Slot | None]  # copies pieces of 
 
 
 class Content(NamedTuple):
-    """The value of a message: the text of a document, then its attachments."""
-
     is_stored: bool  # under keys that expire
     sizes: list[int]  # bytes of each part
     names: list[tuple[str, str]]  # of each attachment the ship's label, and the end of its key
@@ -66,8 +64,6 @@ class Content(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One message."""
-
     kind: str
     call: str  # the id of the call or of the ping
     sender: str  # the id of the caller or of the server
@@ -80,8 +76,6 @@ class Message(NamedTuple):
 
 
 class Packed(NamedTuple):
-    """A message with a value, ready to be sent."""
-
     payload: bytes
     commands: list[Command]  # what stores the value; none if the message or shared memory has it
     is_shared: bool = False  # shared memory has it
@@ -129,7 +123,6 @@ def _database(keys: Keys) -> str:
 
 
 def answers(keys: Keys, caller: str) -> str:
-    """Return the channel of the answers to one caller of the services under a top-level key."""
     return f"{keys.tag}:answers@{caller}"
 
 
@@ -182,7 +175,6 @@ def check_parts(where: str, value: Encoded) -> None:
 
 
 def keys_of(prefix: str, value: Encoded) -> list[str]:
-    """Return the keys that hold a stored value."""
     return [_text_key(prefix), *(prefix + each.suffix for each in value[1])]
 
 
@@ -191,12 +183,10 @@ def _text_key(prefix: str) -> str:
 
 
 def bare(message: Message) -> bytes:
-    """Return a message without a value."""
     return _header(message, "", [0], ())
 
 
 def failure(message: Message, error: BaseException, trace: str) -> bytes:
-    """Return the message that a function raised."""
     words = [(type(error).__qualname__, 200), (text_of(error), 4096), (trace, LONGEST_TEXT)]
     return bare(message._replace(kind=FAILED, words=[_shortened(*each) for each in words]))
 
@@ -217,7 +207,7 @@ def _shortened(text: str, longest: int) -> str:
 def _header(
     message: Message, place: str | list[Any], sizes: list[int], attachments: Sequence[EncodedAttachment]
 ) -> bytes:
-    parts = [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
+    parts = named_parts(attachments, sizes)
     kind, call, sender, number, words, _ = message
     return orjson.dumps([VERSION, kind, call, sender, number, [*words], place, sizes[0], parts]) + b"\n"
 
@@ -308,9 +298,7 @@ def fetch(content: Content, prefix: str, ships: Ships, where: str) -> Plan:
     commands.append(("UNLINK", *keys))
 
     def decode(replies: Sequence[Reply]) -> list[Any]:
-        for reply, command in zip(replies, commands, strict=True):
-            if isinstance(reply, Exception):
-                raise blamed(reply, command)
+        raise_refused(replies, commands)
         parts: list[Any] = [*content.pieces, *replies[:-1]]
         if parts[0] is None or len(parts[0]) != content.sizes[0]:
             raise BadData(f"{where}: the value is not on the server any more; it was kept until after the deadline")

@@ -25,7 +25,6 @@ from ..errors import (
     BadValue,
     MissingKey,
     NotAllowed,
-    PathRefused,
     RedisError,
     ReemError,
     Stale,
@@ -57,15 +56,12 @@ _MOST_REPORTED = 20  # different warnings about one parameter
 
 
 class Declaration(NamedTuple):
-    """What a program declares."""
-
     path: Path
     specification: Specification
     is_array: bool  # values are given to the program as arrays
     on_change: Callable[[Any], Any] | None
 
     def given(self, value: Any) -> Any:
-        """Return a value as the program gets it."""
         if not isinstance(value, tuple):
             return value
         if not self.is_array:
@@ -101,7 +97,6 @@ class ChangeQueue(BoundedQueue):
         """Ignore the updates of the top-level key: its follower closes this queue, the parameter fills it."""
 
     def put_value(self, path: str, value: Any) -> None:
-        """Put in a value, in place of an older one."""
         super().put(Update(path, value, value))
 
     def _skip(self) -> None:
@@ -109,8 +104,6 @@ class ChangeQueue(BoundedQueue):
 
 
 class LiveParameter:
-    """The value of one parameter, which a group keeps current."""
-
     def __init__(self, group: ParameterGroup, path: Path, specification: Specification) -> None:
         self.group = group
         self.path = path
@@ -126,7 +119,6 @@ class LiveParameter:
         self._reported: set[str] = set()
 
     def take(self, raw: Any) -> None:
-        """Take the stored value from the copy, MISSING if there is none."""
         if raw is self._raw:  # the copy shares what has not changed
             return
         self._raw = raw
@@ -154,7 +146,6 @@ class LiveParameter:
                 queue.put_value(self.name, given(value))
 
     def report(self, text: str) -> None:
-        """Log a warning once."""
         if text not in self._reported and len(self._reported) < _MOST_REPORTED:
             self._reported.add(text)
             logger.warning("%s", text)
@@ -247,7 +238,6 @@ class ParameterGroup:
         return link.follows and not link.interface_closed and getattr(link.follower, "failure", None) is None
 
     def check(self, name: str) -> None:
-        """Raise Stale unless the values are kept current."""
         if self.is_followed:
             return
         if self._link.interface_closed:
@@ -295,7 +285,6 @@ class ParameterGroup:
         await DocumentWriter(session, SPECIFICATIONS).set(place, live.specification.stored())
 
     def restore(self, live: LiveParameter) -> None:
-        """Store the default of a parameter again that is gone."""
         default = shorten(as_json(live.specification.default))
         logger.warning(
             "%s is gone from the server (deleted, or lost in a restart): its default %s is used and stored again",
@@ -324,9 +313,9 @@ class ParameterGroup:
 
 async def declare(session: Session, declaration: Declaration) -> LiveParameter:
     """Return the parameter of a declaration; see `Accessor.parameter`."""
-    groups: dict[str, ParameterGroup] = manager_of(session).parameters
-    keys = session.keys(declaration.path[0])
-    group = groups.get(keys.name) or groups.setdefault(keys.name, ParameterGroup(session, keys))
+    kept, keys = manager_of(session).kept, session.keys(declaration.path[0])
+    place = ParameterGroup, keys.name
+    group: ParameterGroup = kept.get(place) or kept.setdefault(place, ParameterGroup(session, keys))
     return await group.declare(declaration)
 
 
@@ -424,7 +413,6 @@ class Parameter(Handle):
 
 
 async def declared(session: Session, declaration: Declaration) -> Parameter:
-    """Return the parameter of a declaration for asyncio."""
     live = await declare(session, declaration)
     if declaration.on_change is not None:
         caller, queue = changes_of(live, declaration)
@@ -490,9 +478,4 @@ async def _with_value(session: Session, path: Path, specification: Specification
 
 async def publish(session: Session, path: Path, value: Any) -> None:
     """Publish a value that was checked; makes the dicts that hold it if they are gone."""
-    writer, inner = publisher(session, path[0], "raise"), path[1:]
-    try:
-        await writer.set(inner, as_json(value))
-    except PathRefused:
-        await session.run(make_parents(session.keys(path[0]), inner))
-        await writer.set(inner, as_json(value))
+    await publisher(session, path[0], "raise").set_with_parents(path[1:], as_json(value))

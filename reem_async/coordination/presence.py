@@ -25,7 +25,7 @@ from ..concurrency.queues import Last
 from ..concurrency.streams import Stream
 from ..concurrency.timeouts import time_limit, timeout
 from ..errors import BadType, BadValue, InterfaceClosed, RedisError, ReemError, Refused
-from ..plan import Command, Plan, Reply, blamed
+from ..plan import Command, Plan, Reply, raise_refused
 from ..plan.keys import PRESENCE, Keys
 from ..plan.paths import shorten
 from ..session import Session
@@ -90,7 +90,6 @@ class NodeEvent:
 
 
 def check_node_name(name: object) -> str:
-    """Return `name` if a program can have it; raises BadType or BadValue."""
     if not isinstance(name, str):
         raise BadType(f"name={shorten(name)} is not a str; use a name such as 'planner', or leave it out")
     if not _NAME.fullmatch(name) or not name.isprintable():
@@ -106,12 +105,6 @@ def _key(keys: Keys, node_id: str) -> str:
     return f"{keys.tag}{PRESENCE}:{node_id}"
 
 
-def _raise_refused(replies: Sequence[Reply], commands: Sequence[Command]) -> None:
-    for reply, command in zip(replies, commands, strict=True):
-        if isinstance(reply, Exception):
-            raise blamed(reply, command)
-
-
 def _renewal(keys: Keys, node_id: str, said: dict[str, Any]) -> Plan:
     """Plan to announce a node for the next moment; one round trip."""
     text = json.dumps(said, separators=(",", ":"))
@@ -120,7 +113,7 @@ def _renewal(keys: Keys, node_id: str, said: dict[str, Any]) -> Plan:
         ("SADD", _index(keys), node_id),
         ("PEXPIRE", _index(keys), round(_LISTED * 1000)),
     ]
-    return Plan(commands, lambda replies: _raise_refused(replies, commands))
+    return Plan(commands, lambda replies: raise_refused(replies, commands))
 
 
 def _listing(keys: Keys) -> Plan:
@@ -128,14 +121,14 @@ def _listing(keys: Keys) -> Plan:
     list_ids: Command = ("SMEMBERS", _index(keys))
 
     def decode_ids(replies: Sequence[Reply]) -> Any:
-        _raise_refused(replies, [list_ids])
+        raise_refused(replies, [list_ids])
         texts = [reply.decode("ascii", "replace") for reply in replies[0]][:_MOST_NODES]
         ids = [text for text in texts if _ID.fullmatch(text)]
         gets: list[Command] = [("GET", _key(keys, node_id)) for node_id in ids]
         return Plan(gets, lambda replies: decode_nodes(ids, gets, replies)) if ids else {}
 
     def decode_nodes(ids: Sequence[str], gets: Sequence[Command], replies: Sequence[Reply]) -> Any:
-        _raise_refused(replies, gets)
+        raise_refused(replies, gets)
         found = {
             node_id: node
             for node_id, raw in zip(ids, replies, strict=True)
@@ -148,7 +141,6 @@ def _listing(keys: Keys) -> Plan:
 
 
 def _decoded(node_id: str, raw: Any) -> NodeInfo | None:
-    """Return what is stored of a node; None if it has left, or if this is not what REEM stores."""
     try:
         said = json.loads(raw)
         names = [tuple(_text(each) for each in said[kind][:_MOST_NAMES]) for kind in ("publishes", "serves", "owns")]
@@ -171,7 +163,6 @@ def _group(session: Session) -> Keys:
 
 
 async def listed(session: Session) -> dict[str, NodeInfo]:
-    """Return the nodes that are connected, by id."""
     nodes: dict[str, NodeInfo] = await session.run(_listing(_group(session)))
     return nodes
 
@@ -335,5 +326,4 @@ async def _poll(reference: weakref.ref[NodeWatch], session: Session) -> None:
 
 
 def in_order(nodes: Iterable[NodeInfo]) -> list[NodeInfo]:
-    """Return nodes in the order of their names."""
     return sorted(nodes, key=lambda node: (node.name, node.host, node.pid, node.id))

@@ -30,7 +30,6 @@ from ..errors import (
     BadType,
     InterfaceClosed,
     NotAllowed,
-    PathRefused,
     RedisError,
     ReemError,
     Refused,
@@ -41,13 +40,12 @@ from ..plan import Command, Reply
 from ..plan.arguments import whole
 from ..plan.keys import Keys
 from ..plan.paths import Path, shorten, show
-from ..plan.writes import make_parents
 from ..pubsub.listeners import Listener, Topic
 from ..pubsub.manager import manager_of
 from ..session import Session
 from ..store.publish import publisher
 from . import messages
-from .calls import Post, encoded, explained, new_id, opened, publish
+from .calls import Post, encoded, naming_rights, new_id, opened, publish
 from .messages import Encoded, Message, Names, Put
 
 logger = logging.getLogger("reem.services")
@@ -73,7 +71,6 @@ class Workers:
         self._busy = 0
 
     async def run(self, function: Callable[..., Any], arguments: dict[str, Any]) -> Any:
-        """Call a function on a thread and return what it returns."""
         loop = asyncio.get_running_loop()
         done: asyncio.Future[tuple[Any, BaseException | None]] = loop.create_future()
         if self._busy == self._threads:
@@ -113,8 +110,6 @@ def _hand_over(done: asyncio.Future[Any], outcome: Any) -> None:
 
 
 class Request:
-    """One request, until it is answered or left."""
-
     def __init__(self, message: Message, leave: Callable[[Request], None], is_stale: bool) -> None:
         loop = asyncio.get_running_loop()
         self.message = message
@@ -165,10 +160,8 @@ class Served(Listener):
 
     async def follow(self) -> None:
         """Begin to serve: when this returns, callers find this server."""
-        try:
+        with naming_rights():
             await self._manager.follow_here(self)
-        except NotAllowed as error:
-            raise explained(error) from None
         self._manager.kept[self.id] = self
         self._session.activities.add_service(self.where)
 
@@ -208,7 +201,6 @@ class Served(Listener):
         self._proved = sent
 
     def on_message(self, payload: bytes) -> None:
-        """Take a message of a caller."""
         message = messages.decode(payload, self._session.local.view)
         match message.kind:
             case messages.CALL:
@@ -343,13 +335,8 @@ class Served(Listener):
 
     async def _publish(self, call: dict[str, Any]) -> None:
         """Publish a call for recorders, before the function may use its arrays again."""
-        writer, place = publisher(self._session, CALLS, "raise"), (self.where,)
         try:
-            try:
-                await writer.set(place, call)
-            except PathRefused:  # the first one
-                await self._session.run(make_parents(self._session.keys(CALLS), place))
-                await writer.set(place, call)
+            await publisher(self._session, CALLS, "raise").set_with_parents((self.where,), call)
         except (ReemError, RedisError) as error:
             logger.warning("a call of %s is not in the recording: %s", self.where, error)
 
@@ -428,7 +415,6 @@ def _below_ours(trace: TracebackType | None) -> TracebackType | None:
 
 
 def is_async(function: Any) -> bool:
-    """Return whether calling it makes a coroutine."""
     return inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(getattr(function, "__call__", None))  # noqa: B004
 
 

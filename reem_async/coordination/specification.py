@@ -58,7 +58,6 @@ class Specification:
         return value
 
     def _bounded(self, value: Any) -> Iterable[tuple[Any, Any, Any]]:
-        """Return each number of a value, with its bounds."""
         if self.type in ("bool", "str"):
             return []
         numbers = value if isinstance(value, tuple) else (value,)
@@ -172,7 +171,6 @@ def _items(vector: Any) -> Sequence[Any]:
 
 
 def _converted(where: str, value: Any, kind: str) -> Any:
-    """Return a value of a type; raises BadType, BadValue."""
     name, _, length = kind.partition("[")
     if not length:
         return _scalar(where, value, kind)
@@ -229,7 +227,6 @@ def _choices(where: str, choices: Iterable[Any], kind: str) -> tuple[Any, ...]:
 
 
 def _floats(value: Any) -> Any:
-    """Return whole numbers as floats."""
     if isinstance(value, list):
         return [_floats(each) for each in value]
     return float(value) if type(value) is int else value

@@ -60,7 +60,6 @@ class LocalPath:
         return host()
 
     def channel(self, keys: Keys) -> str:
-        """Return the channel that subscribers near by listen to beside that of a key's notices."""
         return f"{keys.channel}@{self.host}"
 
     def view(self, slot: Slot, size: int) -> memoryview | None:
@@ -91,7 +90,6 @@ class LocalPath:
         return was
 
     def audience(self, keys: Keys) -> int:
-        """Return how many connections of this host listened to a key when last asked."""
         return self._audiences.get(keys.channel, (0, 0.0))[0]
 
     def put(self, keys: Keys, pieces: Sequence[Any], sizes: Sequence[int]) -> Slot | None:

@@ -65,12 +65,10 @@ _TAKEN = (errno.EAGAIN, errno.EACCES)
 
 
 def lock_for_reading(descriptor: int, number: int) -> bool:
-    """Return whether the slot is not being written, and is locked now."""
     return _set(descriptor, fcntl.F_RDLCK, number)
 
 
 def lock_for_writing(descriptor: int, number: int) -> bool:
-    """Return whether the slot is not being read, and is locked now."""
     return _set(descriptor, fcntl.F_WRLCK, number)
 
 
@@ -182,22 +180,16 @@ _BLOCK = 512  # bytes of what `st_blocks` counts, whatever the file system's blo
 
 
 class _Root(np.ndarray[Any, Any]):
-    """What all arrays that look into a slot refer to."""
-
     lock: mmap.mmap  # has the description open by which the slot is locked
 
 
 class _Pin(NamedTuple):
-    """A slot that is being looked into."""
-
     root: weakref.ref[_Root]
     number: int
     stamp: int  # what it held then
 
 
 class _Mapping:
-    """A publisher's segment, mapped to be read."""
-
     def __init__(self, slot: Slot) -> None:
         self.pins: list[_Pin] = []
         self.used = 0.0

@@ -64,7 +64,6 @@ def _step(found: re.Match[str]) -> Step:
 
 
 def places(holder: list[Any], steps: Steps) -> list[Place]:
-    """Return the places that `steps` lead to from the only item of `holder`."""
     found = [Place(holder, 0)]
     for step in steps:
         found = [inner for place in found for inner in _inside(place.value, step)]
@@ -161,7 +160,6 @@ class TextDocument:
         return [measure(place.value) if type(place.value) is kind else None for place in self._at(path)]
 
     def get(self, path: str, bare: bool) -> bytes | None:
-        """Return the JSON text of the values at a path, in a list; of the root alone if `bare`."""
         if not self.exists:
             return None
         # The usual read, of the whole document, copies the text without parsing.

@@ -73,7 +73,6 @@ class Watched:
 
 
 def concerns(commands: Sequence[Command]) -> bool:
-    """Return whether any command needs a translation."""
     return any(is_json(command) or is_look(command) for command in commands)
 
 
@@ -95,7 +94,6 @@ def key_of(command: Command) -> bytes:
 
 
 def is_whole(command: Command) -> bool:
-    """Return whether it sets or deletes a whole document."""
     return replaces(command) or (command[0] == "JSON.DEL" and (len(command) < 3 or command[2] in ("$", ".")))
 
 
@@ -109,12 +107,10 @@ def asks(commands: Sequence[Command]) -> bool:
 
 
 def body_of(commands: Sequence[Command]) -> slice:
-    """Return the positions of a transaction's commands."""
     return slice(2 if asks(commands) else 1, -1)
 
 
 def framed(commands: Sequence[Command], found: list[Reply]) -> list[Reply]:
-    """Return the replies as a server with the module would: those of a transaction are in the reply to EXEC."""
     if commands[-1][0] != "EXEC":
         return found
     body = body_of(commands)
@@ -122,7 +118,6 @@ def framed(commands: Sequence[Command], found: list[Reply]) -> list[Reply]:
 
 
 def string_type(begins: Reply) -> bytes:
-    """Return the reply of TYPE for a string that begins so."""
     return DOCUMENT.encode() if isinstance(begins, bytes) and is_document(begins) else b"string"
 
 
@@ -171,7 +166,6 @@ def finished(commands: Sequence[Command], replies: list[Reply], known: Known, er
 
 
 def looked_at(commands: Sequence[Command], known: Known) -> list[bytes]:
-    """Return the keys of documents to look at before; none if the batch goes directly."""
     for command in commands:
         if command[0] in WRITES and not (replaces(command) and key_of(command) in known):
             return list({key_of(each): None for each in commands if is_json(each)})
@@ -236,8 +230,6 @@ def _whole(command: Command) -> Command:
 
 
 class _Answers:
-    """Converts the replies to those of the module."""
-
     def __init__(self, sent: Sequence[Command], replies: Sequence[Reply], known: Known, error: MakeError) -> None:
         self._sent, self._known, self._error = sent, known, error
         self._documents: dict[int, TextDocument | Exception] = {}
@@ -247,7 +239,6 @@ class _Answers:
             self._replies[body_of(sent)] = replies[-1]
 
     def of(self, command: Command, place: int) -> Reply:
-        """Return the module's reply to a command, whose reply is at `place`."""
         reply = self._replies[place]
         if command[0] in READS and len(command) > 1:
             document = self._document(place)
@@ -336,8 +327,6 @@ def _not_looked(commands: Sequence[Command], failed: Exception) -> list[Reply]:
 
 
 class _Look:
-    """The commands that watch and read documents before a change, and their replies."""
-
     def __init__(
         self, commands: Sequence[Command], keys: Sequence[bytes], watched: Watched, known: Known, error: MakeError
     ) -> None:
@@ -410,7 +399,6 @@ class _Change:
         return self._sent
 
     def only_deletes(self) -> bool:
-        """Return whether it is no transaction and only deletes documents."""
         return (
             self.end > 0
             and not self.is_whole
@@ -448,7 +436,6 @@ class _Change:
         return framed(self._commands, answers)
 
     def _refused(self, replies: list[Reply], outcome: Reply) -> list[Reply]:
-        """Return the replies if the server refused the transaction."""
         answers: list[Reply] = [b"QUEUED"] * len(self._commands)
         for place, at in self._places.items():
             answers[place] = replies[at]

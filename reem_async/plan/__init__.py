@@ -80,6 +80,13 @@ def _apart(reason: Exception, pairs: Sequence[tuple[Reply, Command]]) -> Excepti
     return PartialWrite(f"{reason}; MULTI was refused, so these commands were executed separately: {shown:.300}")
 
 
+def raise_refused(replies: Sequence[Reply], commands: Sequence[Command]) -> None:
+    """Raise the first error among replies, with the command that it is about."""
+    for reply, command in zip(replies, commands, strict=True):
+        if isinstance(reply, Exception):
+            raise blamed(reply, command)
+
+
 def blamed(error: Exception, command: Command) -> Exception:
     """Return `error` with the command in its message, if the server refused it without naming a key."""
     if not isinstance(error, Refused | ClusterReply):

@@ -29,13 +29,11 @@ def watch(keys: Keys, coming: Sequence[Staged] = ()) -> Command:
 
 
 def permitted(reply: Reply, *names: str) -> None:
-    """Raise the error if the server refused the WATCH of `names`."""
     if isinstance(reply, Exception):
         raise blamed(reply, ("WATCH", " ".join(names)))
 
 
 def survey(keys: Keys, path: Path) -> tuple[Command, ...]:
-    """Return the commands whose replies `unreferred` reads."""
     return get_command(keys, ()), get_command(keys, path), ("SMEMBERS", keys.registry)
 
 
@@ -159,7 +157,6 @@ class ChangeOutcome:
         return self._settle(members, judged)
 
     def _members(self) -> frozenset[bytes]:
-        """Return what the registry held right after the change; nothing if the user may not read it."""
         # In the order in which `writes._change` sends: the command, SADD if there are attachments, then SMEMBERS.
         reply = self.replies[self.main + (2 if self.it.attachments else 1)]
         if isinstance(reply, Exception):

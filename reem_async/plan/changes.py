@@ -14,8 +14,6 @@ REFUSED = object()  # result of `DocumentChange.judge`: the server did nothing a
 
 
 class EncodedAttachment(NamedTuple):
-    """An attachment ready to be stored: the commands its ship recorded."""
-
     suffix: str  # the key's name after the tag
     label: str
     commands: tuple[Command, ...]  # what stores it

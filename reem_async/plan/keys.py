@@ -26,7 +26,6 @@ class Keys(NamedTuple):
 
     @property
     def lease(self) -> str:
-        """The lease of the owner, as long as there is one."""
         return f"{self.tag}:lease"
 
     @property

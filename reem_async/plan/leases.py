@@ -157,7 +157,6 @@ def owned(keys: Keys, claim: Claim, now: float) -> Owned:
 
 
 def _seconds(reply: Reply) -> float:
-    """Return the server's time; 0 if it is not known."""
     try:
         return int(reply[0]) + int(reply[1]) / 1e6
     except (TypeError, ValueError, IndexError):

@@ -126,9 +126,8 @@ def in_slot(
     It has no slot if it would be too long, because of thousands of arrays.
     """
     sizes = sizes_of_parts(text, attachments)
-    parts: list[Any] = [[*slot, sizes[0]]]
-    parts += [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
     size = sum(sizes)
+    parts = [[*slot, sizes[0]], *named_parts(attachments, sizes)]
     notice = _header(publisher, sequence, time, path, "look", parts, size, extras)
     if len(notice) <= LARGEST_INLINE:
         return notice
@@ -138,6 +137,11 @@ def in_slot(
 def sizes_of_parts(text: bytes, attachments: Sequence[EncodedAttachment]) -> list[int]:
     """Return the bytes of each part in a slot: the text of the document, then each attachment."""
     return [len(text), *(sum([len(piece) for piece in each.blob or ()]) for each in attachments)]
+
+
+def named_parts(attachments: Sequence[EncodedAttachment], sizes: Sequence[int]) -> list[list[Any]]:
+    """Return what the line of a message says of each attachment, given the sizes of all parts."""
+    return [[each.label, each.suffix, size] for each, size in zip(attachments, sizes[1:], strict=True)]
 
 
 def with_value(
@@ -152,17 +156,11 @@ def with_value(
     largest: int = LARGEST_INLINE,
 ) -> bytes:
     """Return a notice that carries the value if it has at most so many bytes and is made of bytes."""
-    size, travels = len(text), True
-    for each in attachments:
-        size += sum([len(piece) for piece in each.blob or ()])
-        travels = travels and each.blob is not None
-    if size > largest or not travels:
-        return announce(publisher, sequence, time, path, size=size, extras=extras)
-    parts: list[Any] = []
-    blobs: list[bytes] = []
-    for each in attachments:
-        blobs.append(b"".join(each.blob or ()))
-        parts.append([each.label, each.suffix, len(blobs[-1])])
+    sizes = sizes_of_parts(text, attachments)
+    if sum(sizes) > largest or any(each.blob is None for each in attachments):
+        return announce(publisher, sequence, time, path, size=sum(sizes), extras=extras)
+    parts = named_parts(attachments, sizes) if attachments else []
+    blobs = [piece for each in attachments for piece in each.blob or ()]
     return b"".join([_header(publisher, sequence, time, path, "set", parts, len(text), extras), text, *blobs])
 
 
@@ -328,8 +326,6 @@ _ALIGNED = 64
 
 
 class Slot(NamedTuple):
-    """A slot in the shared memory of a publisher, as a notice names it."""
-
     host: str  # identifies the processes that can reach it: one user on one boot of a host or container
     process: int  # the publisher's process id
     descriptor: int  # its file descriptor of the memory

@@ -86,7 +86,6 @@ def check_namespace(namespace: object) -> str:
 
 
 def is_namespace(text: str) -> bool:
-    """Return whether `text` is empty or ends with a separator: neither letter nor digit."""
     return not text[-1:].isalnum()
 
 
@@ -255,8 +254,6 @@ _LONGEST_TAIL = len("{}:notices@") + 10  # bytes of a channel without the key
 
 
 class Pattern(NamedTuple):
-    """A glob over paths, such as `arm`, `cam_*` or `robot.*.battery`."""
-
     top: str  # the glob of the top-level key, with `*` and `?`
     rest: Path = ()  # globs of the elements below it; empty for all
 

@@ -30,8 +30,6 @@ INLINE_LABELS = frozenset({"text", "float"})
 
 
 class Placeholder(NamedTuple):
-    """The placeholder of an attachment, a value that a ship holds under a key of its own."""
-
     label: str  # the ship's label
     suffix: str  # the key's name after the tag
     size: int = 0  # bytes of the value, 0 where the ship does not say
@@ -69,8 +67,6 @@ _SAFE = "".join(chr(code) for code in range(33, 127) if chr(code) != "%")
 
 
 class PlaceholderSlot(NamedTuple):
-    """A placeholder found in a decoded tree, and where: `container[key]` is to be replaced."""
-
     placeholder: Placeholder
     container: Any
     key: Any
@@ -169,7 +165,6 @@ def find(holder: list[Any], name: str, unreadable: list[Unreadable] | None = Non
 
 
 def place_of(name: str, suffix: str) -> str:
-    """Return the path of an attachment as text: its key ends in the path, and maybe a unique tail."""
     return f"{name}{suffix.partition('~')[0]}"
 
 

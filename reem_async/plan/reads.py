@@ -36,8 +36,6 @@ _NOTHING: HeldValues = {}
 
 
 class RawRead(NamedTuple):
-    """The result of a read, before ships interpret their replies."""
-
     holder: list[Any]  # a list of one: the tree, with placeholders where `slots` says
     name: str  # the top-level key
     # Of each attachment, its place in the tree, the ship, and the reply to interpret.
@@ -201,9 +199,8 @@ class _Fetch:
         )
 
     def _unobtainable(self, it: Placeholder) -> Exception | None:
-        if not self.tolerant or it.size > self.largest:  # then no ship is needed
-            return self.refused.get((it.label, it.suffix))
-        if not self.ships.has(it.label):
+        # Of a larger one no ship is needed.
+        if self.tolerant and it.size <= self.largest and not self.ships.has(it.label):
             return self.ships.lacks(it.label, "it")
         return self.refused.get((it.label, it.suffix))
 
@@ -288,8 +285,6 @@ class _Fetch:
 
 
 def exists(keys: Keys) -> Plan:
-    """Plan to find out whether there is a document, not a foreign key, in one round trip."""
-
     def decode(replies: Sequence[Reply]) -> bool:
         try:
             return type_name(checked(replies[0], keys, ())) is not None
@@ -322,8 +317,6 @@ def type_of(keys: Keys, path: Path, ships: Ships) -> Plan:
 
 
 def keys_at(keys: Keys, path: Path) -> Plan:
-    """Plan to list the keys of the dict at `path` in one round trip; raises MissingKey or WrongType in decode."""
-
     def decode(replies: Sequence[Reply]) -> list[str]:
         reply = checked(replies[0], keys, path)
         if not reply:

@@ -129,7 +129,6 @@ def checked(reply: Reply, keys: Keys, path: Path) -> Reply:
 
 
 def explained(error: Exception, keys: Keys, path: Path) -> Exception:
-    """Return the error to raise for an error reply: one with a remedy, or the server's own."""
     text = str(error)
     where = show(full(keys, path))
     if isinstance(error, Refused | ClusterReply):
@@ -147,7 +146,6 @@ def explained(error: Exception, keys: Keys, path: Path) -> Exception:
 
 
 def registered(reply: Reply, keys: Keys) -> frozenset[bytes]:
-    """Return the members of the registry from a reply to SMEMBERS; raises BadData."""
     # The usual case, without building a frozenset. RESP3 has sets, and a reply from EXEC a list.
     if not reply and type(reply) in (list, set):
         return _NO_MEMBERS

@@ -66,8 +66,6 @@ def delete_change(keys: Keys, path: Path, **announcement: Any) -> DocumentChange
 def append_change(
     keys: Keys, path: Path, texts: Sequence[bytes], attachments: tuple[EncodedAttachment, ...], **announcement: Any
 ) -> DocumentChange:
-    """Return the change that appends to the list at `path`; its plan raises MissingKey or WrongType."""
-
     def judge(reply: Reply) -> Any:
         # An empty list: nothing is there. nil in it: it is not a list.
         if reply in ([], [None]):
@@ -177,7 +175,6 @@ def _is_tried(it: DocumentChange, cache: ShapeCache) -> bool:
 
 
 def _moves(it: DocumentChange, cache: ShapeCache) -> bool:
-    """Return whether a change in a list may replace attachments that have moved since they were named."""
     known = cache.of(it.keys.document).members
     return it.replaces and any(may_hold(it.path, place_of(member)) for member in known)
 
@@ -243,7 +240,6 @@ class _WatchedChange:
 
 
 def _stale(it: DocumentChange, known: frozenset[bytes]) -> list[bytes]:
-    """Return the attachments that the change replaces and does not store again, as far as they are known."""
     if not it.replaces:
         return []
     written = {each.suffix.encode() for each in it.attachments}

@@ -103,8 +103,6 @@ def checked_on_silent(function: Any, kwargs: Mapping[str, Any], ttl: float | Non
 
 
 class Caller:
-    """Calls one callback, in both fronts."""
-
     def __init__(
         self, channel: str, function: Callable[[Update], Any], on_silent: Callable[[], Any] = lambda: None
     ) -> None:
@@ -164,8 +162,6 @@ class Caller:
 
 
 class Calls:
-    """The calls of one subscriber in turns of the event loop, one after the other, until its queue is closed."""
-
     def __init__(self, caller: Caller, updates: Stream[Update], kept: set[Any]) -> None:
         self.loop = asyncio.get_running_loop()
         self._caller = caller

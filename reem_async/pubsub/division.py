@@ -137,7 +137,6 @@ class GapDetector:
         return last is not None and update.sequence == last + 1
 
     def has(self, note: Reply) -> bool:
-        """Return whether the update that a note names was heard of: then so were those before it."""
         update = parsed_note(note)
         return self._heard.has(*update) or any(stamp[:2] == update for stamp in self._recent)
 
@@ -189,8 +188,6 @@ _TRIES = 10  # maximum attempts; exceeded only if an unseen publisher keeps writ
 
 
 class Phase(Enum):
-    """Where a read is; the module's docstring draws it."""
-
     IDLE = auto()
     IN_ORDER = auto()
     ASIDE = auto()

@@ -130,16 +130,12 @@ _UNKNOWN: Any = object()  # a copy of which it is not known what it was
 
 
 class Report(Enum):
-    """How the next snapshot is reported."""
-
     INITIAL = auto()  # as the value that was there when following began
     GAP = auto()  # as what is there after updates were lost, those in it included
     UPDATES = auto()  # not at all: each update in it is reported
 
 
 class EventMaker:
-    """Makes events of what changes a copy."""
-
     def __init__(self, path: Path, rest: Path, outputs: collections.deque[Output]) -> None:
         self._path = path  # where the copy is, below the top-level key
         self._rest = rest  # what is followed below that

@@ -199,7 +199,6 @@ class Follower(Listener):
 
     @property
     def gone(self) -> bool:
-        """Whether the server has nothing at what is followed, as far as is known."""
         return self._replica.is_current and self._replica.at() is MISSING
 
     def at(self, inner: Path = ()) -> Any:
@@ -389,7 +388,6 @@ class Follower(Listener):
 
 
 def checked_largest(largest: float | None) -> float:
-    """Return the bytes of an array up to which it is fetched; raises BadType or BadValue for what cannot be."""
     if largest is None:
         return math.inf
     check_number("largest", largest, "use a number of bytes, or None for no limit")

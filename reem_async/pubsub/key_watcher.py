@@ -16,14 +16,13 @@ import logging
 import re
 import weakref
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
-from ..concurrency.tasks import Tasks
 from ..errors import InterfaceClosed, RedisError
 from ..plan.keys import DOCUMENT, keys_of
 from ..plan.notices import Notice
 from ..plan.paths import fits
-from ..transport import Transport, scanned
+from ..transport import scanned
 from ..transport.wire import Wire
 from .division import Stamp
 from .listeners import Beginning, Listener, Topic
@@ -44,23 +43,11 @@ _PATIENCE = 0.5  # seconds to wait for what is older: ten times as long as nodes
 _REMEMBERED = 5.0  # seconds for which it is remembered what came of all nodes, once the key's own is listened to
 
 
-class Subscriptions(Protocol):
-    """What is needed of the subscription manager, which imports this module."""
-
-    transport: Transport
-    tasks: Tasks
-
-    async def follow_here(self, listener: Listener) -> None: ...
-    async def follow_all(self, listeners: Sequence[Listener]) -> None: ...
-    async def unfollow(self, listener: Listener) -> None: ...
-    async def unfollow_here(self, listener: Listener) -> None: ...
-
-
 class KeyWatcher:
     """Follows, for each listener to a pattern, all keys that there are, and those that come to be."""
 
-    def __init__(self, manager: Subscriptions) -> None:
-        self._manager = manager
+    def __init__(self, manager: Any) -> None:
+        self._manager = manager  # the subscription manager, which imports this module
         self._followed: weakref.WeakKeyDictionary[Listener, dict[bytes, _KeyListener]] = weakref.WeakKeyDictionary()
         self._new_keys: weakref.WeakKeyDictionary[Listener, _NewKeysListener] = weakref.WeakKeyDictionary()
         self._looking: asyncio.Task[Any] | None = None
@@ -224,8 +211,6 @@ class _KeyListener(_Part):
 
 
 class _NewKeysListener(_Part):
-    """What publishers tell all nodes: a listener of the subscription manager."""
-
     def __init__(self, key_watcher: KeyWatcher, listener: Listener) -> None:
         super().__init__(listener, listener.topic)
         self._key_watcher = key_watcher

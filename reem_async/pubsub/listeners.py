@@ -33,8 +33,6 @@ _MOST_WARNINGS = 100  # channels of whose unreadable messages a warning is logge
 
 
 class Topic(NamedTuple):
-    """What to subscribe to: a channel, or a glob pattern of channels."""
-
     name: bytes
     pattern: bool = False
 
@@ -135,21 +133,17 @@ _LENGTHS = {b"message": 3, b"pmessage": 4, b"smessage": 3, b"sunsubscribe": 3}
 
 
 def is_invalidation(message: list[Any]) -> bool:
-    """Return whether a push names keys that were changed, or says that all were (None)."""
     if len(message) != 2 or message[0] != b"invalidate":
         return False
     return message[1] is None or (type(message[1]) is list and all(type(name) is bytes for name in message[1]))
 
 
 def is_message(message: list[Any]) -> bool:
-    """Return whether a push is a message for subscribers: its kind, the pattern if any, channel, and payload."""
     length = _LENGTHS.get(message[0]) if message and type(message[0]) is bytes else None
     return len(message) == length and type(message[1]) is bytes and type(message[-2]) is bytes
 
 
 class Inbox:
-    """Notifies each listener of what is pushed for it."""
-
     def __init__(
         self,
         transport: Transport,

@@ -52,8 +52,6 @@ def manager_of(session: Session) -> SubscriptionManager:
 
 
 class SubscriptionManager:
-    """The subscription connections of an interface in one event loop, and the listeners, by topic."""
-
     def __init__(self, transport: Transport, ships: Ships, local: LocalPath) -> None:
         self.transport = transport
         self._local = local
@@ -73,9 +71,8 @@ class SubscriptionManager:
         self._subscribing = Subscribing(transport, local.host, self._confirmed, self._inbox.early.joined)
         self.invalidations = Invalidations()  # what has servers say which keys were changed
         self._heartbeats = Heartbeats(self)
-        self.parameters: dict[str, Any] = {}  # by top-level key, the groups of coordination/parameters.py
         self.callers: set[Any] = set()  # what makes calls for updates, kept here although the program may not hold it
-        self.kept: dict[object, Any] = {}  # callers and servers of services, which live as long as this
+        self.kept: dict[object, Any] = {}  # what of coordination/ lives as long as this
         self.place = os.getpid(), asyncio.get_running_loop()  # the process and the event loop it belongs to
 
     async def follow(self, listener: Listener) -> None:
@@ -107,7 +104,6 @@ class SubscriptionManager:
         self._inbox.watchers.discard(watcher)
 
     def report(self, unreadable: Iterable[Unreadable] | None) -> None:
-        """Count places that cannot be read, and warn of each once."""
         for it in unreadable or ():
             if it.place not in self._reported and len(self._reported) < _MOST_REPORTED:
                 self._reported.add(it.place)
@@ -116,7 +112,6 @@ class SubscriptionManager:
 
     @property
     def hears_of_changes(self) -> bool:
-        """Whether no server has refused to tell which keys are changed."""
         return all(wire.tracked is not False for wire in self._wires.values())
 
     async def touch(self, channel: str, names: Iterable[str], touched: Callable[[], None]) -> bool:
@@ -283,7 +278,6 @@ class SubscriptionManager:
         self._subscribing.leave(self._subscribed.pop(topic, None), topic)
 
     def forget_empty(self) -> list[Listener]:
-        """Forget topics without listeners; return the listeners that are left."""
         if self._local.host:
             self._local.reader.let_go()
         for topic in [topic for topic, group in self._topics.items() if not group.present()]:
@@ -386,7 +380,6 @@ class SubscriptionManager:
         return wire
 
     async def close(self) -> None:
-        """End all listeners and the connections. Idempotent."""
         self._closed = True
         if self.is_here:
             self._inbox.early.close()

@@ -173,7 +173,6 @@ class Mirror(Following):
         return self._check_begun()
 
     def _refusal(self, follower: Follower) -> Stale | None:
-        """Return the error of an answer; None if the copy may be relied on."""
         if reason := self._silence(follower):
             return Silent(f"{self.channel}: {reason}")
         reason = self._stale(follower)
@@ -306,7 +305,6 @@ def _limit(predicate: Any, timeout: float | None) -> float | None:
 
 
 def _waking(mirror: Mirror) -> Callable[[Any], None]:
-    """Return what hands states to a mirror; a reference back would keep a mirror that was dropped."""
     reference = weakref.ref(mirror)
 
     def on_state(tree: Any) -> None:

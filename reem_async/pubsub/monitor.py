@@ -90,7 +90,6 @@ class PatternStream(Stream[Item]):
 
     @property
     def _begun(self) -> bool:
-        """Whether it has begun, in this process and in an event loop that is not closed."""
         return self._manager is not None and self._manager.is_here
 
     @property
@@ -341,7 +340,6 @@ class _PatternListener(Listener):
             self._monitor._heard(notice, channel)
 
     def _is_others(self, channel: bytes) -> bool:
-        """Return whether the pattern of an earlier subscription fits a channel too."""
         for listener in self._monitor._listeners:
             if listener is self:
                 return False

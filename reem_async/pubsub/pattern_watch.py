@@ -177,8 +177,6 @@ class PatternWatch(PatternStream[Update]):
 
 
 def _searching(reference: weakref.ref[PatternWatch]) -> Callable[[], Awaitable[bool]]:
-    """Return what searches for a watch, which it does not keep from being dropped."""
-
     async def search() -> bool:
         watch = reference()
         if watch is None or watch._closed:

@@ -69,7 +69,6 @@ class RefreshTimer(Generic[Owner]):
                 self._next = self._loop.call_soon(self._look_or_wait, self.heard)
 
     def found(self) -> None:
-        """The last look has found something that no notice told of."""
         self._wait = self._pace.quickest
 
     def cancel(self) -> None:

@@ -121,7 +121,6 @@ class Replica:
 
     @property
     def is_current(self) -> bool:
-        """Whether it is what the server has, as far as is known."""
         return self.state is _CURRENT and not self._feed.dirty
 
     # --- what happens to the connection
@@ -178,7 +177,6 @@ class Replica:
             early.told(notice, before, moment)
 
     def _settles(self, notice: Notice, missing: int) -> bool:
-        """Return whether there is nothing more to do for an update, by what was told early."""
         confirmed = self._early.settle(notice, missing)
         if confirmed is False:
             self._early.clear()

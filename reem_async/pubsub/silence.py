@@ -123,7 +123,6 @@ class LivePlaceQueue(LiveQueue, PlaceQueue):
 
 
 def _counts_from(update: Update) -> float:
-    """Return when an update was published on this program's clock, as far as is known."""
     return (update.arrived or 0.0) - update.late
 
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import time
-import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 
 from ..errors import BadValue, ServerFailed
-from .process import HOST, PortTaken, ServerProcess, ServerProgram, Startable, bindable, find_program, packed
+from .process import HOST, ServerProcess, ServerProgram, Startable, at_port, bindable, find_program, packed
 
 SLOTS = 16384
-ATTEMPTS = 10  # to find ports that no other program takes just before the server does
 JOIN_SECONDS = 30.0  # for all nodes to know of each other
 
 
@@ -109,30 +106,29 @@ class EmbeddedCluster(Startable):
             ServerMissing: No server program was found; says what to install.
             ServerFailed: A node ended, or they did not find each other; nothing is left behind.
         """
-        if not self._is_in_fork() and not self.nodes:
-            self._start_or_stop()
+        self._start()
 
-    def _start(self) -> None:
-        with self._lock:
-            if self.nodes:
-                return
-            program = find_program(json=self._json)
-            count = self._primaries * (1 + self._replicas)
-            nodes: list[NodeProcess] = []
-            try:
-                with ThreadPoolExecutor(count, "reem-cluster") as threads:
-                    begun = [threads.submit(self._node, program) for _ in range(count)]
-                    failed = [each.exception() for each in begun]
-                    nodes += [each.result() for each, error in zip(begun, failed, strict=True) if error is None]
-                for error in failed:
-                    if error is not None:
-                        raise error
-                self._join(nodes)
-            except BaseException:
-                stop_all(nodes)
-                raise
-            self.nodes, self._owner = nodes, os.getpid()
-            self._finalizer = weakref.finalize(self, partial(stop_all, nodes))
+    def _runs(self) -> bool:
+        return bool(self.nodes)
+
+    def _begin(self) -> Callable[[], object]:
+        program = find_program(json=self._json)
+        count = self._primaries * (1 + self._replicas)
+        nodes: list[NodeProcess] = []
+        try:
+            with ThreadPoolExecutor(count, "reem-cluster") as threads:
+                begun = [threads.submit(self._node, program) for _ in range(count)]
+                failed = [each.exception() for each in begun]
+                nodes += [each.result() for each, error in zip(begun, failed, strict=True) if error is None]
+            for error in failed:
+                if error is not None:
+                    raise error
+            self._join(nodes)
+        except BaseException:
+            stop_all(nodes)
+            raise
+        self.nodes = nodes
+        return partial(stop_all, nodes)
 
     def _clear(self) -> None:
         super()._clear()
@@ -151,13 +147,7 @@ class EmbeddedCluster(Startable):
         return all(node.json for node in self.nodes)
 
     def _node(self, program: ServerProgram) -> NodeProcess:
-        for attempt in range(ATTEMPTS):
-            try:
-                return NodeProcess(program, bindable(0), bindable(0), self._node_timeout)
-            except PortTaken:
-                if attempt == ATTEMPTS - 1:
-                    raise
-        raise AssertionError("unreachable")
+        return at_port(0, lambda port: NodeProcess(program, port, bindable(0), self._node_timeout))
 
     def _join(self, nodes: list[NodeProcess]) -> None:
         """Give out the slots, have the nodes meet, give the primaries their replicas, wait until all know."""

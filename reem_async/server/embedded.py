@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import weakref
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from reem_async.errors import BadValue, Misuse
-from reem_async.server.process import HOST, PortTaken, ServerProcess, Startable, bindable, find_program, has_data
+from reem_async.server.process import HOST, ServerProcess, Startable, at_port, find_program, has_data
 
-ATTEMPTS = 10  # to find a port that no other program takes just before the server does
 FILL_SECONDS = 30.0  # without a byte moving, while a snapshot is restored
 PASSWORD_BYTES = 512  # the server's own limit
 
@@ -96,18 +95,14 @@ class EmbeddedServer(Startable):
             BadValue: there is a snapshot, and data in the directory.
             FileNotFoundError: the snapshot is not there.
         """
-        if not self._is_in_fork() and not self.running:
-            self._start_or_stop()
+        self._start()
 
-    def _start(self) -> None:
-        with self._lock:
-            if self.running:
-                return
-            self._clear()
-            self._owner = os.getpid()
-            self._process = self._begun()
-            # At the program's end, and when this object is forgotten.
-            self._finalizer = weakref.finalize(self, self._process.stop)
+    def _runs(self) -> bool:
+        return self.running
+
+    def _begin(self) -> Callable[[], object]:
+        self._process = self._begun()
+        return self._process.stop
 
     @property
     def running(self) -> bool:
@@ -157,7 +152,6 @@ class EmbeddedServer(Startable):
         return f"<EmbeddedServer {state}>"
 
     def _begun(self) -> ServerProcess:
-        """Start the server with what it begins with."""
         if self._snapshot is None:
             return self._run(None)
         from reem_async.tools.snapshots.files import sniff  # only programs that use snapshots load them
@@ -202,22 +196,18 @@ class EmbeddedServer(Startable):
 
     def _run(self, rdb: Path | None) -> ServerProcess:
         program = find_program(json=self._json)
-        attempts = 1 if self._wanted_port else ATTEMPTS
-        while True:
-            attempts -= 1
-            port = bindable(self._wanted_port)
-            try:
-                return ServerProcess(
-                    program,
-                    port=port,
-                    directory=self._wanted_directory,
-                    password=self._password,
-                    rdb=rdb,
-                    maxmemory=self._maxmemory,
-                )
-            except PortTaken:  # by a program that came between the look and the start
-                if not attempts:
-                    raise
+
+        def start(port: int) -> ServerProcess:
+            return ServerProcess(
+                program,
+                port=port,
+                directory=self._wanted_directory,
+                password=self._password,
+                rdb=rdb,
+                maxmemory=self._maxmemory,
+            )
+
+        return at_port(self._wanted_port, start)
 
     def _clear(self) -> None:
         super()._clear()

@@ -21,10 +21,11 @@ import threading
 import time
 import weakref
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -32,7 +33,10 @@ import anyio.to_thread
 from reem_async.concurrency.locks import Inherited
 from reem_async.errors import ServerFailed, ServerMissing
 
+Running = TypeVar("Running")
+
 HOST = "127.0.0.1"
+ATTEMPTS = 10  # to find a port that no other program takes just before the server does
 # For a PING to a server on this machine: one that takes longer is taken for one that does not answer.
 ANSWER_SECONDS = 1.0
 READY_SECONDS = 10.0  # without any answer; loading data from disk may take longer
@@ -47,8 +51,6 @@ WATCHDOG = Path(__file__).with_name("watchdog.py")
 
 @dataclass(frozen=True)
 class ServerProgram:
-    """A server executable."""
-
     path: str  # where it is
     modules: tuple[str, ...] = ()  # what it has to load
     json: bool = False  # it understands JSON then
@@ -132,7 +134,6 @@ class ServerProcess:
         return self._ended
 
     def order_to_end(self) -> None:
-        """Have the server end, and do not wait for it."""
         if self._watchdog is not None and os.getpid() == self._owner:
             _close_pipes(self._watchdog)  # this is the order
 
@@ -291,19 +292,27 @@ def bindable(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
+def at_port(port: int, start: Callable[[int], Running]) -> Running:
+    """Return what `start` returns for a port; for 0 a free one, another one if a program takes that just before."""
+    for left in reversed(range(1 if port else ATTEMPTS)):
+        try:
+            return start(bindable(port))
+        except PortTaken:
+            if not left:
+                raise
+    raise AssertionError("unreachable")
+
+
 def has_data(directory: Path) -> bool:
-    """Whether a server has kept data in the directory."""
     return any((directory / name).exists() for name in ("appendonlydir", "appendonly.aof", "dump.rdb"))
 
 
 def _private_directory() -> Path:
-    """A new directory of mode 700, with a name short enough for the unix socket in it."""
     roomy = len(os.fsencode(tempfile.gettempdir())) + len("/reem-12345678/redis.sock") <= SOCKET_CHARACTERS
     return Path(tempfile.mkdtemp(prefix="reem-", dir=None if roomy else "/tmp"))  # noqa: S108
 
 
 def packed(*words: str) -> bytes:
-    """A command as it travels."""
     encoded = [word.encode() for word in words]
     return b"*%d\r\n" % len(encoded) + b"".join(b"$%d\r\n%b\r\n" % (len(word), word) for word in encoded)
 
@@ -315,7 +324,7 @@ def _quoted(value: bytes) -> str:
 
 
 class Startable(ABC):
-    """A server, or several."""
+    """A server, or several, that start with a `with` block and stop with it, in blocking and in asyncio programs."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -325,6 +334,29 @@ class Startable(ABC):
     @abstractmethod
     def start(self) -> None:
         """Start it, and wait until it answers."""
+
+    @abstractmethod
+    def _runs(self) -> bool:
+        """Return whether it was started, was not stopped, and has not ended by itself."""
+
+    @abstractmethod
+    def _begin(self) -> Callable[[], object]:
+        """Start it, and return what stops it; may be interrupted anywhere."""
+
+    def _start(self) -> None:
+        """Do what `start` does, unless it runs already or this is a forked child."""
+        if self._is_in_fork() or self._runs():
+            return
+        try:
+            with self._lock:
+                if not self._runs():
+                    self._clear()
+                    self._owner = os.getpid()
+                    # At the program's end, and when this object is forgotten.
+                    self._finalizer = weakref.finalize(self, self._begin())
+        except BaseException:  # an interrupted start leaves nothing running without an owner
+            self.stop()
+            raise
 
     def stop(self) -> None:
         """Stop it and wait until it is gone; nothing if it does not run. Kept data is on disk afterwards."""
@@ -338,20 +370,9 @@ class Startable(ABC):
             self._finalizer()  # runs once, here or at exit
         self._finalizer = None
 
-    @abstractmethod
-    def _start(self) -> None:
-        """Do what `start` does; may be interrupted anywhere."""
-
     def _is_in_fork(self) -> bool:
         # Asked before a lock is touched: a thread that the fork has left behind may hold it.
         return self._owner is not None and self._owner != os.getpid()
-
-    def _start_or_stop(self) -> None:
-        try:
-            self._start()
-        except BaseException:  # an interrupted start leaves nothing running without an owner
-            self.stop()
-            raise
 
     def __enter__(self) -> Self:
         self.start()

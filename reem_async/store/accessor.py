@@ -337,11 +337,8 @@ class Accessor(Handle):
     async def expire(self, seconds: float) -> None:
         """Have this top-level key expire: document, arrays and what belongs to it go after `seconds`, at once.
 
-        Subscribers see a deletion. Only for a whole top-level key, `kvs["foo"]`.
-
-        A later write keeps the time that is left. Arrays that it stores have none: they stay behind when the document
-        expires, until `reem doctor --clean`. So call it again after each write with arrays:
-        `kvs["seen"] = {...}; kvs["seen"].expire(2)`. A key that is deleted and written again does not expire.
+        Subscribers see a deletion. A later write keeps the time that is left, but arrays that it stores do not expire:
+        call this again after each write with arrays. A key that is deleted and written again does not expire.
 
         One transaction, two round trips, again if another client writes to the key in between. Needs the right
         +pexpire.
@@ -384,10 +381,8 @@ class Accessor(Handle):
             async for update in kvs["arm"].watch():
                 print(update.path, update.value, update.data)
 
-        An update holds `path` (what changed, such as "arm.joint"), `value` (what was written there), `data` (all that
-        is here now), `time`, `origin` ("published", "stored" or "found"), `late` (by how many seconds an outage delayed
-        it at its publisher), `deleted`, `initial` (the value that was here already), and `gap` and `missed` (updates
-        before it were lost).
+        An `Update` holds `path` (what changed, such as "arm.joint"), `value` (what was written there), `data` (all that
+        is here now), and how it came about: `time`, `origin`, `late`, `deleted`, `initial`, `gap` and `missed`.
 
         Published updates arrive one by one. Plain writes (by a KeyValueStore, another language, redis-cli, an expiry,
         ...) arrive as the state they led to: several in a short time may be one update, and the last state always
@@ -400,9 +395,7 @@ class Accessor(Handle):
                 only published updates arrive.
             ttl: Seconds without a published update after which there is silence, by the clock of this program: one
                 update with `silent=True` says so, within some milliseconds, also if the publisher, the server or the
-                network is gone. The clock starts when following begins. Only published updates arrive then, and none
-                that is older than `ttl`: not what is found, not plain writes, and not what has waited in the queue, or
-                in an outage of its publisher, for longer. `data` has those changes too.
+                network is gone. Only published updates arrive then, and none that is older than `ttl`.
 
         Raises:
             BadType, BadValue: A policy or `ttl` that cannot be used; `ttl` with `Every`, or at an index from the end.
@@ -425,16 +418,15 @@ class Accessor(Handle):
 
         Args:
             max_age: Largest `age` of an answer in seconds, 0.005 at least; beyond it, and without a connection, answers
-                raise Stale. It measures the link to the server, not the age of the value, and does not notice a dead
-                publisher. The server is probed three times in that time: use at least three times the round trip.
+                raise Stale. It measures the link to the server, which is probed three times in that time, and does not
+                notice a dead publisher.
             largest: Bytes of an array up to which it is fetched; an `Unfetched` is in the place of a larger one, with
                 its `label`, `size` and `summary`. `kvs["arm"]["image"].read()` fetches it.
             stale: "keep" has answers return the last known value while the connection is down, instead of raising.
                 `age` says how old that is.
             ttl: Seconds after the last published update in which answers count, on this program's clock; then they
                 raise Silent, also if the publisher, the server or the network is gone, or return what is given:
-                `cmd.value(default=STOP)`. A shorter break of the connection is not noticed. What is found at the
-                beginning or after a break does not count until the next update arrives, nor do plain writes.
+                `cmd.value(default=STOP)`. What is found at the beginning or after a break does not count.
 
         Raises:
             BadType, BadValue: An argument that cannot be used, or `max_age` or `ttl` with `stale="keep"`.
@@ -467,11 +459,8 @@ class Accessor(Handle):
             kp = await kvs["control"].parameter("kp", 2.0, low=0.0, high=10.0, unit="1/s")
 
         The value is stored at `control.kp`. A stored value wins over the default; where none is stored, the default is
-        stored. Values that other programs store there are used if they are of the type and in range; others are
-        ignored, logged once each ("reem.parameters") and shown in `kp.invalid`. In an outage the last value stays.
-
-        Two to six round trips, more for the first parameter of a server. Declared again with equal arguments, it is the
-        same parameter; `on_change` of each declaration is called.
+        stored. A stored value of another type or out of range is ignored, logged once ("reem.parameters") and shown in
+        `kp.invalid`. In an outage the last value stays. Two to six round trips, more for the first one of a server.
 
         Args:
             name: The key in the dict here, which is made if it is missing.
@@ -499,14 +488,12 @@ class Accessor(Handle):
     async def call(self, /, *, timeout: float | None = None, **arguments: Any) -> Any:  # noqa: ASYNC109
         """Ask the service at this place, and return its answer: `actions = await kvs["policy"].call(image=image)`.
 
-        One of the programs that `serve` here calls its function with these arguments, at most once. Arguments and
-        answer are what REEM stores. Arrays in an answer are read-only.
-        Nothing is stored under this key; what is sent in passing expires. A call that is left, by cancelling or by its
-        timeout, cancels a coroutine function, and is not begun if it still waits.
+        One of the programs that `serve` here calls its function with these arguments, at most once. Arrays in an answer
+        are read-only. A call that is left, by cancelling or by its timeout, cancels a coroutine function, and is not
+        begun if it still waits.
 
-        A message to the server and one back, without waiting in between; the first call subscribes and looks for
-        servers, two round trips more. A value over 64 KB goes through shared memory on one host; else fetching it takes
-        one round trip more.
+        A message to the server and one back. The first call subscribes and looks for servers, two round trips more. A
+        value over 64 KB that does not go through shared memory takes one more.
 
         Args:
             timeout: Seconds to wait for the answer; what `reem_async.timeout` says, or 10, if not given. A request
@@ -541,11 +528,10 @@ class Accessor(Handle):
 
         A plain function runs on a thread of REEM's own, and may use REEM. In asyncio a coroutine function runs on the
         event loop and is cancelled when its caller leaves; it must not block. An exception reaches the caller as
-        RemoteError. Programs, and functions in one, that serve the same place share the calls.
+        RemoteError. Functions that serve the same place share the calls.
 
-        In plain programs it has begun when this returns. In asyncio it begins in the background, as soon as there is a
-        server; `async with` and `await service.listen()` return when it has begun, and raise what prevents it. It ends
-        with `close()`, the interface or the program: `await service.wait()` keeps one that only serves.
+        In plain programs it has begun when this returns. In asyncio it begins in the background; `async with` and
+        `await service.listen()` return when it has begun. It ends with `close()`, the interface or the program.
 
         Args:
             function: What answers. It gets the arguments of a call by name; arrays are read-only.
@@ -574,10 +560,9 @@ class Accessor(Handle):
         after the last write; `await cmd.renew()` renews it without one. Leaving the block releases it. Programs that
         do not call `own` are not kept from writing: readers with a `ttl` ignore them while there is an owner.
 
-        Entering takes three round trips and makes a connection that the owner keeps. It raises Owned if another program
-        owns the key, NotAllowed if a right is missing. A write raises LeaseLost, with nothing written, if the lease has
-        expired or another owner has it; then `cmd.lost` is true, and `await cmd.acquire()` owns the key again. If the
-        connection breaks, the next write reconnects, and is made if the lease is still there.
+        Entering takes three round trips; it raises Owned if another program owns the key, NotAllowed if a right is
+        missing. A write raises LeaseLost, with nothing written, if the lease has expired or another owner has it; then
+        `cmd.lost` is true, and `await cmd.acquire()` owns the key again.
 
         Args:
             ttl: Seconds for which the lease lasts after each write, 0.001 to 3600. Write at least twice as often.

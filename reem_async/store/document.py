@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from ..errors import (
     MissingTop,
     NotConnected,
     PartialWrite,
+    PathRefused,
     ReemError,
     WrongType,
 )
@@ -50,6 +52,7 @@ from ..plan.writes import (
     exchange,
     expiry,
     into_new,
+    make_parents,
     set_change,
     takes,
     together,
@@ -59,8 +62,6 @@ from .encoding import HUGE, Encoder, unique_tail
 
 
 class DocumentReader:
-    """Reads one top-level key."""
-
     def __init__(self, session: Session, name: object) -> None:
         self.session = session
         self.keys = session.keys(name)
@@ -136,8 +137,6 @@ Attachments = tuple[EncodedAttachment, ...]
 
 
 class Assignment(NamedTuple):
-    """One encoded value that a call stores, or a place that it removes."""
-
     path: Path  # the place, below the top-level key
     text: bytes | None  # the JSON text; None to remove the value
     attachments: Attachments = ()  # the values that ships store
@@ -145,8 +144,6 @@ class Assignment(NamedTuple):
 
 
 class CallTime(NamedTuple):
-    """When a call was made that is sent later."""
-
     wall: float  # seconds since 1970, for notices
     monotonic: float  # to measure how late it is
 
@@ -238,7 +235,6 @@ class DocumentWriter:
         return _SILENT_TURN
 
     def maker(self) -> Callable[[Session, object], DocumentWriter]:
-        """Return a factory that can be pickled."""
         return type(self)
 
     async def check(self, value: Any) -> None:
@@ -257,6 +253,13 @@ class DocumentWriter:
         if len(text) > HUGE:
             self.encoder.check_sizes(path, [text])
         await self._set(path, text, ())
+
+    async def set_with_parents(self, path: Path, value: Any) -> None:
+        try:
+            await self.set(path, value)
+        except PathRefused:
+            await self.session.run(make_parents(self.keys, path))
+            await self.set(path, value)
 
     def _store(self, assignments: Sequence[Assignment]) -> Awaitable[Any]:
         return self.in_turn(self.send, assignments) if self._outages is None else self._outages.put(self, assignments)
@@ -308,18 +311,13 @@ class DocumentWriter:
         text = number_text(operand, (self.name, *path))
         if isinstance(operand, np.generic):
             operand = operand.item()
-
-        def plan(announcement: Announcement) -> Plan:
-            return calculate(self.keys, path, command, operation, operand, text, announcement, self.session.cache)
-
+        plan = partial(calculate, self.keys, path, command, operation, operand, text, cache=self.session.cache)
         return await self._demand(self._calculate, plan)
 
     async def compute(self, path: Path, function: Any) -> Any:
-
-        def plan(announcement: Announcement) -> Plan:
-            return compute(self.keys, path, function, announcement, self.session.cache)
-
-        return await self._demand(self._calculate, plan)
+        return await self._demand(
+            self._calculate, partial(compute, self.keys, path, function, cache=self.session.cache)
+        )
 
     async def exchange(self, path: Path, value: Any, before: RawRead) -> None:
         """Store `value` at `path` if the stored value is still `before`; raises Conflict."""

@@ -27,8 +27,6 @@ def unique_tail() -> str:
 
 
 class Encoder:
-    """Encodes the values of one top-level key, and refuses what cannot be stored."""
-
     def __init__(self, session: Session, keys: Keys) -> None:
         self._session = session
         self._keys = keys

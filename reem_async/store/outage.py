@@ -121,7 +121,6 @@ class UnsentUpdates:
         return 0 if it is None else len(it.assignments)
 
     def take(self) -> tuple[int, Kept] | None:
-        """Take the oldest call to send it, and count it as being sent; None if there is none."""
         self.sending = 1
         try:
             number, it = self.kept.popitem(last=False)
@@ -264,7 +263,6 @@ class Outage:
         return task if isinstance(task, bool) else not (task.done() or task.get_loop().is_closed())
 
     def _start_asking(self) -> None:
-        """Start a task that asks whether the server is back, if there is none."""
         if not self._out or self._is_asking:
             return
         self._asking = True  # before it begins
@@ -372,7 +370,6 @@ class Outage:
         return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
-        """Count updates that were refused, or are not known to be stored."""
         if isinstance(error, MissingKey):  # a deletion of a value that is gone
             return
         self._count(keys, len(it.assignments))
@@ -442,7 +439,6 @@ def _copied(it: EncodedAttachment) -> EncodedAttachment:
 
 
 def size_of(assignments: Sequence[Assignment]) -> int:
-    """Return how many bytes kept assignments need, about."""
     return sum(
         [
             _OVERHEAD + len(it.text or b"") + sum([sum(sizes_of(each.commands)) for each in it.attachments])
@@ -452,5 +448,4 @@ def size_of(assignments: Sequence[Assignment]) -> int:
 
 
 def place_of(keys: Keys, it: Kept) -> str:
-    """Return the place of the first of kept assignments, for people."""
     return show((keys.name, *it.assignments[0].path))

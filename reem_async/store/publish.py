@@ -210,7 +210,6 @@ class ValueAnnouncement(UpdateAnnouncement):
             self._is_shared = self._notify_early(self._reserved[0], path)
 
     async def _ask_host(self) -> None:
-        """Ask for the subscribers on this host; raises NotConnected."""
         session, keys, local = self._session, self._keys, self._session.local
         channel = keys.channel.encode()
         address = local.subscribers.ask(channel) if local.early else b""
@@ -227,7 +226,6 @@ class ValueAnnouncement(UpdateAnnouncement):
             await session.transport.pause(_ANSWER)
 
     def _notify_early(self, stamp: _Stamp, path: Path) -> bool:
-        """Notify the subscribers on this host; return whether there are any."""
         channel, subscribers = self._keys.channel.encode(), self._session.local.subscribers
         if not subscribers.count(channel):
             return False
@@ -256,8 +254,6 @@ class ValueAnnouncement(UpdateAnnouncement):
 
 
 class DocumentPublisher(DocumentWriter):
-    """Writes one top-level key and notifies its subscribers, in the same transaction."""
-
     keeps_order = True
 
     def turn(self, identity: PublisherIdentity | None = None) -> PublishTurn:

@@ -256,17 +256,15 @@ class PublishSpace(KeyValueStore):
     large one is announced, and subscribers fetch the newest.
 
     `outage` is the policy for `write`, `update` and `delete` in an outage (NotConnected, ConnectionLost or
-    ServerNotReady). They raise, or return at once until the server answers again: "drop" drops the updates. "newest"
-    keeps the newest update of each place, up to 256 MB in all, and sends these when the server is back, in the order of
-    the calls, with the bytes and the time of the call. Nothing is applied twice. What is not published, or not for
-    certain, is counted in `dropped`, and subscribers see it by `gap` and `missed`. `append`, `extend` and arithmetic
-    depend on the stored value, so they always raise in an outage. Promise 14 of docs/guarantees.md has the details.
+    ServerNotReady): they raise, drop their updates, or keep the newest of each place, up to 256 MB in all, and send
+    these when the server is back. Nothing is applied twice. What is not published, or not for certain, is counted in
+    `dropped`, and subscribers see it by `gap` and `missed`. `append`, `extend` and arithmetic always raise.
 
     With `wait=False`, `write`, `update` and `delete` encode and queue their updates and return. A background task sends
     them in the order of the calls. Bad input raises in the call. Errors of the server go to `on_error`, or the next
     call raises the first of them and queues nothing. If 32 calls of a key wait, a further one replaces those of the
     same place. A read may not see an update yet: `flush` waits until it is stored. Closing the interface, and the end
-    of the program, send what is queued for up to a second. Promise 25 has the details.
+    of the program, send what is queued for up to a second. Promises 14 and 25 of docs/guarantees.md have the details.
 
     Args:
         interface: The server: a RedisInterface, a store, or what RedisInterface takes as host.

@@ -10,7 +10,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Protocol
 
 from ..concurrency.timeouts import time_limit
 from ..errors import SELF_EXPLANATORY, BadData, Contended, LeaseLost, NotConnected, ReemError, Refused, WrongKind
@@ -32,19 +32,23 @@ class Held(Protocol):
         """Send `commands` in one go and return their replies; error replies are returned, not raised."""
 
 
-class Keepable(Held, Protocol):
-    """A connection of one caller's own that it keeps over several calls."""
-
-    def fresh(self) -> bool:
-        """Return whether the connection still stands and leads to the right server, as far as one can see."""
+async def give_back(lent: AbstractAsyncContextManager[Any] | None, error: BaseException | None = None) -> None:
+    """Leave what lends a connection, if there is one; after an error the connection is closed."""
+    if lent is not None:
+        try:
+            await lent.__aexit__(type(error) if error else None, error, None)
+        except BaseException as again:
+            if again is not error:
+                raise
 
 
 Guard = Callable[[Any], Held]
-"""Wraps a connection, a `Keepable` except in a cluster, before anything is sent over it."""
+"""Wraps a connection before anything is sent over it. Except in a cluster, that has `fresh()`: whether it still stands
+and leads to the right server, as far as one can see."""
 
 
-class Transport(Held, Protocol):
-    """A server, as far as plans can see it.
+class Transport(ABC):
+    """A server, as far as plans can see it. What is not abstract is that of one server and of plain threads.
 
     Attributes:
         states: What the interface's user gets to know of the connections.
@@ -54,25 +58,38 @@ class Transport(Held, Protocol):
 
     states: States
     at_end: Callable[[], Awaitable[None]]
-    sharded: bool
+    sharded = False
 
+    def __init__(self, options: Options) -> None:
+        self._options = options
+
+    @abstractmethod
+    def roundtrip(self, commands: Sequence[Command], *, bulk: bool = False) -> Awaitable[list[Reply]]:
+        """As `Held.roundtrip`."""
+
+    @abstractmethod
     def hold(self, guard: Guard | None = None) -> AbstractAsyncContextManager[Held]:
         """Return a connection of the caller's own, given back on exit; with a guard, it may be kept for long."""
 
     @property
     def options(self) -> Options:
         """How the server is reached; in a cluster, one of its nodes."""
+        return self._options
 
     @property
     def timeout(self) -> float:
         """Seconds without a byte moving after which a call made now is given up."""
+        return time_limit(self.options.timeout)
 
     async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
         """Return the way to the server that has `key`; `refresh` if it was not where it was thought to be."""
+        return self
 
     async def nodes(self) -> Sequence[Transport]:
         """Return the ways to the servers that have all keys together."""
+        return (self,)
 
+    @abstractmethod
     async def pause(self, seconds: float) -> None:
         """Wait."""
 
@@ -81,27 +98,89 @@ class Transport(Held, Protocol):
 
         Returns whether anything else could happen meanwhile.
         """
+        return False
 
     def is_settled(self, document: str) -> bool:
         """Return whether nothing large, sent by callers that were cancelled since, is on its way to `document`."""
+        return True
 
-    async def settle(self, document: str) -> None:
+    async def settle(self, document: str) -> None:  # noqa: B027 - only where something may be on its way
         """Wait until it has arrived: it must not come after what is written next."""
 
+    @abstractmethod
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         """Return a lock: what is sent inside arrives in the order of entering, per `key`."""
 
-    def broken_off(self) -> None:
+    def broken_off(self) -> None:  # noqa: B027 - in an event loop calls are cancelled, which gives all back
         """Give back what a call of this thread holds that was broken off between two steps, by Ctrl-C for example."""
 
+    @abstractmethod
     def check(self) -> None:
         """Raise if this cannot be used here: closed, or bound to another event loop."""
 
+    @abstractmethod
     async def release(self) -> None:
         """Close the connections that are not in use; new ones are made when needed."""
 
+    @abstractmethod
     async def close(self) -> None:
         """Close all connections. Idempotent."""
+
+
+NewTransport = Callable[[Options], Any]
+"""Makes the transport to one server: on an event loop, or for plain threads."""
+
+
+class CompositeTransport(Transport):
+    """A transport over others, one of which, the root, is there from beginning to end."""
+
+    _root: Transport
+
+    @abstractmethod
+    def _all(self) -> Iterable[Transport]:
+        """Return the transports there are, the root among them."""
+
+    @property
+    def options(self) -> Options:
+        return self._root.options
+
+    async def pause(self, seconds: float) -> None:
+        await self._root.pause(seconds)
+
+    def is_settled(self, document: str) -> bool:
+        # A key may have moved since: what was sent to any node counts.
+        return all(each.is_settled(document) for each in self._all())
+
+    async def settle(self, document: str) -> None:
+        for each in list(self._all()):
+            await each.settle(document)
+
+    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
+        return self._root.ordered(key)
+
+    def broken_off(self) -> None:
+        self._root.broken_off()
+
+    def check(self) -> None:
+        self._root.check()
+
+    @property
+    def at_end(self) -> Callable[[], Awaitable[None]]:
+        return self._root.at_end
+
+    @at_end.setter
+    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
+        self._root.at_end = action
+
+    async def release(self) -> None:
+        async with AsyncExitStack() as steps:  # the last comes first, and each is taken, also if one is cancelled
+            for each in reversed(list(self._all())):
+                steps.push_async_callback(each.release)
+
+    async def close(self) -> None:
+        async with AsyncExitStack() as steps:  # as above
+            for each in reversed(list(self._all())):
+                steps.push_async_callback(each.close)
 
 
 class Contention:
@@ -184,7 +263,6 @@ def _told(plan: Plan, error: Exception) -> Exception:
 
 
 async def _named(transport: Transport, error: WrongKind) -> WrongKind:
-    """Return the error with the type that is there."""
     (kind,) = await transport.roundtrip([("TYPE", error.key)])
     text = False
     if kind == b"string":  # of another program, or a document as servers without JSON keep it
@@ -255,90 +333,3 @@ async def counted(transport: Transport, database: int) -> int | None:
             return None
         total += held
     return total
-
-
-NewTransport = Callable[[Options], Any]
-"""Makes the transport to one server: on an event loop, or for plain threads."""
-
-
-class OneServer:
-    """What the transports to one server have in common."""
-
-    sharded = False
-
-    def __init__(self, options: Options) -> None:
-        self._options = options
-
-    @property
-    def options(self) -> Options:
-        return self._options
-
-    @property
-    def timeout(self) -> float:
-        return time_limit(self._options.timeout)
-
-    async def owner(self, key: bytes, *, refresh: bool = False) -> Self:
-        return self
-
-    async def nodes(self) -> Sequence[Self]:
-        return (self,)
-
-
-class CompositeTransport(ABC):
-    """A transport over others, one of which, the root, is there from beginning to end."""
-
-    _root: Transport
-
-    @abstractmethod
-    def _all(self) -> Iterable[Transport]:
-        """Return the transports there are, the root among them."""
-
-    async def pause(self, seconds: float) -> None:
-        await self._root.pause(seconds)
-
-    async def let_pass(self) -> bool:
-        """Return False: a node that does not answer must not keep what goes to another one."""
-        return False
-
-    def is_settled(self, document: str) -> bool:
-        # A key may have moved since: what was sent to any node counts.
-        return all(each.is_settled(document) for each in self._all())
-
-    async def settle(self, document: str) -> None:
-        for each in list(self._all()):
-            await each.settle(document)
-
-    def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
-        return self._root.ordered(key)
-
-    def broken_off(self) -> None:
-        self._root.broken_off()
-
-    def check(self) -> None:
-        self._root.check()
-
-    @property
-    def options(self) -> Options:
-        return self._root.options
-
-    @property
-    def timeout(self) -> float:
-        return self._root.timeout
-
-    @property
-    def at_end(self) -> Callable[[], Awaitable[None]]:
-        return self._root.at_end
-
-    @at_end.setter
-    def at_end(self, action: Callable[[], Awaitable[None]]) -> None:
-        self._root.at_end = action
-
-    async def release(self) -> None:
-        async with AsyncExitStack() as steps:  # the last comes first, and each is taken, also if one is cancelled
-            for each in reversed(list(self._all())):
-                steps.push_async_callback(each.release)
-
-    async def close(self) -> None:
-        async with AsyncExitStack() as steps:  # as above
-            for each in reversed(list(self._all())):
-                steps.push_async_callback(each.close)

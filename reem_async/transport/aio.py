@@ -17,7 +17,7 @@ from ..errors import ConnectionLost, InterfaceClosed, NotConnected, ReemError, W
 from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
 from ..plan.sizes import has_large
-from . import Guard, Held, OneServer, document_of
+from . import Guard, Held, Transport, document_of
 from .options import Options, server_run_id
 from .protocol import error_of
 from .state import States
@@ -36,9 +36,7 @@ _COMPANY, _PORTION = 0.1, 1 << 17
 It would take megabytes at once, and the event loop stands still meanwhile."""
 
 
-class AsyncTransport(OneServer):
-    """Connections of one interface in one event loop, made when first needed."""
-
+class AsyncTransport(Transport):
     def __init__(self, options: Options) -> None:
         super().__init__(options)
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -259,7 +257,6 @@ class AsyncTransport(OneServer):
             await wire.discard()
 
     async def take_broken(self, lent: _Lent) -> None:
-        """Close a connection on which a call may be under way."""
         self._kept.discard(lent.wire)
         if lent.is_uploading:  # its reply tells when what is on its way has arrived
             self._leaving.add(lent.wire)
@@ -315,9 +312,6 @@ class AsyncTransport(OneServer):
             self.check()  # a lock of another event loop, or of the parent process, is no lock here
         return self._orders.of(key)
 
-    def broken_off(self) -> None:
-        """Do nothing: in an event loop calls end by being cancelled, which gives everything back."""
-
     async def listen(self, on_push: Callable[[list[Any]], None], on_lost: Callable[[Wire, Exception], None]) -> Wire:
         self.check()
         return await self._opened(on_push, on_lost)
@@ -348,8 +342,6 @@ class AsyncTransport(OneServer):
 
 
 class _Lent:
-    """A connection in the hands of one caller."""
-
     def __init__(self, transport: AsyncTransport, wire: Wire) -> None:
         self._transport = transport
         self.wire = wire

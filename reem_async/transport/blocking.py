@@ -24,7 +24,7 @@ from ..concurrency.timeouts import LOOKS, moved_last, time_limit, unsent
 from ..errors import ConnectionLost, InterfaceClosed
 from ..plain.translation import finished, shortcut
 from ..plan import Command, Reply
-from . import Guard, Held, OneServer
+from . import Guard, Held, Transport
 from .options import INFO_SERVER, Options, server_run_id
 from .protocol import MORE, NOT_THE_PROTOCOL, SLOW, LargeReader, Piece, ReplyReader, SmallReader, error_of, pack
 from .state import States
@@ -35,8 +35,6 @@ _SLICE = 1 << 19  # bytes of a large value that are sent before giving way
 
 
 class _Line:
-    """One blocking connection, used by one caller at a time."""
-
     def __init__(self, options: Options, states: States) -> None:
         self._states = states
         self._is_kept = False
@@ -173,7 +171,6 @@ class _Line:
             raise TimeoutError
 
     def fresh(self) -> bool:
-        """Return whether the connection still stands, as far as one can see without sending."""
         # Nothing is due: an event is a stray reply, or the server has closed.
         return not self.broken and not self.retired and not self._poll.poll(0)
 
@@ -213,9 +210,7 @@ def keep_open_at_exit() -> None:
     _open_at_exit.set([line.kept_open() for transport in _all for line in list(transport._idle)])
 
 
-class BlockingTransport(OneServer):
-    """Connections for the threads of one process: as many as there are calls at the same time."""
-
+class BlockingTransport(Transport):
     def __init__(self, options: Options) -> None:
         super().__init__(options)
         self._closed = False
@@ -237,7 +232,6 @@ class BlockingTransport(OneServer):
         self._orders = Locks(ThreadLock)
 
     def _take(self) -> _Line | None:
-        """Return an idle connection, None if there is none."""
         if self._closed:
             self.check()
         stale: _Line | None = None
@@ -313,15 +307,6 @@ class BlockingTransport(OneServer):
 
     async def pause(self, seconds: float) -> None:
         time.sleep(seconds)  # noqa: ASYNC251 - nothing else runs on this thread
-
-    async def let_pass(self) -> bool:
-        return False  # a call has a connection of its own, and keeps no other thread
-
-    def is_settled(self, document: str) -> bool:
-        return True  # no caller can leave before the reply is there
-
-    async def settle(self, document: str) -> None:
-        return None
 
     def ordered(self, key: str) -> AbstractAsyncContextManager[None]:
         return self._orders.of(key)

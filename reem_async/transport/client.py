@@ -70,13 +70,11 @@ def _settings(options: Options) -> dict[str, Any]:
 
 
 def client(options: Options) -> Any:
-    """Return a blocking client; nothing is connected yet."""
     kind = getattr(redis.connection, options.connection_class)
     settings = {"command_packer": Packer(), **_settings(options)}
     return _Client.from_pool(redis.ConnectionPool(connection_class=kind, **settings))
 
 
 def asyncio_client(options: Options) -> Any:
-    """Return an asyncio client; nothing is connected yet."""
     kind = getattr(redis.asyncio.connection, options.connection_class)
     return _AsyncioClient.from_pool(redis.asyncio.ConnectionPool(connection_class=kind, **_settings(options)))

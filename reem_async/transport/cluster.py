@@ -80,8 +80,7 @@ class ClusterOptions(Options):
 
 
 class ClusterTransport(CompositeTransport):
-    """Connections to the nodes of a cluster, made when first needed."""
-
+    _options: ClusterOptions
     sharded = True
 
     def __init__(self, options: ClusterOptions, new_transport: NewTransport) -> None:
@@ -165,7 +164,6 @@ class ClusterTransport(CompositeTransport):
         return await self.owner_of(key_slot(key if isinstance(key, bytes) else key.encode()), refresh=refresh)
 
     async def owner_of(self, slot: int, *, refresh: bool = False) -> Transport:
-        """Return the node that has `slot`; `refresh` if what is known of the cluster is in doubt."""
         if refresh or self._owners[slot] is None:
             await self.look()
         found = self._owners[slot]
@@ -316,7 +314,6 @@ class ClusterTransport(CompositeTransport):
         return answers
 
     async def _scattered(self, commands: Sequence[Command], slots: Sequence[int | None], bulk: bool) -> list[Reply]:
-        """Send commands that belong to several slots, a round trip for each slot."""
         answers: list[Reply] = list(commands)
         grouped: dict[int | None, list[int]] = {}
         for place, slot in enumerate(slots):
@@ -371,8 +368,6 @@ def _address(host: bytes | str | None, port: Any, asked: str) -> Address:
 
 
 class _NodeStates(States):
-    """What one node's connections report, on its way to the cluster's states."""
-
     def __init__(self, cluster: ClusterTransport, address: Address) -> None:
         super().__init__()
         self._cluster = cluster
@@ -406,7 +401,6 @@ class Publication:
         self._there: Transport | None = None
 
     async def send_ahead(self, node: Transport, asking: bool) -> Outcome:
-        """Send to `node` what is large, unless that has it already."""
         if asking:
             self._keep_together()
         if not self._coming or self._there is node:
@@ -438,7 +432,6 @@ class Publication:
         return answers
 
     async def publish(self, held: Held, route: Route, bulk: bool) -> Outcome:
-        """Do the rest over a connection to the same node."""
         # Where a slot moves, its document tells where its keys may be made: see `route`.
         keys = list(dict.fromkeys([self._document, *keys_in(self._commands)]))
         problem, looks = await watched(held, keys, route, looks_at(self._coming))

@@ -167,7 +167,6 @@ class Options:
         return "SSLConnection" if self.tls else "Connection"
 
     def asynchronous_connection(self) -> Any:
-        """Return a fresh connection of redis.asyncio, not yet connected."""
         module: Any = redis.asyncio.connection
         # No timeout of redis-py's own: its wait_for can swallow a cancellation before Python 3.12, and it counts what
         # other tasks of the loop do.
@@ -175,7 +174,6 @@ class Options:
         return _greeted(getattr(module, self.connection_class)(**settings))
 
     def blocking_connection(self) -> Any:
-        """Return a fresh connection of redis, not yet connected."""
         module: Any = redis.connection
         # redis-py's time limit is for the handshake only; then the transport sets its own on the socket.
         limit = self.handshake_timeout
@@ -260,8 +258,6 @@ def _greeted(connection: Any) -> Any:
 
 
 class NodeOptions(Options):
-    """How to reach one of several servers: as all of them, `of`, unless it has other connection `settings`."""
-
     def __init__(self, of: Options, address: Address, settings: dict[str, Any] | None = None) -> None:
         host, port = address
         settings = of.settings if settings is None else settings
@@ -349,7 +345,6 @@ def _shown(reason: BaseException, text: str) -> str:
 
 
 def server_run_id(introduction: Any) -> str | None:
-    """Return what the server's process calls itself in the reply to `INFO_SERVER`; None if it did not say."""
     # A user without the right gets an error: restarts are then not noticed, and all else goes on.
     found = _RUN.search(introduction) if isinstance(introduction, bytes | bytearray) else None
     return None if found is None else found[1].decode()
@@ -558,7 +553,6 @@ def _split(url: str) -> SplitResult:
 
 
 def address_of(url: str, port: int) -> tuple[str, int]:
-    """Return host and port of a plain URL; `port` if it names none."""
     parts = urlsplit(url)
     return parts.hostname or "localhost", parts.port or port
 

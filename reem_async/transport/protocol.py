@@ -122,7 +122,6 @@ class CommandRecorder(
         self.commands: list[Command] = []
 
     def execute_command(self, *words: Any, **_: Any) -> CommandRecorder:
-        """Record one command; returns the recorder, as pipelines do."""
         # Arrays stay views of their memory, not copies: they are sent from there.
         self.commands.append(tuple([flat_buffer(as_text(word)) for word in words]))
         return self
@@ -149,7 +148,6 @@ _BULK = b"$="
 
 
 def error_of(text: str) -> Exception:
-    """Return the exception that an error reply stands for."""
     try:
         return refusal(text) or _parse_error(text)
     except Exception:  # redis-py takes the places in MOVED and ASK apart and trusts them to be whole
@@ -160,8 +158,6 @@ _parse_error: Any = BaseParser.parse_error
 
 
 class SmallReader:
-    """hiredis, handing out error replies as redis-py's exceptions."""
-
     def __init__(self, largest: int = LARGEST) -> None:
         self.fed = 0  # bytes received of the reply that is under way; to be set to 0 when a reply is taken
         self._largest, self._in_all, self._look_at = largest, largest * _IN_ALL, _MUCH
@@ -219,8 +215,6 @@ def _check_elements(count: int) -> None:
 
 
 class _Open:
-    """An aggregate whose elements are being received."""
-
     __slots__ = ("items", "kind", "left")
 
     def __init__(self, kind: int, left: int) -> None:

@@ -37,7 +37,7 @@ import redis.exceptions
 
 from ..errors import ConnectionLost, NotConnected, TlsRefused
 from ..plan import Command, Reply, blamed
-from . import Held, Transport
+from . import Held, Transport, give_back
 
 key_slot: Callable[[bytes], int] = redis.crc.key_slot  # the number of the slot that a key or channel belongs to
 
@@ -66,7 +66,6 @@ _PAUSES = (0.0, 0.0, 0.005, 0.01, 0.02, 0.05)
 
 
 def slot_of(commands: Sequence[Command]) -> int | None:
-    """Return the slot that commands of one top-level key belong to; None if any node may have them."""
     first = commands[0]
     return _slot(commands[1] if first[0] == "MULTI" else first)
 
@@ -95,7 +94,6 @@ def publishes(commands: Sequence[Command]) -> bool:
 
 
 def keys_in(commands: Sequence[Command]) -> list[bytes]:
-    """Return all keys of commands, channels left out, each once."""
     found: dict[bytes, None] = {}
     for command in commands:
         # The only commands of REEM with more than one key.
@@ -120,8 +118,6 @@ def is_unapplied(reply: object) -> bool:
 
 
 class Route:
-    """The way of one call through a `cluster.ClusterTransport`: which node is next, until the call's time is over."""
-
     def __init__(self, cluster: Any, slot: int | None, asked: Transport | None = None) -> None:
         self._cluster = cluster
         self._slot = slot
@@ -137,7 +133,6 @@ class Route:
         return self._source is not None
 
     async def node(self) -> Any:
-        """Return the transport to send with next."""
         if self._node is None:
             # The first try believes what is known. Each later one looks again, since what was known has failed.
             if self._slot is not None:
@@ -205,8 +200,6 @@ def _reason(problem: Exception) -> str:
 
 
 class HeldAcross:
-    """A connection to the node that has what is watched; each WATCH may find it elsewhere."""
-
     def __init__(self, cluster: Any) -> None:
         self._cluster = cluster
         self._node: Transport | None = None
@@ -277,15 +270,8 @@ class HeldAcross:
         return self._held
 
     async def leave(self, error: BaseException | None = None) -> None:
-        """Give the connection back; after an error it is closed."""
         lent, self._lent, self._held = self._lent, None, None
-        if lent is None:
-            return
-        try:
-            await lent.__aexit__(type(error) if error else None, error, None)
-        except BaseException as again:
-            if again is not error:
-                raise
+        await give_back(lent, error)
 
 
 async def asked_of(to: Held, commands: Sequence[Command], asking: bool, bulk: bool) -> list[Reply]:

@@ -210,9 +210,7 @@ def _check_role(connection: Any) -> None:
 
 
 class SentinelTransport(CompositeTransport):
-    """Connections to the primary of the moment."""
-
-    sharded = False
+    _options: SentinelOptions
 
     def __init__(self, options: SentinelOptions, new_transport: NewTransport) -> None:
         self._options = options
@@ -225,7 +223,6 @@ class SentinelTransport(CompositeTransport):
         return self.checked(await self._root.roundtrip(commands, bulk=bulk))
 
     def _look_out(self) -> None:
-        """See to it that a change of the primary is noticed."""
         if self._lookout is None or self._lookout.pid != os.getpid():
             self._lookout = _Lookout(self._options, self)
             self._options.changed = self._lookout.tell
@@ -274,12 +271,6 @@ class SentinelTransport(CompositeTransport):
         async with self._root.hold() as held:
             yield _CheckedConnection(self, held)
 
-    async def owner(self, key: bytes, *, refresh: bool = False) -> Transport:
-        return self
-
-    async def nodes(self) -> Sequence[Transport]:
-        return (self,)
-
     async def close(self) -> None:
         if self._lookout is not None:
             self._lookout.stop()
@@ -317,8 +308,6 @@ class _Lookout:
 
 
 class _CheckedConnection:
-    """A lent connection whose replies are checked, too."""
-
     def __init__(self, transport: SentinelTransport, held: Any) -> None:
         self._transport = transport
         self._held = held

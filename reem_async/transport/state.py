@@ -109,7 +109,6 @@ class States:
         _all.add(self)
 
     def changes(self) -> StateChanges:
-        """Return an iterator over the state and its changes; it keeps the last 100 that wait."""
         changes = StateChanges(Last(_KEPT))
         with self._lock:
             changes.queue.put(self.last)
@@ -149,14 +148,12 @@ class States:
         return is_lost
 
     def answered(self) -> None:
-        """Note that the server answers over another connection than the one that was lost."""
         with self._lock:
             if self.last.state == "lost":
                 self._change("connected", "")
         self.tell()
 
     def retrying(self) -> None:
-        """Note that a connection is made again."""
         with self._lock:
             if self.last.state in ("connected", "lost"):
                 self._change("reconnecting", self.last.reason)

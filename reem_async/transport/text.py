@@ -32,7 +32,6 @@ _MODULES = (b"ReJSON", "ReJSON", b"json", "json")  # what HELLO calls the module
 
 
 def lists_json(greeting: Any) -> bool:
-    """Return whether a reply to HELLO lists a JSON module."""
     if not isinstance(greeting, dict):
         return False
     modules = greeting.get(b"modules") or greeting.get("modules") or ()
@@ -40,7 +39,6 @@ def lists_json(greeting: Any) -> bool:
 
 
 def is_plain(reply: Reply) -> bool:
-    """Return whether a reply to `PROBE` says that the server has no JSON."""
     return isinstance(reply, NoJsonSupport)
 
 
@@ -48,8 +46,6 @@ Send = Callable[..., Awaitable[list[Reply]]]  # sends commands that any server t
 
 
 class Text:
-    """The documents of one server without JSON, as one transport meets them."""
-
     def __init__(self, timeout: float) -> None:
         self.timeout = timeout
         self.known = Known()
@@ -114,8 +110,6 @@ class Text:
 
 
 class HeldText:
-    """A connection of one caller's own, to a server without JSON."""
-
     def __init__(self, held: Held, text: Text) -> None:
         self._held = held
         self._known = text.known
@@ -142,8 +136,6 @@ class HeldText:
 
 
 class _Lost(NamedTuple):
-    """A call that lost the server."""
-
     time: float
     took: float  # for how many seconds it had tried
     error: str  # what it raised, in words: the error itself would keep what its caller had
@@ -165,7 +157,6 @@ class _Attempt:
             self._commands, self._coming = stage(self.given, tag, secrets.token_hex(5))
 
     async def made(self, held: Held, bulk: bool) -> list[Reply] | None:
-        """Try once; return None if another client was first."""
         if not isinstance(held, HeldText):  # the server was replaced meanwhile by one that has JSON
             return await held.roundtrip(self.given, bulk=bulk)
         # Sent again well before the server forgets it.
@@ -178,7 +169,6 @@ class _Attempt:
         return None if replies is None else as_given(self._commands, self._coming, replies)
 
     async def _upload(self, held: HeldText) -> list[Reply] | None:
-        """Send what is large; return the replies if the server refuses that."""
         replies = await held.roundtrip([each.upload for each in self._coming])
         reason = next((reply for reply in replies if isinstance(reply, Exception)), None)
         return None if reason is None else [reason] * (len(self._commands) - len(self._coming))

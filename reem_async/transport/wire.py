@@ -42,8 +42,6 @@ event loop, since both share one epoll."""
 
 @dataclass(slots=True, eq=False)
 class _Due:
-    """The replies one caller waits for."""
-
     count: int
     done: Callable[[list[Reply] | Exception], None]  # takes them, or an error
     limit: float  # seconds without a byte moving after which the call fails, and
@@ -55,8 +53,6 @@ class _Due:
 
 
 class Wire(asyncio.BufferedProtocol):
-    """The protocol over a connection that has shaken hands."""
-
     def __init__(self, timeout: float, reader: ReplyReader) -> None:
         self.on_push: Callable[[list[Any]], None] | None = None  # called with each message the server sends unasked
         # Called once when the connection is gone, with the reason.
@@ -127,7 +123,6 @@ class Wire(asyncio.BufferedProtocol):
 
     @property
     def idle(self) -> float:
-        """Seconds since a byte was received."""
         return self._loop.time() - self._last_byte
 
     @property
@@ -223,13 +218,11 @@ class Wire(asyncio.BufferedProtocol):
         return arrived
 
     def abort(self, reason: Exception) -> None:
-        """Break the connection; waiting calls get `reason`."""
         self._fail(reason)
         if self._transport is not None:
             self._transport.abort()
 
     def abort_soon(self, reason: Exception) -> None:
-        """Break the connection, from another thread."""
         with contextlib.suppress(RuntimeError):  # the event loop has ended, and the connection with it
             self._loop.call_soon_threadsafe(self.abort, reason)
 
@@ -248,7 +241,6 @@ class Wire(asyncio.BufferedProtocol):
         return self._gone
 
     def cut_off(self) -> None:
-        """Do not wait any longer for what was to be sent before the connection is closed."""
         if self._transport is not None and not self._gone.done():
             self._transport.abort()
 
@@ -318,7 +310,6 @@ class Wire(asyncio.BufferedProtocol):
         self._watch_until(self._loop.time() + limit / LOOKS)
 
     def _watch_until(self, moment: float) -> None:
-        """Look at the time at `moment`, unless it will be looked at before."""
         if self._watch is not None:
             if self._watch.when() <= moment:
                 return
