@@ -50,8 +50,7 @@ _HOMES = {
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],
     ".ships": ["BlobShip", "BytesShip", "NumpyShip", "SpecialDatatypeShip"],
     ".store.accessor": ["Reader", "Writer"],
-    ".store.space": ["PublishSpace", "Publisher"],
-    ".store.store": ["KeyValueStore"],
+    ".store.store": ["KeyValueStore", "PublishSpace", "Publisher"],
     ".transport.state": ["StateChange"],
 }
 """Where the names are that are no errors. Imported when first used: `reem --help` starts sooner."""

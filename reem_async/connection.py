@@ -8,7 +8,7 @@ from typing import Any, Literal, Self
 
 from .coordination.presence import NodeInfo, NodeWatch, Presence, in_order, listed
 from .errors import SELF_EXPLANATORY
-from .local.path import MEMORY, LocalPath
+from .local import MEMORY, LocalPath
 from .session import Session
 from .ships.base import SpecialDatatypeShip
 from .transport import NewTransport

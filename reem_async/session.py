@@ -17,7 +17,7 @@ from .concurrency.locks import WeakList
 from .concurrency.tasks import Tasks
 from .concurrency.timeouts import LONGEST
 from .errors import BadKey, ClusterReply, NotAllowed, Refused, is_of_command, turned_down
-from .local.path import LocalPath
+from .local import LocalPath
 from .plan import Plan, Reply
 from .plan.arguments import check_number
 from .plan.keys import DOCUMENT, Keys, keys_of

@@ -102,7 +102,7 @@ def server_url(request):
         yield request.getfixturevalue("cluster").url
         return
     from reem_async.errors import ServerMissing
-    from reem_async.server.embedded import EmbeddedServer
+    from reem_async.server import EmbeddedServer
 
     with contextlib.ExitStack() as stack:
         try:
@@ -115,7 +115,7 @@ def server_url(request):
 @pytest.fixture
 def server():
     """A server of the test's own, to be stopped and killed."""
-    from reem_async.server.embedded import EmbeddedServer
+    from reem_async.server import EmbeddedServer
 
     with EmbeddedServer() as own:
         yield own
@@ -284,7 +284,7 @@ def url_of_user(url, name, password):
 async def server_without_right(right):
     """A server of its own: a store there, and the address of a user who lacks one right."""
     import reem_async
-    from reem_async.server.embedded import EmbeddedServer
+    from reem_async.server import EmbeddedServer
 
     async with EmbeddedServer() as server, reem_async.RedisInterface(server) as interface:
         with redis.Redis.from_url(server.url) as client:

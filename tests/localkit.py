@@ -12,7 +12,7 @@ import numpy as np
 from slotkit import in_slot
 
 import reem
-from reem_async.local import path, segment  # users without rights cannot import them later
+from reem_async.local import LocalPath, Slot, segment  # users without rights cannot import them later
 from reem_async.store import publish
 
 PATIENCE = 30.0
@@ -197,7 +197,7 @@ def another_user(url, key, user):
         until(lambda: mirror.value() is not None and mirror.value()["n"] == 1)
         say(in_slot(mirror.value()["image"]), is_whole(mirror.value()))
         process, descriptor, inode, number, stamp = map(int, sys.stdin.readline().split())
-        slot = path.Slot(segment.host(), process, descriptor, inode, number, stamp)
+        slot = Slot(segment.host(), process, descriptor, inode, number, stamp)
         say(interface._followers.session.local.reader.view(slot, 1))
         try:
             os.close(os.open(f"/proc/{process}/fd/{descriptor}", os.O_RDONLY))
@@ -242,14 +242,14 @@ class Numpy:
 
 
 STEPS = {
-    "before it is put into a slot": lambda: killing(path.LocalPath, "put", before=True),
+    "before it is put into a slot": lambda: killing(LocalPath, "put", before=True),
     "before there is memory": lambda: killing(segment.os, "memfd_create", before=True),
     "memory without seals": lambda: killing(segment.os, "posix_fallocate"),
     "memory with seals and nothing in it": lambda: killing(segment.fcntl, "fcntl"),
     "a slot is locked": lambda: killing(segment, "lock_for_writing"),
     "in the middle of writing": lambda: setattr(segment, "np", Numpy()),
     "written and locked": lambda: killing(segment.Segment, "_write"),
-    "in the slot": lambda: killing(path.LocalPath, "put"),
+    "in the slot": lambda: killing(LocalPath, "put"),
     "told early, not stored": lambda: killing(publish.ValueAnnouncement, "_notify_early"),
     "not stored": lambda: killing(publish.ValueAnnouncement, "share"),
     "stored": lambda: None,

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from reem_async.local.path import LocalPath
+from reem_async.local import LocalPath
 from reem_async.local.segment import SLOTS, reason_against
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import Slot

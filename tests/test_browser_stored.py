@@ -17,7 +17,7 @@ from reem_async.plan.placeholders import Unreadable
 from reem_async.plan.trees import MISSING
 from reem_async.pubsub import refresh
 from reem_async.pubsub.monitor import Monitor
-from reem_async.server.embedded import EmbeddedServer
+from reem_async.server import EmbeddedServer
 from reem_async.tools.browser import LiveSource
 from reem_async.tools.browser import follower as follower_module
 from reem_async.tools.browser.follower import Follower

@@ -11,9 +11,8 @@ import pytest
 from test_layers import ROOT, roots
 
 from reem_async.errors import Conflict, NotConnected
-from reem_async.plan.copies import concerns, is_own, rest_of
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
-from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced
+from reem_async.plan.trees import MISSING, CannotApply, concerns, get, is_own, removed, replaced, rest_of
 from reem_async.pubsub.division import Division, Heard, Numbers, divided_read
 from reem_async.tools.recording.key_queue import Item, KeyQueue, settled
 from reem_async.tools.recording.stored import New, Unchanged, applied

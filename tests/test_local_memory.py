@@ -13,9 +13,9 @@ import orjson
 import pytest
 from slotkit import at_step
 
-from reem_async.local import path as local_path
+import reem_async.local as local_path
+from reem_async.local import LocalPath
 from reem_async.local import segment as local_segment
-from reem_async.local.path import LocalPath
 from reem_async.local.segment import (
     HEAD,
     IDENTITY,

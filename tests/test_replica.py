@@ -15,7 +15,6 @@ from test_layers import ROOT, roots
 
 from reem_async.errors import BadData, NotConnected
 from reem_async.plan import wire_commands
-from reem_async.plan.copies import concerns
 from reem_async.plan.keys import keys_of
 from reem_async.plan.notices import ANNOUNCED, Notice, note_of
 from reem_async.plan.paths import suffix, to_jsonpath
@@ -23,7 +22,7 @@ from reem_async.plan.placeholders import Placeholder
 from reem_async.plan.reads import interpreted
 from reem_async.plan.shapes import ShapeCache
 from reem_async.plan.sizes import LARGE
-from reem_async.plan.trees import MISSING, CannotApply, get, removed, replaced, same
+from reem_async.plan.trees import MISSING, CannotApply, concerns, get, removed, replaced, same
 from reem_async.pubsub.replica import (
     Arm,
     Failed,

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 import pytest
 from test_replica import PATHS, PUBLISHERS, Faults, Made, World, has_bytes, value_at
 
-from reem_async.plan.copies import concerns
 from reem_async.plan.notices import ANNOUNCED, Notice, Slot, note_of
-from reem_async.plan.trees import MISSING
+from reem_async.plan.trees import MISSING, concerns
 from reem_async.pubsub.replica import Read, Skipped, Snapshot, State, Stored, Updated
 
 SEEDS = int(os.environ.get("REEM_TEST_SCHEDULES", "60"))

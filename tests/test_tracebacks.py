@@ -11,7 +11,7 @@ from conftest import ROOT
 import reem
 import reem_async
 from reem_async.errors import ConnectionLost, MissingKey, NotConnected, PathRefused
-from reem_async.server.embedded import EmbeddedServer
+from reem_async.server import EmbeddedServer
 
 
 def shown(error):

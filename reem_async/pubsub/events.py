@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from enum import Enum, StrEnum, auto
 from typing import Any, NamedTuple
 
-from ..plan.copies import applied, concerns, is_own, is_whole
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path
-from ..plan.trees import MISSING, CannotApply, difference, get, replaced
+from ..plan.trees import MISSING, CannotApply, applied, concerns, difference, get, is_own, is_whole, replaced
 from .division import Heard
 from .feed import Step
 
@@ -192,7 +191,7 @@ class EventMaker:
     def _updates(self, before: Any, covered: Sequence[Heard[Notice]], tree: Any) -> None:
         """Tell of the updates that a snapshot has; those whose own value later ones in it have changed are skipped.
 
-        `plan/copies.py` says which. What came with its value has that, whatever came later. What was lost may
+        `plan/trees.py` says which. What came with its value has that, whatever came later. What was lost may
         have changed any of those announced before. Each is reported with the copy that it led to while that is known,
         and then with the snapshot: no copy is reported after a newer one.
         """

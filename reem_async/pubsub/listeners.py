@@ -17,7 +17,7 @@ from typing import Any, Concatenate, NamedTuple, ParamSpec
 from ..concurrency.locks import WeakList
 from ..concurrency.queues import BoundedQueue
 from ..errors import BadData, ServerNotReady, is_of_command
-from ..local.path import LocalPath
+from ..local import LocalPath
 from ..plan import Reply, blamed
 from ..plan.notices import ANNOUNCED, Notice, decode
 from ..plan.paths import names_key, shorten

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ..concurrency.queues import noop
 from ..concurrency.tasks import Tasks
 from ..errors import ClusterNode, InterfaceClosed, NotConnected, RedisError, ReemError
-from ..local.path import LocalPath
+from ..local import LocalPath
 from ..plan import Command, Reply
 from ..plan.placeholders import Unreadable
 from ..session import Session

@@ -48,14 +48,13 @@ from typing import Any
 
 from ..errors import BadData, NotAllowed, RedisError, ReemError, WrongKind
 from ..plan import Reply
-from ..plan.copies import applied, concerns, is_whole
 from ..plan.keys import Keys
 from ..plan.notices import ANNOUNCED, Notice
 from ..plan.paths import Path, show
 from ..plan.placeholders import Unreadable
 from ..plan.reads import look_first, read
 from ..plan.shapes import ShapeCache
-from ..plan.trees import MISSING, CannotApply, get
+from ..plan.trees import MISSING, CannotApply, applied, concerns, get, is_whole
 from ..ships.registry import Ships
 from .division import Heard, Phase
 from .events import EventMaker, Failed, Look, Output, Ready, Report, Skipped, Snapshot, Stored, Updated

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, Self
 
 from ..errors import ConnectionLost, Contended, LeaseLost, NotConnected
-from ..local.path import LEAST
+from ..local import LEAST
 from ..plan import Command
 from ..plan.changes import Announcement
 from ..plan.keys import Keys

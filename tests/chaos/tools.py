@@ -17,7 +17,7 @@ import numpy as np
 from slotkit import shared_in
 
 import reem_async
-from reem_async.local.path import LEAST
+from reem_async.local import LEAST
 
 from .scoreboard import ROOT
 

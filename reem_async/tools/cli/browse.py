@@ -19,7 +19,7 @@ import typer
 
 from reem_async.connection import RedisInterface
 from reem_async.errors import ServerFailed
-from reem_async.server.embedded import EmbeddedServer
+from reem_async.server import EmbeddedServer
 from reem_async.tools.cli.checks import is_loopback
 from reem_async.tools.cli.options import DEFAULT_URL, Namespace, Ships, Url, existing, named_ships
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled

@@ -15,8 +15,8 @@ from typing import Annotated, NoReturn
 import typer
 
 from reem_async.errors import LoginRefused, RedisError, ReemError, ServerFailed, ServerMissing
+from reem_async.server import EmbeddedServer
 from reem_async.server.cluster import EmbeddedCluster
-from reem_async.server.embedded import EmbeddedServer
 from reem_async.tools.cli.options import existing
 from reem_async.tools.cli.output import clean, emit, facts_lines, styled
 from reem_async.tools.cli.running import INTERRUPTED, PASSWORD_VARIABLE, for_users, interface_to

@@ -1,7 +1,7 @@
 """The news of one top-level key, in the order in which it is written, while some of it has to be read. Without I/O.
 
 `pubsub/division.py` says which updates are in what was read. Each announced update up to that line then has its value
-or is skipped, as `plan/copies.py` draws it. Nothing is moved before what came before it.
+or is skipped, as `plan/trees.py` draws it. Nothing is moved before what came before it.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
-from ...plan.copies import is_own, rest_of
 from ...plan.notices import ANNOUNCED
 from ...plan.paths import Path, below, has_index
-from ...plan.trees import MISSING, get
+from ...plan.trees import MISSING, get, is_own, rest_of
 from ...pubsub.division import Division, GapDetector, Heard, Numbered, Phase
 from .format import Role
 from .stored import carried
