@@ -11,7 +11,7 @@ from reem_async.tools.recording import open_log
 from reem_async.tools.recording.format import Role
 from reem_async.tools.recording.sink import Sink
 from reem_async.tools.recording.writer_thread import Operation, WriterThread
-from reem_async.transport.packing import CommandRecorder
+from reem_async.transport.protocol import CommandRecorder
 
 BEGUN = 1_764_000_000
 """Seconds since 1970 at which the recordings of these tests begin."""

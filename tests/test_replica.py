@@ -588,7 +588,7 @@ def test_an_array_is_not_taken_for_the_old_one_while_the_word_of_its_change_is_s
 
 def test_the_replica_does_no_input_or_output():
     """It knows no loop, socket or client, and what it imports of REEM are values."""
-    for name in ("replica", "gaps"):
+    for name in ("replica", "division"):
         path = ROOT / "reem_async/pubsub" / f"{name}.py"
         assert roots(path) <= set(sys.stdlib_module_names) | {"reem_async"}
         assert not roots(path) & {"asyncio", "socket", "time", "threading"}

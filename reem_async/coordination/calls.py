@@ -28,7 +28,6 @@ from ..errors import (
     RedisError,
     ReemError,
     RemoteError,
-    ServiceError,
     ServiceLost,
 )
 from ..plan import Command, Plan, Reply, raise_refused
@@ -408,7 +407,14 @@ class Caller(Listener):
             instance = directory.best(refused)
             if instance is None:
                 if is_complete:
-                    raise _refusal(call.where, [*refused.values()].count(messages.BUSY))
+                    if busy := [*refused.values()].count(messages.BUSY):
+                        raise Busy(
+                            f"{call.where}: each of {busy} servers has as many requests waiting as its `queue` allows; "
+                            "call again later, or start more servers"
+                        )
+                    raise NoService(
+                        f"{call.where}: no program serves this; start one that calls .serve(function) at this place"
+                    )
                 await directory.look(self._session)
                 is_complete = True
                 continue
@@ -518,12 +524,3 @@ class Caller(Listener):
             return said
         finally:
             del self._asked[ping.call]
-
-
-def _refusal(where: str, busy: int) -> ServiceError:
-    if busy:
-        return Busy(
-            f"{where}: each of {busy} servers has as many requests waiting as its `queue` allows; "
-            "call again later, or start more servers"
-        )
-    return NoService(f"{where}: no program serves this; start one that calls .serve(function) at this place")

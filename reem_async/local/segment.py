@@ -37,7 +37,7 @@ import numpy as np
 from ..concurrency.locks import Descriptor
 from ..plan.notices import Slot, starts
 
-SLOTS = 6  # one that is written, three for a subscriber (see `reader.py`), two for others that are not as far
+SLOTS = 6  # one that is written, three for a subscriber (see `_PINS`), two for others that are not as far
 NAME = "reem"  # of the file, for a look at the descriptors of a process
 HEAD = 4096  # bytes before the first slot: a page
 

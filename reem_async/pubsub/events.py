@@ -180,11 +180,10 @@ class EventMaker:
             if data is not MISSING:
                 self._outputs.append(Snapshot(data, True, 0))
         elif report is Report.GAP or self.missed != 0:
-            missed, self.missed = self.missed, 0
-            self._outputs.append(Snapshot(data, False, missed))
+            self.lose(data)
 
     def lose(self, tree: Any) -> None:
-        """Report that what is there cannot be read; `tree` takes its place."""
+        """Report what is there after a loss, or that it cannot be read: then `tree` takes its place."""
         missed, self.missed = self.missed, 0
         self._outputs.append(Snapshot(tree, False, missed))
 

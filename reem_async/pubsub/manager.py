@@ -129,20 +129,17 @@ class SubscriptionManager:
         """Subscribe to many channels ahead of following them, which tries again what cannot be subscribed now."""
         self.transport.check()
         await self._ships.ready()
+        nodes: dict[Transport, list[Listener]] = {}
         with contextlib.suppress(RedisError):
             async with self._lock:
-                await self._subscribe_all(listeners)
-
-    async def _subscribe_all(self, listeners: Sequence[Listener]) -> None:
-        nodes: dict[Transport, list[Listener]] = {}
-        for listener in listeners:
-            if listener.topic not in self._subscribed:
-                nodes.setdefault(await self.transport.owner(listener.topic.name), []).append(listener)
-        with self._beginning(listeners):
-            for node, there in nodes.items():
-                for listener in there:
-                    self._enter(listener)
-                await self._subscribe_at(node, [listener.topic for listener in there])
+                for listener in listeners:
+                    if listener.topic not in self._subscribed:
+                        nodes.setdefault(await self.transport.owner(listener.topic.name), []).append(listener)
+                with self._beginning(listeners):
+                    for node, there in nodes.items():
+                        for listener in there:
+                            self._enter(listener)
+                        await self._subscribe_at(node, [listener.topic for listener in there])
 
     @contextlib.contextmanager
     def _beginning(self, listeners: Sequence[Listener]) -> Iterator[None]:

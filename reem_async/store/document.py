@@ -12,8 +12,6 @@ import numpy as np
 from ..errors import (
     SELF_EXPLANATORY,
     BadKey,
-    BadType,
-    BadValue,
     Conflict,
     ConnectionLost,
     Contended,
@@ -26,10 +24,11 @@ from ..errors import (
     WrongType,
 )
 from ..plan import Plan
+from ..plan.arguments import check_number
 from ..plan.arithmetic import Operation, calculate, compute
 from ..plan.changes import SILENT, Announcement, DocumentChange, EncodedAttachment
 from ..plan.documents import number_text
-from ..plan.paths import Path, check_name, has_index, shorten, show, suffix
+from ..plan.paths import Path, check_name, has_index, show, suffix
 from ..plan.reads import (
     RawRead,
     awaited,
@@ -188,14 +187,6 @@ _TRIES = 50  # of a call that reads and then writes
 _LONGEST_EXPIRY = 1e10
 
 
-def _milliseconds(seconds: float, name: str) -> int:
-    if isinstance(seconds, bool) or not isinstance(seconds, int | float | np.integer | np.floating):
-        raise BadType(f"{name}: expire() takes seconds, got {shorten(seconds)}")
-    if not 0 < seconds <= _LONGEST_EXPIRY:
-        raise BadValue(f"{name}: seconds must be positive and at most {_LONGEST_EXPIRY:g}, got {seconds!r}")
-    return max(round(seconds * 1000), 1)
-
-
 def _may_have_left(error: BaseException) -> bool:
     """Return whether a change that raised `error` may have left arrays that the document does not refer to."""
     if isinstance(error, PartialWrite):  # the server could not be reached to remove them
@@ -334,7 +325,12 @@ class DocumentWriter:
                 f"{show((self.name, *path))}: only a whole top-level key can expire; use kvs[{self.name!r}], or store "
                 "this part under a top-level key of its own"
             )
-        await self._demand(self._expire, None if seconds is None else _milliseconds(seconds, self.name))
+        if seconds is None:
+            await self._demand(self._expire, None)
+            return
+        cure = f"use a number above 0, up to {_LONGEST_EXPIRY:g}"
+        check_number(f"{self.name}: seconds", seconds, cure, above=0, most=_LONGEST_EXPIRY)
+        await self._demand(self._expire, max(round(seconds * 1000), 1))
 
     async def take(self, path: Path, before: RawRead) -> None:
         await self._demand(self._take, path, before)

@@ -15,6 +15,8 @@ from ..concurrency.queues import BoundedQueue, Last, noop
 from ..concurrency.streams import Stream
 from ..errors import InterfaceClosed, NotConnected, ServerNotReady
 
+logger = logging.getLogger("reem.connection")
+
 _PAUSE = 0.1  # seconds between two attempts
 
 
@@ -46,8 +48,6 @@ class StartupWait:
         await transport.pause(min(_PAUSE, self._deadline - now))
         return True
 
-
-logger = logging.getLogger("reem.connection")
 
 State = Literal["idle", "connected", "lost", "reconnecting", "closed"]
 """idle: nothing was connected yet. lost: a connection broke and none is left that answers; the next call makes a
