@@ -22,7 +22,7 @@ from .accessor import Accessor, Publisher, Reader, Writer
 from .connection import RedisInterface
 from .coordination import Parameter
 from .errors import *
-from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+from .ships import BlobShip, BytesShip, Jpeg, JpegShip, NumpyShip, Png, PngShip, SpecialDatatypeShip
 from .store import KeyValueStore, PublishSpace
 from .subscribe import CallbackSubscriber, SilentSubscriber
 
@@ -57,12 +57,12 @@ def __getattr__(name: str) -> Any:
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
     "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
-    "InterfaceClosed", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument", "MissingKey",
-    "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
+    "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument",
+    "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
     "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
-    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
-    "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
-    "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange",
-    "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
-    "timeout",
+    "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
+    "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
+    "ServerReadOnly", "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
+    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "WrongType", "timeout",
 ]  # fmt: skip

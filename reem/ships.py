@@ -1,5 +1,5 @@
 """Ships carry what is not JSON; the same objects serve both fronts."""
 
-from reem_async.ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+from reem_async.ships import BlobShip, BytesShip, Jpeg, JpegShip, NumpyShip, Png, PngShip, SpecialDatatypeShip
 
-__all__ = ["BlobShip", "BytesShip", "NumpyShip", "SpecialDatatypeShip"]
+__all__ = ["BlobShip", "BytesShip", "Jpeg", "JpegShip", "NumpyShip", "Png", "PngShip", "SpecialDatatypeShip"]

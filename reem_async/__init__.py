@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .plan.placeholders import Unreadable
     from .pubsub.events import Origin, Update
     from .pubsub.subscribers import CallbackSubscriber, SilentSubscriber
-    from .ships import BlobShip, BytesShip, NumpyShip, SpecialDatatypeShip
+    from .ships import BlobShip, BytesShip, Jpeg, JpegShip, NumpyShip, Png, PngShip, SpecialDatatypeShip
     from .store.accessor import Reader, Writer
     from .store.store import KeyValueStore, Publisher, PublishSpace
     from .transport.state import StateChange
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 __all__ = [
     "BadData", "BadInput", "BadKey", "BadType", "BadValue", "BlobShip", "Busy", "BytesShip", "CallTimeout",
     "CallbackSubscriber", "ClusterNode", "Conflict", "ConnectionLost", "Contended", "Every", "InsecureConnection",
-    "InterfaceClosed", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument", "MissingKey",
-    "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
+    "InterfaceClosed", "Jpeg", "JpegShip", "KeyValueStore", "Last", "LeaseLost", "LoginRefused", "MissingDocument",
+    "MissingKey", "MissingTop", "Misuse", "Newest", "NoJsonSupport", "NoService", "NodeEvent", "NodeInfo", "NotAllowed",
     "NotConnected", "NotFinite", "NumpyShip", "Origin", "Overflow", "Owned", "Parameter", "PartialWrite",
-    "PathRefused", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface", "ReemError",
-    "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady", "ServerReadOnly",
-    "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale", "StateChange",
-    "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop", "WrongType",
-    "timeout",
+    "PathRefused", "Png", "PngShip", "PublishSpace", "Publisher", "QueueFull", "ReadOnly", "Reader", "RedisInterface",
+    "ReemError", "Refused", "RemoteError", "ServerFailed", "ServerFull", "ServerMissing", "ServerNotReady",
+    "ServerReadOnly", "ServiceError", "ServiceLost", "Silent", "SilentSubscriber", "SpecialDatatypeShip", "Stale",
+    "StateChange", "TlsRefused", "TooDeep", "Unreadable", "Update", "WriteOnly", "Writer", "WrongKind", "WrongLoop",
+    "WrongType", "timeout",
 ]  # fmt: skip
 
 _HOMES = {
@@ -48,7 +48,7 @@ _HOMES = {
     ".plan.placeholders": ["Unreadable"],
     ".pubsub.events": ["Origin", "Update"],
     ".pubsub.subscribers": ["CallbackSubscriber", "SilentSubscriber"],
-    ".ships": ["BlobShip", "BytesShip", "NumpyShip", "SpecialDatatypeShip"],
+    ".ships": ["BlobShip", "BytesShip", "Jpeg", "JpegShip", "NumpyShip", "Png", "PngShip", "SpecialDatatypeShip"],
     ".store.accessor": ["Reader", "Writer"],
     ".store.store": ["KeyValueStore", "PublishSpace", "Publisher"],
     ".transport.state": ["StateChange"],

@@ -35,7 +35,7 @@ class RedisInterface:
             `redis+cluster://user:password@host:7000,host:7001` for some nodes of a cluster, or an `EmbeddedCluster`;
             `redis+sentinel://host:26379,host:26380/mymaster`. With TLS they begin with `rediss+`.
         ships: What carries values that are not JSON, first fit first; replaces the default list of
-            `NumpyShip` and `BytesShip`. A number in its place is the port.
+            `NumpyShip`, `BytesShip`, `JpegShip` and `PngShip`. A number in its place is the port.
         namespace: Goes before every key and channel, so that several robots can share a server. It ends with a
             separator, any character but a letter or digit: "robot1:", "robots/r1:".
         timeout: Seconds without a byte moving after which a call times out; `reem_async.timeout` sets

@@ -160,9 +160,27 @@ class Session(PublisherIdentity):
         # The `Outage`s of its publishers: `finish` is called before this is closed, `close` then.
         self.closing: weakref.WeakSet[Any] = weakref.WeakSet()
         self.closed = False  # whether it is closed, or about to be
+        self._raw: Session | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return attrgetter("session"), (self.interface,)
+
+    @property
+    def raw(self) -> Session:
+        """The same session for what passes pictures on as they are: its ships do not decode them.
+
+        What follows updates through it has a connection of its own.
+        """
+        if self.ships.raw is self.ships:
+            return self
+        if self._raw is None:
+            self._raw = object.__new__(Session)
+            self._raw.__dict__.update(self.__dict__, ships=self.ships.raw, subscriptions=None)
+        return self._raw
+
+    def _managers(self) -> list[Any]:
+        managers = [self.subscriptions, self._raw and self._raw.subscriptions]
+        return [each for each in managers if each is not None]
 
     def share_with(self, other: Session) -> None:
         """Have both be one interface for its user: one state, and one list of what the program does."""
@@ -208,13 +226,15 @@ class Session(PublisherIdentity):
 
     async def release(self) -> None:
         """End all subscriptions and close all connections of this event loop; another one may go on."""
-        subscriptions, self.subscriptions = self.subscriptions, None
+        managers, self.subscriptions = self._managers(), None
+        if self._raw is not None:
+            self._raw.subscriptions = None
         # The steps run from the last to the first, each even if another one is cancelled.
         async with contextlib.AsyncExitStack() as steps:
             steps.push_async_callback(self.transport.release)
             steps.push_async_callback(self.tasks.end)
-            if subscriptions is not None:
-                steps.push_async_callback(subscriptions.close)
+            for each in managers:
+                steps.push_async_callback(each.close)
             steps.push_async_callback(self.finish)
 
     async def finish(self, *, is_exit: bool = False) -> None:
@@ -231,8 +251,8 @@ class Session(PublisherIdentity):
                 steps.callback(each.close)
             # Before the background tasks: their calls end with InterfaceClosed, and `closing` counts kept updates.
             steps.push_async_callback(self.transport.close)
-            if self.subscriptions is not None:
-                steps.push_async_callback(self.subscriptions.close)
+            for each in self._managers():
+                steps.push_async_callback(each.close)
             steps.push_async_callback(self.finish)
 
 

@@ -30,7 +30,7 @@ async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, bi
     name = key("cam")
 
     def paces():
-        return {wire.pace for wire in manager_of(binterface.session)._wires.values()}
+        return {wire.pace for wire in manager_of(binterface.session.raw)._wires.values()}
 
     async with Recorder(binterface, [key("*")], file) as recorder:
         for number in range(3):

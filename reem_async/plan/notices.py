@@ -304,7 +304,12 @@ def _rebuilt(text: bytes, parts: list[Any], blobs: list[Any], ships: Ships, deep
         ship = ships.labelled(label, "an update").blob
         if ship is None:
             return ANNOUNCED
-        replies[label, suffix] = ship.unpack(blob)
+        try:
+            replies[label, suffix] = ship.unpack(blob)
+        except BadData as error:
+            if not ship.tolerated:
+                raise
+            replies[label, suffix] = Unreadable(suffix.partition("~")[0], str(error))
     return assembled(text, replies, deepest)
 
 

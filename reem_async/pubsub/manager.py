@@ -64,7 +64,6 @@ class SubscriptionManager:
         self.tasks = Tasks()  # all that runs in the background for what is followed; ended by `close`
         self._reconnecting: asyncio.Task[Any] | None = None
         self._key_watcher = KeyWatcher(self)
-        self._reported: set[str] = set()
         self._pace = 0.0
         self._closed = False
         self._inbox = Inbox(transport, ships, self._topics, local, self._moved, self._forget_if_empty)
@@ -104,10 +103,11 @@ class SubscriptionManager:
         self._inbox.watchers.discard(watcher)
 
     def report(self, unreadable: Iterable[Unreadable] | None) -> None:
+        states = self.transport.states
         for it in unreadable or ():
-            if it.place not in self._reported and len(self._reported) < _MOST_REPORTED:
-                self._reported.add(it.place)
-                self.transport.states.unreadable += 1
+            if it.place not in states.reported and len(states.reported) < _MOST_REPORTED:
+                states.reported.add(it.place)
+                states.unreadable += 1
                 logger.warning("%s cannot be read, the values beside it can: %s (reported once)", it.place, it.reason)
 
     @property

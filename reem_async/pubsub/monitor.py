@@ -162,6 +162,7 @@ class Monitor(PatternStream[Event]):
             `event.namespace` says which it was: the shortest that fits.
         patience: Seconds that updates may wait here for each other while many come, unless another subscriber of this
             interface waits for its updates. That costs publishers less.
+        raw: Pictures are not decoded: `Jpeg` and `Png` in place of arrays.
 
     Attributes:
         invalidated: Called with a top-level key of which a message could not be read.
@@ -184,10 +185,12 @@ class Monitor(PatternStream[Event]):
         *,
         namespaces: str | None = None,
         patience: float = 0.0,
+        raw: bool = False,
     ) -> None:
         if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
             raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
-        super().__init__(interface.session, parse_patterns(patterns), chosen(policy, Every(10_000)))
+        session = interface.session.raw if raw else interface.session
+        super().__init__(session, parse_patterns(patterns), chosen(policy, Every(10_000)))
         self._namespaces = None if namespaces is None else Pattern(namespaces)
         check_number("patience", patience, "use seconds, 0 or more")
         self.patience = patience

@@ -69,6 +69,9 @@ class BlobShip(SpecialDatatypeShip):
     notice of an update.
     """
 
+    tolerated = False
+    """Whether bytes that `unpack` refuses may be those that were published: the rest of the update is delivered."""
+
     @abstractmethod
     def pack(self, value: Any) -> tuple[Any, ...]:
         """Return the bytes as a few pieces, each bytes or a flat buffer of bytes."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from functools import cached_property
 from typing import Any
 
 from ..errors import BadData, BadType
 from ..plan import Command
 from ..plan.placeholders import INLINE_LABELS
 from .base import BlobShip, BytesShip, SpecialDatatypeShip
+from .images import ImageShip, JpegShip, PngShip
 from .numpy import NumpyShip
 
 # In the place of the key in the command that a ship records; no real key begins with a zero byte.
@@ -25,7 +27,10 @@ _SAMPLES: tuple[Any, ...] = (
 
 
 def default_ships() -> list[SpecialDatatypeShip]:
-    return [NumpyShip(), BytesShip()]
+    return [NumpyShip(), BytesShip(), JpegShip(), PngShip()]
+
+
+_OWN = (NumpyShip, BytesShip, JpegShip, PngShip)
 
 
 def _is_plain_blob(ship: BlobShip) -> bool:
@@ -51,7 +56,7 @@ class Registered:
         self.carries: type | None = getattr(ship, "carries", None)
         self.blob: BlobShip | None = ship if isinstance(ship, BlobShip) and _is_plain_blob(ship) else None
         # Ships of users may compress, or leave the size out.
-        self.describes_exactly = type(ship) in (NumpyShip, BytesShip)
+        self.describes_exactly = type(ship) in _OWN
 
     def describe(self, value: Any) -> tuple[int, str]:
         describe = getattr(self.ship, "describe", None)
@@ -77,6 +82,12 @@ class Ships:
         if not self.asynchronous:
             with suppress(StopIteration):  # which says that it is done: it waits for nothing
                 self.ready().send(None)
+
+    @cached_property
+    def raw(self) -> Ships:
+        """The same ships, but with pictures as `Jpeg` and `Png`, not decoded; itself if it has none for them."""
+        ships = [ship.raw if isinstance(ship, ImageShip) else ship for ship in self.given]
+        return Ships(ships, self.new_recorder) if ships != self.given else self
 
     async def ready(self) -> None:
         """Ask the ships for their labels and read commands; does nothing the second time."""
@@ -147,7 +158,7 @@ async def _claims(ship: SpecialDatatypeShip) -> set[type]:
     """Return the JSON types that the ship names, or takes samples of."""
     found: set[type] = set(getattr(ship, "claims", ()))
     # These take none; asking them would cost each new interface 40 calls.
-    for sample in () if type(ship) in (NumpyShip, BytesShip) else _SAMPLES:
+    for sample in () if type(ship) in _OWN else _SAMPLES:
         with suppress(Exception):  # it may expect other types
             if await _settled(ship.check_fit(sample)):
                 found.add(type(sample))

@@ -88,8 +88,11 @@ class Accessor(Handle):
         """The writer of the top-level key."""
         return Writer(self._reader.name, self._reader.session.interface)
 
-    async def read(self) -> Any:
+    async def read(self, *, raw: bool = False) -> Any:
         """Return the value here. Arrays are read-only: they share memory with the reply.
+
+        Pictures that were written as `Jpeg` or `Png` are decoded to arrays; with `raw` they stay as they are, and their
+        `data` is the file.
 
         None if nothing is stored under the top-level key, as with redis-py's GET; the store's `contains` tells whether
         there is.
@@ -102,7 +105,7 @@ class Accessor(Handle):
             BadData: What is stored here was not written by REEM, or by a ship this interface lacks.
         """
         try:
-            return await self._reader.read(self._path)
+            return await (self._reader.raw if raw else self._reader).read(self._path)
         except MissingDocument:
             return None
         except MissingKey as error:
@@ -364,7 +367,8 @@ class Accessor(Handle):
     def edit(self) -> Edit:
         """Return a context manager that reads the value, lets you change it, and writes it back.
 
-        Nothing is written if the block raises. Two round trips to write.
+        Nothing is written if the block raises. Two round trips to write. Pictures are `Jpeg` and `Png` in it, and
+        written back as they were; `decode()` returns their arrays.
 
         Raises:
             MissingKey: Nothing is here (on entering).
@@ -372,7 +376,7 @@ class Accessor(Handle):
             Conflict: Another client changed it in between, or others kept writing to the same top-level key (on
                 leaving); nothing was written.
         """
-        return Edit(self._reader, self._writer, self._path)
+        return Edit(self._reader.raw, self._writer, self._path)
 
     def watch(self, policy: Policy | None = None, *, stored: bool = True, ttl: float | None = None) -> Watch:
         """Return an async iterator over the value here, first as it is, then each time any client changes it.

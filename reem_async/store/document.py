@@ -66,6 +66,11 @@ class DocumentReader:
         self.keys = session.keys(name)
         self.name = self.keys.name
 
+    @property
+    def raw(self) -> DocumentReader:
+        """A reader that does not decode pictures."""
+        return DocumentReader(self.session.raw, self.name)
+
     async def read(self, path: Path) -> Any:
         raw_read = await self.raw_read(path)
         return await opened(raw_read) if raw_read.slots else raw_read.holder[0]

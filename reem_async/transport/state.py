@@ -99,6 +99,7 @@ class States:
         self.first_opened: float | None = None  # when the first connection was made, on this machine's monotonic clock
         self.on_opened: Callable[[], None] = noop  # called after each new connection
         self.unreadable = 0  # how many messages on followed channels could not be read
+        self.reported: set[str] = set()  # places that cannot be read, of which was warned
         self.last = StateChange("idle", "", time.time())
         self._lock = threading.RLock()
         self._queues: WeakList[BoundedQueue] = WeakList()

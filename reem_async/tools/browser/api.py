@@ -39,6 +39,7 @@ from ...plan.placeholders import Unfetched
 from ...plan.trees import walk
 from ..jsontext import json_text
 from .source import Node, NotKept, Series, Source, address, path_of, thinned, visible
+from .trees import CONTENTS
 
 # Requests: parameters are checked, and errors become answers with the right status.
 
@@ -237,7 +238,7 @@ class Api:
         """Return a value as JSON, for the editor; raises BadType if arrays or bytes are in it."""
         path = value_path_in(request)
         value = (await self._source.value(path, at_of(request))).value
-        if any(isinstance(it, np.ndarray | bytes | Unfetched) for _, it in walk(value, path)):
+        if any(isinstance(it, (Unfetched, *CONTENTS)) for _, it in walk(value, path)):
             raise BadType(f"{show(path)} holds arrays or bytes, which a page cannot write; edit what is below it")
         text = json_text(value, pretty=True).encode(errors="backslashreplace")  # half of a surrogate pair
         return Response(text, media_type="application/json")

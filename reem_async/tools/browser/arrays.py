@@ -16,6 +16,7 @@ from starlette.routing import Route
 from ...errors import BadType, BadValue
 from ...plan.paths import show
 from ...plan.placeholders import Unfetched
+from ...ships.images import EncodedImage
 from .api import answered, at_of, integer_of, number_of, reply, told, value_path_in
 from .pictures import LARGEST_SIDE, MAPS, Preview, RenderedPicture, Slice, colours_of, look_at, paint, parse_slice, part
 from .source import NotKept, Sample, Source, finite, shown_text, thinned
@@ -170,6 +171,8 @@ class Arrays:
         value = sample.value
         if isinstance(value, Unfetched):
             raise NotKept(f"the array at {show(path)} is not kept for this instant: there was no room for it")
+        if isinstance(value, EncodedImage):
+            value = await self._do(_SMALL + 1, value.decode)
         if isinstance(value, list) and (value := _numbers(value)) is None:
             raise BadType(f"{show(path)} is a list that holds other things than numbers")
         if not isinstance(value, np.ndarray | Preview):
@@ -261,6 +264,8 @@ class Arrays:
         value = (await self._source.value(path, at_of(request))).value
         if isinstance(value, Unfetched):
             raise NotKept(f"the bytes at {show(path)} are not kept for this instant: there was no room for them")
+        if isinstance(value, EncodedImage):
+            return value.data
         if not isinstance(value, bytes):
             raise BadType(f"{show(path)} is of type {type(value).__name__}, not bytes")
         return value

@@ -269,13 +269,13 @@ class FollowedKey:
 class Follower:
     def __init__(self, interface: RedisInterface, history: History) -> None:
         self._interface = interface
-        self.session = interface.session
+        self.session = interface.session.raw  # pictures are shown as they are
         self.history = history
         # Bytes of long documents that may be kept
         self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
         # Bytes of arrays that may be read: four pictures a second each of two cameras
         self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
-        self.monitor = Monitor(interface, policy=Last(_WAITING))
+        self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True)
         self.monitor.invalidated = lambda name: self.key(name).doubt()
         self.monitor.broken, self.monitor.changed = self._lost, self._changed
         self.monitor.resynchronised = self._read_again

@@ -205,7 +205,7 @@ class LiveSource:
         # Before it is fetched: a page must not make this program take all memory.
         if node is not None and (node.size or 0) > _LARGEST:
             raise NotKept(f"{show(path)} has {node.size} bytes, too many for a page; read it with Python")
-        return await DocumentReader(self.interface.session, str(path[0])).read(path[1:])
+        return await DocumentReader(self.interface.session.raw, str(path[0])).read(path[1:])
 
     async def parameters(self, path: Path) -> list[StoredParameter]:
         """Return what programs have declared at and below a path. Two round trips, none without any parameters."""

@@ -60,7 +60,7 @@ class LogSource:
 
     def __init__(self, path: str | FilePath, ships: Sequence[Any] | None = None) -> None:
         self.title = FilePath(path).name
-        self.log: Log = open_log(path, ships)
+        self.log: Log = open_log(path, ships).raw  # pictures are shown as they are
         # When there was news of a path, sorted; read when it is asked for, since all of a long recording takes seconds.
         self._times = lru_cache(_CACHED)(self.log.news_times)
         self._state = lru_cache(_CACHED)(self._read_state)

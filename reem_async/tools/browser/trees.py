@@ -14,6 +14,7 @@ from ...errors import BadData
 from ...plan.paths import Path
 from ...plan.placeholders import Unfetched, Unreadable, find, marked
 from ...plan.trees import MISSING, get, mapped, walk
+from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
 from ...store.catalog import Outline
 from .pictures import preview_of
@@ -21,6 +22,8 @@ from .pictures import preview_of
 _NUMPY = NumpyShip()
 _SCALARS = (str, int, float, bool, type(None))
 _OVERHEAD = 200  # bytes of memory that an array takes besides its items
+CONTENTS = (np.ndarray, bytes, EncodedImage)
+"""The types of what is kept as a `Frame`."""
 
 
 class Frame:
@@ -29,9 +32,11 @@ class Frame:
     # Not a dataclass: two frames are the same only if they are one, and there are thousands.
     __slots__ = ("described", "preview", "time", "whole")
 
-    def __init__(self, whole: np.ndarray[Any, Any] | bytes) -> None:
+    def __init__(self, whole: np.ndarray[Any, Any] | bytes | EncodedImage) -> None:
         self.described = described(whole)
-        self.whole: np.ndarray[Any, Any] | bytes | None = whole  # the value, None once there is no room for it
+        self.whole: np.ndarray[Any, Any] | bytes | EncodedImage | None = (
+            whole  # the value, None once there is no room for it
+        )
         # A small picture of it; None if there is none
         self.preview = preview_of(whole) if isinstance(whole, np.ndarray) else None
         self.time = 0.0  # since when it is known, in seconds since 1970
@@ -48,7 +53,7 @@ class Frame:
 
 
 def framed(tree: Any) -> Any:
-    return mapped(tree, lambda it: Frame(it) if isinstance(it, np.ndarray | bytes) else it)
+    return mapped(tree, lambda it: Frame(it) if isinstance(it, CONTENTS) else it)
 
 
 def thawed(tree: Any) -> Any:
@@ -64,6 +69,8 @@ def described(value: Any) -> Unfetched:
         return Unfetched("numpy", *_NUMPY.describe(value))
     if isinstance(value, bytes):
         return Unfetched("bytes", len(value), "bytes")
+    if isinstance(value, EncodedImage):
+        return Unfetched(value.label, len(value.data), value.summary)
     if isinstance(value, Unreadable):
         return Unfetched("unreadable", 0, value.reason)
     return Unfetched(type(value).__name__, 0, "")
@@ -116,7 +123,7 @@ def is_kept(one: Any, other: Any) -> bool:
         return False
     if isinstance(one, np.ndarray) and isinstance(other, np.ndarray):
         return one.dtype == other.dtype and one.shape == other.shape and one.tobytes() == other.tobytes()
-    return isinstance(one, bytes) and isinstance(other, bytes) and one == other
+    return isinstance(one, bytes | EncodedImage) and type(one) is type(other) and bool(one == other)
 
 
 def strip(tree: Any) -> Any:
@@ -131,6 +138,8 @@ def weight(tree: Any) -> int:
     for _, it in walk(tree, ()):
         if isinstance(it, np.ndarray):
             total += it.nbytes + _OVERHEAD
+        elif isinstance(it, EncodedImage):
+            total += len(it.data) + _OVERHEAD
         elif isinstance(it, bytes | str):
             # What objects of Python take besides their content, about.
             total += len(it) + 80
@@ -180,7 +189,7 @@ def _at(old: list[Any], index: int, new: list[Any], path: Path) -> list[Path]:
 
 
 def _equal(one: Any, other: Any) -> bool:
-    if isinstance(one, Frame | np.ndarray | bytes):
+    if isinstance(one, (Frame, *CONTENTS)):
         return is_kept(one, other)
     plain = all(isinstance(it, str | bool | int | float | None) for it in (one, other))
     return plain and same(one, other)

@@ -23,6 +23,7 @@ from reem_async.plan.attachments import orphans, remove_orphans
 from reem_async.plan.paths import check_top_key, parse_suffix
 from reem_async.plan.sizes import STAGED
 from reem_async.session import Session
+from reem_async.ships.images import codecs
 from reem_async.tools.cli import checks
 from reem_async.tools.cli.checks import FAIL, OK, UNKNOWN, WARN, Facts, Finding
 from reem_async.tools.cli.following import follow
@@ -268,6 +269,10 @@ def _of_installation() -> Iterator[Finding]:
     python = ".".join(map(str, sys.version_info[:3]))
     versions = [f"{name} {metadata.version(name)}" for name in _LIBRARIES]
     yield Finding("libraries", OK, f"Python {python}, {', '.join(versions)}")
+    by = codecs()
+    lacking = [kind for kind, codec in by.items() if not codec]
+    text = ", ".join([f"{kind} by {codec}" for kind, codec in by.items() if codec]) or "none can be read or written"
+    yield Finding("pictures", WARN if lacking else OK, text, "pip install 'reem-async[images]'" if lacking else "")
     if clash := original_reem():
         yield Finding("installation", FAIL, clash, CURE)
 

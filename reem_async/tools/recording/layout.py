@@ -29,6 +29,7 @@ from google.protobuf.message import DecodeError
 from ...errors import BadData
 from ...plan.documents import nested_over
 from ...plan.paths import Path, shorten
+from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip, flat
 from ...ships.registry import Ships
 from .format import DamagedRecording
@@ -270,14 +271,15 @@ def schema_bytes(schema: str) -> bytes:
 
 
 def encode(label: str, value: Any, frame: str, time: int) -> EncodedMessage:
-    """Return an array, or the bytes of any other ship, as a message.
+    """Return an array, a picture, or the bytes of any other ship, as a message.
 
     The label is the ship's, or "list"; viewers show `frame`, the path, with a picture; the time is in ns since 1970.
     """
     if isinstance(value, np.ndarray):
         return _picture(value, frame, time) if _is_picture(label, value) else _array_message(value, time)
-    picture = _compressed(value)
-    if label == "bytes" and picture:
+    picture = value.label if isinstance(value, EncodedImage) else _compressed(value) if label == "bytes" else ""
+    value = value.data if isinstance(value, EncodedImage) else value
+    if picture:
         head = _CLASSES["foxglove.CompressedImage"](frame_id=frame, format=picture)
         return _encoded("foxglove.CompressedImage", "", head, time, [value])
     return _encoded("reem.Blob", "", _CLASSES["reem.Blob"](label=label, size=len(value)), time, [value])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -83,11 +84,11 @@ class ArrayHandle:
     size: int
     summary: str
     _stored: Reference
-    _past: RecordedPast
+    _load: Callable[[Reference], Any]
 
     def read(self) -> Any:
         """Return the value, read-only; raises DamagedRecording if it is."""
-        return self._past.value(self._stored)
+        return self._load(self._stored)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +136,7 @@ def open_log(
 
     Args:
         path: The file.
-        ships: What makes values of what is not JSON; NumpyShip and BytesShip if not given.
+        ships: What makes values of what is not JSON; those of an interface if not given.
         progress: Called with the bytes done and all of them, if the whole file is read: its recorder was killed, or its
             summary is damaged or leaves something out.
 
@@ -169,8 +170,20 @@ class Log:
         except BaseException:
             self._container.close()
             raise
+        self._load: Callable[[Reference], Any] = past.value  # what makes the value of a `Reference`
         keeping = lru_cache(max(_CACHED_TREES, 2 * len(past.names)))
         self._tree = keeping(lambda name, changed: past.tree((name,), changed))
+
+    @property
+    def raw(self) -> Log:
+        """The same recording, in which pictures are `Jpeg` and `Png`, as they were published, and not decoded.
+
+        For what passes them on, such as players and exports. `log.raw[path].values()` yields them, for example; their
+        `data` is the file. It shares the open file with this log.
+        """
+        it = copy.copy(self)
+        it._load = self._past.raw_value
+        return it
 
     @property
     def start(self) -> float:
@@ -236,12 +249,12 @@ class Log:
         found = self._past.tree(place, nanoseconds(instant))
         if found is MISSING:
             raise MissingKey(f"nothing was at {show(place)} at {instant!r}; it was recorded from {self.start!r} on")
-        return self._past.value(found) if type(found) is Reference else resolve(found, self._recorded)
+        return self._load(found) if type(found) is Reference else resolve(found, self._recorded)
 
     def _recorded(self, it: Reference) -> Any:
         """Return a value, or what stands in a tree for one that could not be recorded; raises DamagedRecording."""
         if it.label != LOST:
-            return self._past.value(it)
+            return self._load(it)
         self._past.unreadable += 1
         return Unreadable(it.shown, it.summary)
 
@@ -262,7 +275,7 @@ class Log:
         if tree is MISSING:
             return tree
         try:
-            return resolve(tree, self._past.value)
+            return resolve(tree, self._load)
         except ValueError:  # damaged, or never recorded
             self._past.unreadable += 1
             return MISSING
@@ -273,7 +286,7 @@ class Log:
         return {name: resolve(tree, self._handle) for name, tree in trees.items()}
 
     def _handle(self, it: Reference) -> ArrayHandle:
-        return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._past)
+        return ArrayHandle(it.label, it.dtype, it.shape, it.size, it.summary, it, self._load)
 
     def _trees_at(self, ns: int) -> dict[str, Any]:
         found = [(name, self._tree(name, self._past.changed(name, ns))) for name in self.names()]

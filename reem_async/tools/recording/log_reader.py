@@ -16,13 +16,13 @@ from ...errors import BadData
 from ...plan.past import Past
 from ...plan.paths import Path, Pattern, below, related
 from ...plan.trees import MISSING, get, same
-from ...ships.numpy import NumpyShip
+from ...ships.images import EncodedImage
 from ...ships.registry import Ships
 from .container import Container, Ref, Timeline
 from .format import NEWS, DamagedRecording, Kind, Role
 from .layout import decode, from_json
 from .sink import CHANNELS
-from .stored import LOST, Reference, applied, opened
+from .stored import LOST, Reference, applied, opened, reference_to
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,18 +194,20 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
     def _stored(self, channel: Channel, at: int, path: Path, data: bytes) -> Reference:
         """Return what stands for a value that is a message of its own and not a part of another."""
         label = channel.metadata.get("reem.ship", "")
-        value = self._decoded(channel, data)
-        if label == "numpy":
-            size, summary = NumpyShip().describe(value)
-            return Reference(label, path, at, size, summary, summary.partition("[")[0], value.shape)
-        return Reference(label, path, at, len(value) if isinstance(value, bytes) else len(data), label)
+        value = self._decoded(channel, data, self._ships.raw)
+        known = label == "numpy" or isinstance(value, bytes | EncodedImage)
+        return reference_to(label, path, at, value if known else data)
 
-    def _decoded(self, channel: Channel, data: bytes) -> Any:
+    def _decoded(self, channel: Channel, data: bytes, ships: Ships) -> Any:
         schema = self._container.schemas.get(channel.schema_id)
         label, channels = channel.metadata.get("reem.ship", ""), channel.metadata.get("reem.channels", "")
-        return decode(schema.name if schema else "", channels, label, data, self._ships)
+        return decode(schema.name if schema else "", channels, label, data, ships)
 
-    def value(self, it: Reference) -> Any:
+    def raw_value(self, it: Reference) -> Any:
+        """Return what `value` does, but pictures as `Jpeg` and `Png`."""
+        return self.value(it, self._ships.raw)
+
+    def value(self, it: Reference, ships: Ships | None = None) -> Any:
         """Return the value that something stands for; raises DamagedRecording."""
         if it.label == LOST:
             raise DamagedRecording(f"{it.shown}: {it.summary}")
@@ -213,7 +215,7 @@ class RecordedPast(Past[tuple[Ref, RecordedStream]]):
             ref = self.timeline.latest(channel, it.at, it.at - 1)
             message = None if ref is None else self._container.message(ref)
             if message is not None and self._container.channels[channel].message_encoding == "protobuf":
-                return self._decoded(self._container.channels[channel], message.data)
+                return self._decoded(self._container.channels[channel], message.data, ships or self._ships)
         raise DamagedRecording(f"{it.shown}: {it.summary or it.label}, recorded at {it.at} ns, is damaged or missing")
 
     def changed(self, name: str, until: int) -> int:

@@ -126,7 +126,7 @@ class Recorder:
         check_instance("path", path, (str, FilePath), "use the name of a file")
         self.path = FilePath(path)
         self.patterns = parse_patterns(patterns)
-        self.session = interface.session
+        self.session = interface.session.raw  # pictures go into the file as they are
         self.clock = Clock()
         self.arrivals = Arrivals(2 * PATIENCE)  # the system wakes no process at the very moment
         self.fetching = asyncio.Semaphore(_FETCHES)
@@ -137,7 +137,7 @@ class Recorder:
         self._keyframes = 0
         self._keys = RecordedKeys(self)
         tops = self._keys.tops
-        self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE) if tops else None
+        self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE, raw=True) if tops else None
         if self._monitor is not None:
             self._monitor.invalidated = lambda name: self._keys.of(name).lost(None)
             self._monitor.resynchronised = self._keys.lost

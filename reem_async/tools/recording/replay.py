@@ -86,7 +86,7 @@ class Replayer:
                 f"the replay would end before it starts; the recording is {log.duration:.3f} s long, "
                 f"from {log.start!r} to {log.end!r}"
             )
-        self._log = log
+        self._log = log.raw  # pictures are published as they were
         self._rate = rate
         self._loop = loop
         self._texts = list(patterns)

@@ -15,6 +15,8 @@ import numpy as np
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, changed, get, mapped, removed, replaced
+from ...ships.images import EncodedImage
+from ...ships.numpy import NumpyShip
 from .contents import Content
 from .format import Kind, Role
 
@@ -46,6 +48,20 @@ class Reference:
     @property
     def shown(self) -> str:
         return show(self.path)
+
+
+_NUMPY = NumpyShip()
+
+
+def reference_to(label: str, path: Path, at: int, value: Any, content: Content | None = None) -> Reference:
+    """Return what stands for an array, bytes or a picture."""
+    if isinstance(value, EncodedImage):
+        return Reference(label, path, at, len(value.data), value.summary, value.dtype, value.shape, content)
+    if isinstance(value, np.ndarray):
+        size, summary = _NUMPY.describe(value)
+        numbers = value if label == "list" else None
+        return Reference(label, path, at, size, summary, summary.partition("[")[0], value.shape, content, numbers)
+    return Reference(label, path, at, len(value), label, content=content)
 
 
 class Unchanged:
@@ -117,6 +133,8 @@ def extract(value: Any, path: Path, store: Store) -> Any:
         return found if any(new is not old for new, old in zip(found, value, strict=True)) else value
     if kind in _PLAIN or (kind is np.ndarray and is_inline(value)):
         return value
+    if isinstance(value, EncodedImage):
+        return store(value.label, path, value)
     label = "numpy" if kind is np.ndarray else "bytes" if kind is bytes else ""
     return store(label, path, value)
 

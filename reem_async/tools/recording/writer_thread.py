@@ -20,13 +20,14 @@ from ...concurrency.tasks import give_way
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
 from ...plan.trees import MISSING, CannotApply, difference, get, replaced, same, walk
+from ...ships.images import EncodedImage
 from ...ships.numpy import NumpyShip
 from ...ships.registry import Ships
 from .contents import Content
 from .format import Kind, Role
 from .layout import WRAPPER, JsonMessage, encode, to_json
 from .sink import FullError, Sink
-from .stored import LOST, NotWritten, Reference, Unchanged, extract, opened, planted, pruned, without
+from .stored import LOST, NotWritten, Reference, Unchanged, extract, opened, planted, pruned, reference_to, without
 
 logger = logging.getLogger("reem.recording")
 
@@ -343,8 +344,9 @@ class WriterThread:
                     return old
                 self.counts.lose(path)
                 return lost
-            content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", data)
-            stored = _described(label, path, it.stamp[0], data, content)
+            file = data.data if isinstance(data, EncodedImage) else data
+            content = Content(*_NUMPY.pack(data)) if isinstance(data, np.ndarray) else Content(b"", file)
+            stored = reference_to(label, path, it.stamp[0], data, content)
             if type(old) is Reference and _is_same(stored, old):
                 return old
             # A part belongs to an update or a state; an array that was published by itself is an update.
@@ -372,14 +374,6 @@ class WriterThread:
     def _count(self, size: int) -> None:
         self.counts.messages += 1
         self.counts.bytes += size
-
-
-def _described(label: str, path: Path, at: int, data: Any, content: Content) -> Reference:
-    if isinstance(data, np.ndarray):
-        size, summary = _NUMPY.describe(data)
-        numbers = data if label == "list" else None
-        return Reference(label, path, at, size, summary, summary.partition("[")[0], data.shape, content, numbers)
-    return Reference(label, path, at, len(data), label, content=content)
 
 
 def _as_state(it: Operation) -> Operation:

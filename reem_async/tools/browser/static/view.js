@@ -365,4 +365,4 @@ class BytesBody {
   }
 }
 
-const BODIES = new Map([["dict", DictBody], ["list", ListBody], ["str", TextBody], ["bytes", BytesBody], ["numpy", ArrayView], ["int", NumberBody], ["float", NumberBody], ["bool", NumberBody]]);
+const BODIES = new Map([["dict", DictBody], ["list", ListBody], ["str", TextBody], ["bytes", BytesBody], ["jpeg", BytesBody], ["numpy", ArrayView], ["png", ArrayView], ["int", NumberBody], ["float", NumberBody], ["bool", NumberBody]]);
