@@ -1,5 +1,7 @@
 """Ctrl-C ends any blocking call and leaves the interface usable; a handler of SIGTERM may close it."""
 
+import collections
+import contextlib
 import errno
 import os
 import subprocess
@@ -9,10 +11,10 @@ import time
 
 import numpy as np
 import pytest
-from conftest import ROOT, assert_same, sized
+from conftest import ROOT, assert_same, eventually, sized
 
 from reem_async import transport
-from reem_async.concurrency.locks import Locks
+from reem_async.concurrency.locks import Locks, Pipe
 from reem_async.concurrency.queues import EMPTY, BoundedQueue, Ended, Every, Last, Newest
 from reem_async.errors import QueueFull
 from reem_async.plan.keys import keys_of
@@ -164,7 +166,7 @@ def test_several_threads_take_from_a_queue_while_one_puts(policy, descriptors, m
         except Ended:
             return
 
-    threads = [threading.Thread(target=take) for _ in range(3)]
+    threads = [threading.Thread(target=take, daemon=True) for _ in range(3)]
     for thread in threads:
         thread.start()
     for number in range(1, 20_001):
@@ -180,6 +182,45 @@ def test_several_threads_take_from_a_queue_while_one_puts(policy, descriptors, m
     assert len({each.sequence for each in taken}) == len(taken)
     assert 20_000 in {each.sequence for each in taken}
     assert sum(each.missed for each in taken) == 20_000 // 7
+
+
+def test_a_thread_is_woken_once_for_an_update():
+    """However often one came as it began to wait, and however soon it waits again."""
+    box, taken, woken = BoundedQueue(Last(9)), [], []
+
+    class Sleepers(collections.deque):
+        def append(self, sleeper):
+            super().append(sleeper)
+            if len(taken) < 50:
+                box.put(update(0))  # just before the thread sleeps
+
+    def put(self, wakeup, put=Pipe.put):
+        woken.append(1)
+        assert len(woken) < 100
+        put(self, wakeup)
+        end = time.monotonic() + 0.02
+        while not box._sleepers and time.monotonic() < end:
+            time.sleep(0)
+
+    def take():
+        with contextlib.suppress(Ended):
+            while True:
+                taken.append(box.take_waiting())
+
+    box._sleepers = Sleepers()
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Pipe, "put", put)
+        thread = threading.Thread(target=take, daemon=True)
+        thread.start()
+        for number in range(50, 100):
+            eventually(lambda number=number: len(taken) == number and box._sleepers)
+            woken.clear()
+            box.put(update(number))
+        eventually(lambda: len(taken) == 100)
+        assert len(woken) == 1
+        box.close()
+        thread.join(PATIENCE)
+    assert not thread.is_alive()
 
 
 def test_a_thread_broken_off_among_the_locks_keeps_no_other_from_them():

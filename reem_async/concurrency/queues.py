@@ -87,9 +87,9 @@ class BoundedQueue:
         self._items: collections.OrderedDict[int, Any] = collections.OrderedDict()
         self._last = 0
         self._gaps: dict[int, int | None] = {}  # what was lost before which update
-        # One for each thread that waits for a wakeup: what wakes that one alone, or None for one that all may take
-        self._sleepers: collections.deque[queue.SimpleQueue[None] | None] = collections.deque()
-        self._wakeups: dict[int, Wakeups] = {}  # by process: a forked child must not take its parent's
+        self._sleepers: collections.deque[Wakeups] = collections.deque()  # one for each thread that waits
+        # Those of threads that do not wait now, by process: a forked child must not take its parent's
+        self._idle: dict[int, collections.deque[Wakeups]] = {}
         self._end: BaseException | None = None
         self.dropped = 0  # how many updates were skipped and will never be taken out
         self.wake: Callable[[], None] = noop  # called after each change, from the putting thread
@@ -132,13 +132,11 @@ class BoundedQueue:
 
     def _tell(self) -> None:
         """Wake all waiting threads; one that finds nothing waits again."""
-        while self._sleepers:
+        # Not those that wait again meanwhile: such a thread would be woken as often as it is quicker than this one.
+        for _ in range(len(self._sleepers)):
             with contextlib.suppress(IndexError):  # it has found something meanwhile
-                (self._sleepers.pop() or self._wakeup()).put(None)
+                self._sleepers.popleft().put(None)
         self.wake()
-
-    def _wakeup(self) -> Wakeups:
-        return self._wakeups.get(os.getpid()) or self._wakeups.setdefault(os.getpid(), wakeups())
 
     def take(self) -> Any:
         """Return the oldest update that waits, or EMPTY; raises Ended after the last, or what else ended it."""
@@ -161,7 +159,6 @@ class BoundedQueue:
         """As `take_waiting`, for so many seconds at most; then return EMPTY."""
         end = time.monotonic() + seconds
         while (item := self.take()) is EMPTY and (left := end - time.monotonic()) > 0:
-            # Its own, since a thread that reads from the common one cannot leave when its time is over.
             wakeup: queue.SimpleQueue[None] = queue.SimpleQueue()
             self._sleepers.append(wakeup)
             if not self._items and self._end is None:
@@ -173,12 +170,21 @@ class BoundedQueue:
 
     def take_waiting(self) -> Any:
         """As `take`, but block this thread until there is something. Any number of threads may."""
-        while (item := self.take()) is EMPTY:
-            waiting = self._wakeup()
-            self._sleepers.append(None)
-            if not self._items and self._end is None:  # else it was put in before this thread was seen to sleep
-                waiting.get()
-            # A thread that leaves otherwise, by Ctrl-C for example, leaves a wakeup that wakes another one in vain.
+        if (item := self.take()) is not EMPTY:
+            return item
+        idle = self._idle.setdefault(os.getpid(), collections.deque())
+        try:
+            wakeup = idle.pop()
+        except IndexError:
+            wakeup = wakeups()
+        try:
+            while (item := self.take()) is EMPTY:
+                if wakeup not in self._sleepers:  # else it was one that the thread had left over
+                    self._sleepers.append(wakeup)
+                if not self._items and self._end is None:  # else it was put in before this thread was seen to sleep
+                    wakeup.get()
+        finally:
+            idle.append(wakeup)
         return item
 
     def close(self, end: Exception | None = None) -> None:
