@@ -196,6 +196,37 @@ def test_errors_go_to_the_callback(publisher, server, caplog):
     assert "of the callback" in caplog.text
 
 
+def test_calls_that_wait_share_transactions_and_each_gets_its_own_error(publisher, server, reader):
+    """Early ones are sent together every few milliseconds. Numbers, values and losses are those of single calls."""
+    errors = []
+    front = publisher(f"redis://localhost:{server.port}", on_error=errors.append, local="early", timeout=PATIENCE)
+    front.write(["a"], {"n": -1, "image": np.zeros(3)})
+    front.flush()
+    with redis.Redis.from_url(server.url) as admin, reader["a"].watch(Every(1000)) as watch:
+        transactions = admin.info("commandstats")["cmdstat_exec"]["calls"]
+        for number in range(30):
+            if number % 10 == 5:
+                front.write(["a", "n", "x", f"y{number}"], number)
+            elif number % 10 == 7:
+                front.write(["a", "image"], np.full(3, number))
+            else:
+                front.write(["a", "n"], number)
+        front.update(["a"], {"x": 1, "y": 2})
+        front.write(["a", "end"], True)
+        front.flush()
+        assert admin.info("commandstats")["cmdstat_exec"]["calls"] - transactions < 30
+        arrived = []
+        while (update := next(watch)).path != "a.end":
+            arrived.append((update.path, update.value if update.path == "a.n" else None))
+            assert update.missed in (0, None)
+    good = [number for number in range(30) if number % 10 not in (5, 7)]
+    assert [value for path, value in arrived if path == "a.n" and value in good] == good
+    assert_same(reader["a"].read(), {"n": 29, "image": np.full(3, 27), "x": 1, "y": 2, "end": True})
+    assert [re.search(r"y\d+", error.__notes__[0])[0] for error in errors] == ["y5", "y15", "y25"]
+    assert all(isinstance(error, PathRefused) for error in errors)
+    assert front.kvs.dropped == 3
+
+
 @pytest.mark.parametrize("policy", ["raise", "drop", "newest"])
 def test_the_server_is_killed_and_comes_back(publisher, policy, caplog):
     """With each policy; the call never waits, and what is not stored is counted."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from ..errors import BadType, Conflict, MissingKey, PathRefused, RedisError, ReemError, WrongType
+from ..errors import BadType, Conflict, MissingKey, PathRefused, RedisError, ReemError, WrongKind, WrongType
 from . import Command, Plan, Reply
 from .attachments import ChangeOutcome, left_behind, permitted, place_of, survey, unreferred, watch
 from .changes import REFUSED, SILENT, Announcement, DocumentChange, EncodedAttachment
@@ -317,10 +317,10 @@ def expiry(keys: Keys, milliseconds: int | None) -> Plan:
 
 
 def together(changes: Sequence[DocumentChange], cache: ShapeCache) -> Plan:
-    """Plan changes of entries of one dict in one transaction, then the plans that follow from each.
+    """Plan several changes in one transaction, then the plans that follow from each; the result is each one's error.
 
-    All or none are applied: the server refuses one if the dict is missing, and then it refuses all. Raises BadType if a
-    change must be watched: such changes cannot share one transaction.
+    Of entries of one dict all or none are applied: the server refuses one if the dict is missing, and then it refuses
+    all. Raises BadType if a change must be watched: such changes cannot share one transaction.
     """
     for each in changes:
         if is_watched(each, cache):
@@ -348,8 +348,8 @@ def _decoded(plan: Plan, replies: Sequence[Reply]) -> Any:
         return error
 
 
-def _each(outcomes: list[Any]) -> Any:
-    """Continue with each outcome that is a plan; then raise the first error."""
+def _each(outcomes: list[Any]) -> Plan | list[Exception | None]:
+    """Continue with each outcome that is a plan; then return all."""
     for number, outcome in enumerate(outcomes):
         # One after the other: each may need the connection for itself.
         if isinstance(outcome, Plan):
@@ -359,6 +359,6 @@ def _each(outcomes: list[Any]) -> Any:
 
             return outcome._replace(decode=decode)
     for outcome in outcomes:
-        if isinstance(outcome, Exception):
+        if isinstance(outcome, WrongKind):  # of the document, so all were refused; the error is yet to name the type
             raise outcome
-    return None
+    return outcomes

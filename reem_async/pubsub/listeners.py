@@ -6,6 +6,7 @@ Sent: SUBSCRIBE, CLIENT TRACKING, and TYPE to touch keys. Pushed: updates, inval
 from __future__ import annotations
 
 import asyncio
+import collections
 import functools
 import logging
 import math
@@ -29,6 +30,7 @@ from .early import EarlyInbox
 logger = logging.getLogger("reem.subscribe")
 
 Arguments = ParamSpec("Arguments")
+_MOST_EARLY = 100  # early updates that wait for those of the server
 _MOST_WARNINGS = 100  # channels of whose unreadable messages a warning is logged: any client may make up channels
 
 
@@ -162,8 +164,8 @@ class Inbox:
         self._moved = moved  # called with topics that their server does not have any more, and why
         self._empty = empty  # called with a topic that has no listener any more
         self.early = EarlyInbox(self._take_early)
-        # The bytes are decoded once if the server's are equal
-        self._last_early: tuple[bytes, Notice | None] = b"", None
+        # Early updates by their bytes: those of the server are equal, and are not decoded again
+        self._early: collections.OrderedDict[bytes, Notice] = collections.OrderedDict()
         self._warned: set[bytes] = set()
         # Notified of every key that the server says was changed, whichever listener read it
         self.watchers = ListenerGroup()
@@ -203,8 +205,8 @@ class Inbox:
         try:
             # A loop, since a generator would take as long as the rest.
             view = self._view if [1 for listener in listeners if listener.local] else None
-            early, notice = self._last_early
-            if view is None or payload != early or notice is None:
+            notice = None if view is None else self._early.pop(payload, None)
+            if notice is None:
                 notice = decode(payload, self._ships, view)
         except BadData as error:
             self._unreadable(channel, error)
@@ -226,7 +228,10 @@ class Inbox:
             return
         try:
             notice = decode(payload, self._ships, self._view)
-            self._last_early = payload, notice if notice.slot is None else None  # no slot is kept from its publisher
+            if notice.slot is None:  # none is kept from its publisher
+                self._early[payload] = notice
+                if len(self._early) > _MOST_EARLY:
+                    self._early.popitem(last=False)
             early = notice._replace(early=True)
             for listener in listeners:
                 listener.on_early(early)

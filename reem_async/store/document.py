@@ -394,6 +394,12 @@ class DocumentWriter:
         await self._run(change(it, self.session.cache))
 
     async def _put_all(self, turn: Turn, assignments: Sequence[Assignment]) -> None:
+        for error in await self.send_each(turn, assignments):
+            if error is not None:
+                raise error
+
+    async def send_each(self, turn: Turn, assignments: Sequence[Assignment]) -> list[Exception | None]:
+        """Send values in one transaction, in its turn; return why each was refused, or None."""
         shipped = next((each for each in assignments if each.attachments), None)
         if shipped is not None:
             await self._check_place(shipped.path, shipped.attachments)
@@ -401,7 +407,8 @@ class DocumentWriter:
         if shipped is not None or self.session.local.early:
             for each in changes:
                 await each.announcement.share(each.path)
-        await self._run(together(changes, self.session.cache))
+        errors: list[Exception | None] = await self._run(together(changes, self.session.cache))
+        return errors
 
     async def _put_instead(
         self, turn: Turn, path: Path, text: bytes, attachments: Attachments, before: RawRead

@@ -17,6 +17,7 @@ import collections
 import logging
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 from ..concurrency.locks import Inherited
@@ -44,6 +45,7 @@ logger = logging.getLogger("reem.publish")
 _PAUSES = (0.02, 0.05, 0.1, 0.2, 0.25)  # seconds between two attempts to reach the server; the last one repeats
 _LOOK = 0.001  # seconds between two looks of `flush` at what is unsent
 _MOST = 256 << 20  # bytes of kept values, of all keys together
+_MOST_SHARED, _LARGEST_SHARED = 32, 1 << 14  # calls in one transaction, and their bytes
 _OVERHEAD = 500  # bytes that a kept value needs besides its content, about
 _AWAY = (NotConnected, ConnectionLost, ServerNotReady)
 """Errors of an outage; except TlsRefused, a NotConnected that does not end by waiting."""
@@ -58,6 +60,13 @@ class Kept(NamedTuple):
     called: CallTime  # when it was published
     announcements: tuple[Announcement, ...] = ()  # if they have their numbers already
     removals: int = 0  # how many items had been removed from lists before, if the path leads through one
+
+    @property
+    def can_share(self) -> bool:
+        """Whether it can be sent in one transaction with other calls: small values at places that no list moves."""
+        return bool(self.announcements) and all(
+            it.text is not None and not it.attachments and not has_index(it.path) for it in self.assignments
+        )
 
     def replaces(self, older: Kept, in_list: bool) -> bool:
         """Return whether nothing of an older update is left after this one; `in_list` if its path leads through one."""
@@ -120,15 +129,17 @@ class UnsentUpdates:
         it = self.kept.pop(number, None)  # None: it is being sent
         return 0 if it is None else len(it.assignments)
 
-    def take(self) -> tuple[int, Kept] | None:
-        self.sending = 1
-        try:
-            number, it = self.kept.popitem(last=False)
-        except KeyError:
-            self.sending = 0
-            return None
-        self.sending = len(it.assignments)
-        return number, it
+    def take(self) -> list[tuple[int, Kept]]:
+        """Take the oldest call, and those after it that can share its transaction; they count as being sent."""
+        self.sending, size, taken = 1, 0, list[tuple[int, Kept]]()
+        for number, it in list(islice(self.kept.items(), _MOST_SHARED)):
+            size += it.size
+            if taken and not (it.can_share and taken[0][1].can_share and size <= _LARGEST_SHARED):
+                break
+            if self.kept.pop(number, None) is not None:
+                taken.append((number, it))
+        self.sending = sum([len(it.assignments) for _, it in taken])
+        return taken
 
     def put_back(self, number: int, it: Kept) -> None:
         self.kept[number] = it
@@ -143,6 +154,7 @@ class Outage:
     """The outages of one PublishSpace, with the policy "drop" or "newest"."""
 
     _task_name = "reem outage"
+    _rest = 0.0  # seconds after everything was sent until more is
 
     def __init__(self, session: Session, policy: str) -> None:
         self.policy = policy
@@ -280,6 +292,8 @@ class Outage:
             while self._out or self._has_more():
                 if await self._all_sent():
                     tries = 0
+                    if self._rest:
+                        await self._session.transport.pause(self._rest)
                     continue
                 await self._session.transport.pause(_PAUSES[min(tries, len(_PAUSES) - 1)])
                 tries += 1
@@ -337,36 +351,39 @@ class Outage:
         self._out.pop(out.writer.keys.document, None)
 
     async def _send_next(self, turn: Turn, out: UnsentUpdates) -> bool:
-        """Send the oldest kept call of a key, in its turn; return whether there was one."""
-        taken = await self._taken(out)  # first, so that it is never sent twice
-        if taken is None:
+        """Send the oldest kept call of a key, in its turn, and those that share its transaction; False for none."""
+        taken = await self._taken(out)  # first, so that none is ever sent twice
+        if not taken:
             return False
-        number, it = taken
-        turn.called, turn.announced = it.called, list(it.announcements)
+        keys, calls = out.writer.keys, [it for _, it in taken]
+        turn.called, turn.announced = calls[0].called, [each for it in calls for each in it.announcements]
         is_over = True
         try:
-            await out.writer.send(turn, it.assignments)
+            for it, error in await _sent_together(out.writer, turn, calls):
+                self._not_stored(keys, it, error, is_refused=True)
         except (NotConnected, ServerNotReady):
             is_over = False
-            turn.not_applied(len(it.assignments))
-            for each in it.announcements:
-                each.again()
-            out.put_back(number, it)
+            for number, it in reversed(taken):
+                turn.not_applied(len(it.assignments))
+                for each in it.announcements:
+                    each.again()
+                out.put_back(number, it)
             raise
         except BaseException as error:
             is_refused = isinstance(error, RedisError | ReemError) and not isinstance(error, _CUT)
-            self._not_stored(out.writer.keys, it, error, is_refused)
+            for it in calls:
+                self._not_stored(keys, it, error, is_refused)
             if not is_refused:
                 raise
         finally:
             turn.called, turn.announced = None, []
             if is_over:
-                out.done = number
+                out.done = taken[-1][0]
             out.sending = 0
             turn.release()
         return True
 
-    async def _taken(self, out: UnsentUpdates) -> tuple[int, Kept] | None:
+    async def _taken(self, out: UnsentUpdates) -> list[tuple[int, Kept]]:
         return out.take()
 
     def _not_stored(self, keys: Keys, it: Kept, error: BaseException, is_refused: bool) -> None:
@@ -411,6 +428,16 @@ class Outage:
 
 
 _every = Inherited[Outage](lambda outage: outage.forget())
+
+
+async def _sent_together(writer: DocumentWriter, turn: Turn, calls: Sequence[Kept]) -> list[tuple[Kept, Exception]]:
+    """Send calls in one transaction; return those of several that the server refused. Raises what refuses all."""
+    if len(calls) == 1:
+        await writer.send(turn, calls[0].assignments)
+        return []
+    errors = iter(await writer.send_each(turn, [each for it in calls for each in it.assignments]))
+    found = [(it, next(filter(None, [next(errors) for _ in it.assignments]), None)) for it in calls]
+    return [(it, error) for it, error in found if error is not None]
 
 
 def own_copies(assignments: Sequence[Assignment]) -> tuple[Assignment, ...]:

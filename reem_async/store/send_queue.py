@@ -40,6 +40,9 @@ LAG = 32  # calls of a key that wait before a further one replaces older ones of
 MOST_CALLS = 1000  # calls that wait, of all keys together
 _LONGEST_FINISH = 1.0  # seconds for which closing the interface, and the end of the program, wait for the queue
 _IDLE = 5.0  # seconds without a call after which the sender's thread ends; the next call starts another one
+# Seconds between two transactions of updates that subscribers on this host have already: one for each would cost
+# publisher, server and subscribers two wake-ups each. Below the time from which a notice says that it is late.
+_EARLY_REST = 0.005
 _MOST_ERRORS = 100  # errors that wait to be reported
 _PAUSE = 0.001  # seconds between two looks whether the sender has ended
 
@@ -65,6 +68,10 @@ def outages(
     return None if policy == "raise" else Outage(session, policy)
 
 
+def _lags(out: UnsentUpdates) -> bool:
+    return len(out.kept) + out.sending >= LAG
+
+
 class SendQueue(Outage):
     """The queue of one PublishSpace with `wait=False`.
 
@@ -77,6 +84,7 @@ class SendQueue(Outage):
 
     def __init__(self, session: Session, policy: str, on_error: Callable[[Exception], object] | None) -> None:
         self._on_error = on_error
+        self._rest = _EARLY_REST if session.local.early else 0.0
         super().__init__(session, policy)
         self.chosen = {"policy": policy, "wait": False, "on_error": on_error}
 
@@ -101,7 +109,7 @@ class SendQueue(Outage):
         self._raise_earlier()
         called, own = CallTime(time.time(), time.monotonic()), own_copies(assignments)
         out = self._out.get(writer.keys.document)
-        if out is not None and len(out.kept) >= LAG:
+        if out is not None and _lags(out):
             await self._session.transport.pause(0)  # let the sender go on, which may be a task of this event loop
         async with self._calls(writer.keys):
             self._session.transport.check()
@@ -127,7 +135,7 @@ class SendQueue(Outage):
         state = self._session.transport.states.last.state
         away = self._reached != self._session.tasks.place or state != "connected"
         out = self._out.setdefault(document, UnsentUpdates(writer, away=away))
-        dropped = out.put(it, merge=self._is_outage or len(out.kept) >= LAG)
+        dropped = out.put(it, merge=self._is_outage or _lags(out))
         while len(out.kept) > 1 and self._is_full:  # the newest always stays
             dropped += out.drop_first()
         if dropped:
@@ -215,13 +223,16 @@ class SendQueue(Outage):
         return not out.away
 
     async def _flush(self, turn: Turn, out: UnsentUpdates) -> None:
-        for _ in range(len(out.kept)):  # not those that come meanwhile: other calls wait for this turn
-            await self._send_next(turn, out)
+        last = out.last
+        while out.done < last and await self._send_next(
+            turn, out
+        ):  # not those that come meanwhile: others wait for this turn
+            pass
         async with self._calls(out.writer.keys):
             if not out.kept:
                 self._out.pop(out.writer.keys.document, None)
 
-    async def _taken(self, out: UnsentUpdates) -> tuple[int, Kept] | None:
+    async def _taken(self, out: UnsentUpdates) -> list[tuple[int, Kept]]:
         async with self._calls(out.writer.keys):  # not before the call has shared it with subscribers on this host
             return out.take()
 
