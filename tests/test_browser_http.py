@@ -287,6 +287,15 @@ def test_events_name_what_changed_and_are_few(ask, pspace, key):
     assert said[4] - said[0] > 0.3, "more than ten a second"
 
 
+def test_arrays_are_read_less_often_while_no_page_is_open(server_url):
+    with served(live(server_url)) as (address, source), client_of(address) as ask:
+        arrays = source._follower.arrays
+        alone = arrays.rate
+        with ask.http.stream("GET", "/api/events"):
+            eventually(lambda: arrays.rate == 8 * alone)
+        eventually(lambda: arrays.rate == alone)
+
+
 def test_a_server_that_goes_away_is_said_and_so_is_its_return(tmp_path):
     with EmbeddedServer(directory=tmp_path / "data") as server:
         port = server.port

@@ -92,11 +92,12 @@ def come_second() -> None:
 def stand_back() -> None:
     """Run only when the processor is idle from now on, with all threads begun later; there is no way back.
 
-    Where there is no SCHED_IDLE (not Linux), it is niceness 19. Raises AttributeError or OSError where neither works.
+    Where there is no SCHED_IDLE (not Linux), or it is not allowed, it is niceness 19. Raises AttributeError or OSError
+    where neither works.
     """
-    if hasattr(os, "SCHED_IDLE"):
+    try:
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-    else:
+    except (AttributeError, OSError):
         os.nice(_NICEST)
 
 

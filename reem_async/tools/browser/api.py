@@ -375,6 +375,7 @@ class Events:
 
     async def _stream(self) -> AsyncIterator[bytes]:
         self._clients += 1
+        self._source.shown_on(self._clients)
         try:
             # Milliseconds until a browser that lost the connection tries again.
             yield b"retry: 1000\n\n"
@@ -394,3 +395,4 @@ class Events:
                 quiet += _PAUSE
         finally:
             self._clients -= 1
+            self._source.shown_on(self._clients)

@@ -34,6 +34,9 @@ from .timeline import PENDING
 from .trees import framed, is_kept, same, weight
 
 _WAITING = 50_000  # updates that wait for this program before the oldest are skipped
+# The part of BACKGROUND_RATE at which arrays are read for the slider while no page is open: one picture a second.
+# With a page it is four a second each of two cameras.
+_UNSEEN = 1 / 8
 _RECENT = 16  # updates that are known again if they come twice, where there may be thousands of keys
 
 # Documents that are asked for at the same time.
@@ -53,7 +56,7 @@ class Allowance:
 
     def __init__(self, rate: float, most: float) -> None:
         self.most = most  # bytes that can be saved up
-        self._rate, self._saved, self._then = rate, most, time.monotonic()
+        self.rate, self._saved, self._then = rate, min(rate, most), time.monotonic()
 
     def take(self, size: int) -> bool:
         """Take so many bytes if they are there; else nothing, and return False."""
@@ -65,9 +68,9 @@ class Allowance:
     def wait(self, size: int) -> float:
         """Return the seconds until so many bytes are there; infinite if there never are so many."""
         now = time.monotonic()
-        self._saved = min(self._saved + (now - self._then) * self._rate, self.most)
+        self._saved = min(self._saved + (now - self._then) * self.rate, self.most)
         self._then = now
-        return math.inf if size > self.most else max((size - self._saved) / self._rate, 0.0)
+        return math.inf if size > self.most else max((size - self._saved) / self.rate, 0.0)
 
 
 def _rest(took: float) -> float:
@@ -273,8 +276,7 @@ class Follower:
         self.history = history
         # Bytes of long documents that may be kept
         self.texts = Allowance(0.5 * history.budget / history.seconds, history.budget / 4)
-        # Bytes of arrays that may be read: four pictures a second each of two cameras
-        self.arrays = Allowance(BACKGROUND_RATE, history.budget / 2)
+        self.arrays = Allowance(BACKGROUND_RATE * _UNSEEN, history.budget / 2)  # bytes of arrays that may be read
         self.monitor = Monitor(interface, policy=Last(_WAITING), raw=True)
         self.monitor.invalidated = lambda name: self.key(name).doubt()
         self.monitor.broken, self.monitor.changed = self._lost, self._changed
@@ -309,6 +311,9 @@ class Follower:
         for key in self._keys.values():
             key.looks.cancel()
         await self.monitor.close()
+
+    def shown_on(self, pages: int) -> None:
+        self.arrays.rate = BACKGROUND_RATE * (1 if pages else _UNSEEN)
 
     @property
     def hears_of_changes(self) -> bool:

@@ -89,6 +89,9 @@ class LiveSource:
             min(max(self.history.start, end - self.history.seconds), end), end, self._follower.lost, "; ".join(notes)
         )
 
+    def shown_on(self, pages: int) -> None:
+        self._follower.shown_on(pages)
+
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
         return snippets(path, self.interface.session.options.url, self.interface.namespace)
 

@@ -79,6 +79,9 @@ class LogSource:
         start, end = (instant and instant + _ROUNDING for instant in (self.log.start, self.log.end))
         return Status(start, end, "", "; ".join(notes))
 
+    def shown_on(self, pages: int) -> None:
+        """Do nothing: a recording is read only for a page."""
+
     def snippets(self, path: Path, at: float | None) -> dict[str, str]:
         code = f"from reem.recording import open_log\n\nlog = open_log({str(self.log.path.resolve())!r})\n"
         when = "log.end" if at is None else repr(at)

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from reem_async.concurrency.tasks import stand_back
 from reem_async.connection import RedisInterface
 from reem_async.errors import ServerFailed
 from reem_async.server import EmbeddedServer
@@ -124,6 +125,8 @@ async def _serve(source: Source, host: str, port: int, allow_write: bool, open_:
         _tell(source, address, alone, allow_write)
         if open_:
             open_page(address)
+        with suppress(AttributeError, OSError):
+            stand_back()  # not before the web browser, which would inherit it
         await PageServer(app, sock).run_until_stopped()
     finally:
         sock.close()

@@ -7,6 +7,7 @@ import { View } from "./view.js";
 import { addressUrl, clockText, el, getJson, setText } from "./util.js";
 
 const config = JSON.parse(document.body.dataset.config);
+const REST = 4; // times as long as a refresh took there is no other one: a robot's programs may share these processors
 const SILENCE = 5000; // ms without an event after which the connection counts as lost
 
 const app = {
@@ -87,7 +88,7 @@ const app = {
   news(paths, many) {
     const now = performance.now();
     this.owed ||= many || view.concerns(paths);
-    if (this.busy || now < this.done + this.took) return; // the next event comes within a second
+    if (this.busy || now < this.done + REST * this.took) return; // the next event comes within a second
     const due = now > (this.valueDone ?? 0) + Math.max(1000, 10 * (this.valueTook ?? 0));
     this.refresh(this.owed || due);
     this.owed = false;
