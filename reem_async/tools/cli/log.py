@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import datetime
 import os
-import shutil
 import sys
-import tempfile
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -16,16 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from reem_async.connection import RedisInterface
-from reem_async.errors import BadValue
+from reem_async.tools.cli.export import export
 from reem_async.tools.cli.following import progress
-from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Force, Namespace, Url
+from reem_async.tools.cli.options import DEFAULT_URL, AsJson, Namespace, Only, Recording, Url
 from reem_async.tools.cli.output import (
     clean,
     columns,
     emit,
     emit_json,
     figures,
-    note,
     progress_bar,
     size_text,
     styled,
@@ -38,18 +35,10 @@ if TYPE_CHECKING:
 _NOTICED_LAG = 0.1
 """Seconds behind the pace that are worth a word."""
 
-_STDOUT = Path("-")
-
-_File = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
-_Only = Annotated[
-    list[str] | None,
-    typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
-]
-
 
 def play(
-    file: _File,
-    patterns: _Only = None,
+    file: Recording,
+    patterns: Only = None,
     rate: Annotated[
         float, typer.Option("--rate", "-r", min=0.001, max=1_000_000, metavar="N", help="N times as fast as it was.")
     ] = 1.0,
@@ -186,7 +175,7 @@ app = typer.Typer(
 
 @app.command()
 def info(
-    file: _File,
+    file: Recording,
     verify: Annotated[bool, typer.Option("--verify", help="Read all of the file and count what is damaged.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -289,79 +278,4 @@ def _when(instant: float) -> str:
     return f"{datetime.datetime.fromtimestamp(instant).astimezone():%Y-%m-%d %H:%M:%S %Z}"
 
 
-@app.command()
-def export(
-    file: _File,
-    patterns: _Only = None,
-    to: Annotated[
-        str | None,
-        typer.Option(
-            "--to", metavar="FORMAT", show_default=False, help="csv, npz or parquet; else the end of FILE, or csv."
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE",
-            show_default=False,
-            help="The file; - is the standard output, for csv. The recording's name with another end if not given.",
-        ),
-    ] = None,
-    force: Force = False,
-    as_json: AsJson = False,
-) -> None:
-    """Write a recording as CSV, npz or Parquet.
-
-    CSV and Parquet have a row for each update and a column for each number or text; npz has an array of
-    all values for each path, pictures too, and their times.
-    """
-
-    def work() -> int:
-        from reem_async.tools.recording import open_log
-        from reem_async.tools.recording.export import export as write
-
-        kind, to_stdout = _format(to, output), output == _STDOUT
-        if to_stdout and as_json:
-            raise BadValue("--json and the export would both be on the standard output; name a file with -o")
-        with open_log(file) as log, ExitStack() as stack:
-            target = output or file.with_suffix(f".{kind}")
-            if to_stdout:
-                target = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "export"
-            result = write(log, kind, target, patterns or ["*"], overwrite=force)
-            size = target.stat().st_size
-            if to_stdout:
-                with target.open(encoding="utf-8", newline="") as text:
-                    shutil.copyfileobj(text, sys.stdout)
-        for path, why in result.left_out.items():
-            note(f"left out: {path}: {why}")
-        if result.time != "time":
-            note(f"the column of instants is {result.time}: time is a path of the recording")
-        if result.unreadable:
-            note(f"{result.unreadable} updates are damaged or were not recorded (see reem log info --verify)")
-        if as_json:
-            names = ("rows", "columns", "left_out", "time", "unreadable")
-            emit_json({"file": str(target)} | {name: getattr(result, name) for name in names})
-        elif not to_stdout:
-            emit(clean(f"{target}: {len(result.columns)} columns, {result.rows} rows, {size_text(size)}"))
-        return 1 if result.unreadable else 0
-
-    run_local("log export", work)
-
-
-def _format(to: str | None, output: Path | None) -> str:
-    """Return the format of an export; BadValue if there is none of this name, or the file's name is that of another."""
-    from reem_async.tools.recording.export import FORMATS, check_format
-
-    end = "" if output is None else output.suffix.removeprefix(".").lower()
-    by_name = "csv" if output in (None, _STDOUT) else end
-    kind = by_name if to is None else to
-    if to is None and kind not in FORMATS:
-        raise BadValue(f"no format is known by the name {output}; let it end in .csv, .npz or .parquet, or give --to")
-    check_format(kind)
-    if end in FORMATS and end != kind:
-        raise BadValue(f"--to {kind} does not fit the name {output}; leave out --to, or choose another name")
-    if output == _STDOUT and kind != "csv":
-        raise BadValue(f"{kind} is not text and is not written to the standard output; name a file with -o")
-    return kind
+app.command()(export)

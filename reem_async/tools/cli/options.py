@@ -114,6 +114,11 @@ Value = Annotated[
 ]
 Text = Annotated[bool, typer.Option("--str", help="VALUE is text, not JSON; - still reads the input.")]
 Publish = Annotated[bool, typer.Option("--publish", help="Notify subscribers, as a PublishSpace does.")]
+Recording = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
+Only = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[PATTERN]...", show_default=False, help="Only these paths; all if there is none."),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace the file if it is there already.")]
 
 

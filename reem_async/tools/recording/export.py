@@ -9,6 +9,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path as FilePath
 from typing import IO, Any
@@ -82,15 +83,24 @@ def export(
     out and named. The file appears once it is complete.
     """
     check_format(kind)
-    target = FilePath(target)
+    result = Export()
+    with appearing(FilePath(target), log, overwrite=overwrite) as part:
+        FORMATS[kind](log, part, patterns, result)
+    return result
+
+
+@contextmanager
+def appearing(target: FilePath, log: Log, *, overwrite: bool) -> Iterator[FilePath]:
+    """Give the hidden name of a file that gets its name when the block has ended, and is removed if the block fails.
+
+    A program that waits for the file never sees a half one. Raises BadValue if it is there and may not be replaced.
+    """
     if target.exists() and not overwrite:
         raise BadValue(str(there_already(target)))
-    result = Export()
     try:
         part = PartFile(target, replace=overwrite)
         try:
-            # Under a hidden name: a program that waits for the file never sees a half one.
-            FORMATS[kind](log, part.path, patterns, result)
+            yield part.path
             part.finish()
         finally:
             part.close()
@@ -99,7 +109,6 @@ def export(
     except OSError as error:
         file = str(log.path if error.filename == str(log.path) else target)
         raise OSError(error.errno, error.strerror or str(error), file) from error
-    return result
 
 
 def check_format(kind: str) -> None:
@@ -161,30 +170,29 @@ def _csv(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
 
 
 def _parquet(log: Log, target: FilePath, patterns: Sequence[str], result: Export) -> None:
-    try:
-        pyarrow: Any = import_module("pyarrow")
-        parquet: Any = import_module("pyarrow.parquet")
-    except ModuleNotFoundError:
-        raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
+    arrow, parquet = pyarrow()
     # None stands for an empty cell in every type.
     forms = {key: _form(found - {type(None)}) for key, found in _columns(log, patterns, result).items()}
-    arrow = {
-        bool: pyarrow.bool_(),
-        int: pyarrow.int64(),
-        float: pyarrow.float64(),
-        str: pyarrow.string(),
-    }
+    types = {bool: arrow.bool_(), int: arrow.int64(), float: arrow.float64(), str: arrow.string()}
     titles = dict(zip(forms, result.columns, strict=True))
-    fields = [(result.time, pyarrow.timestamp("us", "UTC")), *[(titles[key], arrow[forms[key]]) for key in forms]]
-    schema = pyarrow.schema(fields)
+    fields = [(result.time, arrow.timestamp("us", "UTC")), *[(titles[key], types[forms[key]]) for key in forms]]
+    schema = arrow.schema(fields)
     rows = _rows(log, patterns, Export())
     with parquet.ParquetWriter(target, schema) as writer:
         while batch := list(itertools.islice(rows, _ROWS)):
             data: dict[str, list[Any]] = {result.time: [round(time * 1e6) for time, _ in batch]}
             for key, form in forms.items():
                 data[titles[key]] = [_cell(cells.get(key), form) for _, cells in batch]
-            writer.write_table(pyarrow.table(data, schema=schema))
+            writer.write_table(arrow.table(data, schema=schema))
             result.rows += len(batch)
+
+
+def pyarrow() -> tuple[Any, Any]:
+    """Return pyarrow and its part for Parquet; raises BadValue if it is not installed."""
+    try:
+        return import_module("pyarrow"), import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise BadValue("Parquet needs pyarrow: pip install pyarrow") from None
 
 
 class _Long(int):
@@ -235,15 +243,18 @@ def _npz(log: Log, target: FilePath, patterns: Sequence[str], result: Export) ->
                     continue
                 result.rows += len(times)
                 result.columns.append(_name(path))
-                _write(archive, f"{_name(path)}.time", np.dtype(np.float64), times.shape, io.BytesIO(times.tobytes()))
-                values.seek(0)
-                _write(archive, _name(path), form[0], (len(times), *form[1]), values)
+                write_array(archive, f"{_name(path)}.time", times.dtype, times.shape, io.BytesIO(times.tobytes()))
+                write_array(archive, _name(path), form[0], (len(times), *form[1]), values)
     # What each path lacks is in the updates, which were counted, but for arrays, which were not read then.
     result.unreadable = result.unreadable or lost
     result.begin(result.columns)
 
 
-def _write(archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], data: IO[bytes]) -> None:
+def write_array(
+    archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], shape: tuple[int, ...], data: IO[bytes]
+) -> None:
+    """Write an array whose bytes are in a file into an npz archive."""
+    data.seek(0)
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
     with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
         np.lib.format.write_array_header_2_0(file, header)
