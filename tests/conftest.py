@@ -380,6 +380,15 @@ async def apspace(ainterface):
     return reem_async.PublishSpace(ainterface)
 
 
+@pytest.fixture
+async def far_space(server_url):
+    """Publishes as a program of another host: large updates have to be fetched."""
+    import reem_async
+
+    async with reem_async.RedisInterface(server_url, local="off") as interface:
+        yield reem_async.PublishSpace(interface)
+
+
 def _of_place(name):
     return lambda self, path, *given: self.wait(getattr(self.at(path), name)(*given))
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 from clikit import CommandLine
-from conftest import PATIENCE
+from conftest import PATIENCE, aeventually, assert_same
 
 import reem
 import reem_async
@@ -18,6 +18,7 @@ from reem_async.tools.cli import doctor
 from reem_async.tools.cli.checks import OK, WARN
 from reem_async.tools.cli.following import follow
 from reem_async.tools.cli.top import ALL, Window
+from reem_async.tools.recording import Recorder, open_log
 
 IMAGE = np.arange(30_000, dtype=np.float64)
 only_where_there_is = pytest.mark.skipif(bool(reason_against()), reason=f"no shared memory: {reason_against()}")
@@ -37,6 +38,21 @@ def local_finding(url, *words, namespace=""):
     assert run.returncode == 0, run.stdout + run.stderr
     (row,) = [row for row in map(json.loads, run.stdout.splitlines()) if row["check"] == "local"]
     return row
+
+
+@only_where_there_is
+async def test_a_recorder_takes_frames_from_memory_which_the_server_has_lost_by_then(key, apspace, binterface, file):
+    """Frames that come so fast that each is replaced before a read of it could be sent."""
+    frames = [IMAGE + number for number in range(4)]
+    async with Recorder(binterface, [key("*")], file) as recorder:
+        await apspace[key("cam")].write(IMAGE)  # asks for subscribers on this host
+        await aeventually(lambda: recorder.status.messages > 0)
+        await asyncio.gather(*[apspace[key("cam")].write(frame) for frame in frames])
+        await recorder.fence()
+        assert recorder.status.skipped == 0
+    with open_log(file) as log:
+        found = [value for _, value in log[key("cam")].values()]
+    assert_same(found[-4:], frames)
 
 
 @pytest.mark.long

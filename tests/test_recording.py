@@ -25,7 +25,7 @@ IMAGE = np.arange(48 * 64 * 3, dtype=np.uint16).astype(np.uint8).reshape(48, 64,
 FRAME = np.arange(480 * 640 * 3, dtype=np.uint32).astype(np.uint8).reshape(480, 640, 3)
 
 
-async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, binterface, file):
+async def test_it_looks_more_often_once_large_updates_come_fast(key, far_space, binterface, file):
     """Else the next one would have replaced what was announced; where few come, publishers are spared."""
     name = key("cam")
 
@@ -34,13 +34,13 @@ async def test_it_looks_more_often_once_large_updates_come_fast(key, apspace, bi
 
     async with Recorder(binterface, [key("*")], file) as recorder:
         for number in range(3):
-            await apspace[name].write({"image": FRAME, "n": number})
+            await far_space[name].write({"image": FRAME, "n": number})
             await aeventually(lambda n=number: recorder.status.messages > n)
             await asyncio.sleep(0.04)
         assert paces() == {PATIENCE}
         async with asyncio.timeout(10):
             while paces() != {HURRIED}:
-                await apspace[name].write({"image": FRAME, "n": 0})
+                await far_space[name].write({"image": FRAME, "n": 0})
                 await asyncio.sleep(0.008)
 
 

@@ -42,13 +42,13 @@ async def test_what_is_stored_beside_what_is_published_is_seen(key, apspace, akv
         assert log[key()]["z"].at(log.end) == 7
 
 
-async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(key, apspace, akvs, binterface, file):
+async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(key, far_space, akvs, binterface, file):
     async with Recorder(binterface, [key()], file) as recorder:
         for number in range(10):
-            await apspace[key()].write({"image": LARGE + number, "n": number, "state": "raw", "box": [1, 2, 3]})
-            await apspace[key()]["state"].write("done")
-            await apspace[key()]["box"][0].delete()
-            await apspace[key()]["score"].write(number / 2)
+            await far_space[key()].write({"image": LARGE + number, "n": number, "state": "raw", "box": [1, 2, 3]})
+            await far_space[key()]["state"].write("done")
+            await far_space[key()]["box"][0].delete()
+            await far_space[key()]["score"].write(number / 2)
             await recorder.fence()
             await recorder._keys.settled(PATIENCE)
         whole = await akvs[key()].read()
@@ -73,7 +73,7 @@ async def test_a_frame_that_is_changed_inside_before_it_is_fetched_is_skipped(ke
             elif update.path == (key(), "state"):
                 assert state["state"] == "done"
         assert_same(log[key()].at(log.end), whole)
-        await apspace[key()].delete()
+        await far_space[key()].delete()
         await Replayer(binterface, log, rate=100).play()
     assert_same(await akvs[key()].read(), whole)
 

@@ -191,6 +191,7 @@ class _KeyListener(_Part):
     def __init__(self, listener: Listener, document: bytes, new_keys: _NewKeysListener | None) -> None:
         channel = keys_of(document.decode(errors="surrogateescape")).channel
         super().__init__(listener, Topic(channel.encode(errors="surrogateescape")))
+        self.local = listener.local
         self._new_keys = new_keys  # where its first notices came from, or None if only this key is meant
         self.begun = False  # it is followed
 

@@ -184,8 +184,9 @@ class Inbox:
             self._moved([Topic(*topic)], "its slot has moved to another node")
             return
         channel, payload = message[-2:]
-        if self._asks is not None and channel.endswith(self._asks) and not topic[1]:
-            self.early.answer(channel.removesuffix(self._asks), payload)  # empty if its publisher is not an early one
+        if self._asks is not None and channel.endswith(self._asks):
+            if not topic[1]:  # what follows a pattern has large values from shared memory, and no early updates
+                self.early.answer(channel.removesuffix(self._asks), payload)  # empty if its publisher is not early
             return
         self.early.read()  # first what was sent before: a busy program finds both at once
         listeners = self._topics.get(topic, NO_LISTENERS).present()

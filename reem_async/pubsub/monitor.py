@@ -163,6 +163,7 @@ class Monitor(PatternStream[Event]):
         patience: Seconds that updates may wait here for each other while many come, unless another subscriber of this
             interface waits for its updates. That costs publishers less.
         raw: Pictures are not decoded: `Jpeg` and `Png` in place of arrays.
+        local: Large values of publishers of the same user and host come with their events, from shared memory.
 
     Attributes:
         invalidated: Called with a top-level key of which a message could not be read.
@@ -186,6 +187,7 @@ class Monitor(PatternStream[Event]):
         namespaces: str | None = None,
         patience: float = 0.0,
         raw: bool = False,
+        local: bool = False,
     ) -> None:
         if namespaces is not None and (not isinstance(namespaces, str) or "{" in namespaces or "}" in namespaces):
             raise BadType(f"namespaces={namespaces!r} is not a str without braces, such as 'robots/*:'")
@@ -194,6 +196,7 @@ class Monitor(PatternStream[Event]):
         self._namespaces = None if namespaces is None else Pattern(namespaces)
         check_number("patience", patience, "use seconds, 0 or more")
         self.patience = patience
+        self.local = local
         self._numbers = Numbers()
         self._gaps: set[str] | None = None  # keys heard of since a loss, which each has a gap once; None for no loss
         self._owed: dict[str, int] = {}  # keys with a gap to be told, and how many updates are known to be lost there
@@ -311,6 +314,7 @@ class _PatternListener(Listener):
 
     def __init__(self, monitor: Monitor, topic: Topic) -> None:
         super().__init__(topic, monitor.patience, [monitor.queue])
+        self.local = monitor.local
         self._monitor = monitor
         self.wire: Wire | None = None
 

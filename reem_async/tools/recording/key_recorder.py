@@ -14,11 +14,13 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Protocol
 
+import numpy as np
+
 from ...concurrency.tasks import started
 from ...errors import BadData, Conflict, NotAllowed, RedisError, WrongKind
 from ...plan.paths import Path, Pattern, show
 from ...plan.placeholders import Unreadable
-from ...plan.trees import MISSING
+from ...plan.trees import MISSING, mapped
 from ...pubsub.manager import manager_of
 from ...pubsub.monitor import ANNOUNCED, Event
 from ...pubsub.refresh import BACKGROUND, BACKGROUND_RATE, RefreshTimer, present_keys
@@ -93,7 +95,9 @@ class KeyRecorder:
             return
         if self._whole or any(pattern.concerns(event.path) for pattern in self._collector.patterns):
             role = Role.DELETE if event.deleted else Role.UPDATE
-            self._add(Item(role, event.path, event.value, stamp, self._queue.order, event.size))
+            # What waits to be written must keep no slot from its publisher, which has few for the next frames.
+            value = mapped(event.value, _copied) if event.local else event.value
+            self._add(Item(role, event.path, value, stamp, self._queue.order, event.size))
 
     def lost(self, missed: int | None) -> None:
         self._reader.forget()
@@ -221,6 +225,10 @@ class KeyRecorder:
             self._emit(given_up)
         if not is_there:
             self._collector.writer_thread.behind.add(self._name)
+
+
+def _copied(leaf: Any) -> Any:
+    return leaf.copy() if isinstance(leaf, np.ndarray) else leaf
 
 
 class RecordedKeys:

@@ -137,7 +137,10 @@ class Recorder:
         self._keyframes = 0
         self._keys = RecordedKeys(self)
         tops = self._keys.tops
-        self._monitor = Monitor(interface, tops, Last(_WAITING), patience=PATIENCE, raw=True) if tops else None
+        # A camera's frames are taken from its memory before it writes others there, however busy the server is.
+        self._monitor = (
+            Monitor(interface, tops, Last(_WAITING), patience=PATIENCE, raw=True, local=True) if tops else None
+        )
         if self._monitor is not None:
             self._monitor.invalidated = lambda name: self._keys.of(name).lost(None)
             self._monitor.resynchronised = self._keys.lost
@@ -280,6 +283,7 @@ class Recorder:
         assert self._monitor is not None
         async for event in self._monitor:
             self._keys.of(event.name).on_event(event)
+            del event  # it may keep a slot of its publisher's memory
             if self._monitor.batches_messages:
                 give_way()
 
