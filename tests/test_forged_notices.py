@@ -124,6 +124,22 @@ def test_what_a_publisher_could_have_written_is_read(title):
     notices.decode(SOUND[title], SHIPS)
 
 
+@pytest.mark.parametrize("lengths", [(2048,), (2049,), (1024, 1024), (1024, 1025), (1, 2047, 1)])
+def test_a_change_is_announced_at_a_place_that_is_read(lengths):
+    path = tuple("x" * length for length in lengths)
+    place = notices.notify_path(path)
+    assert notices.decode(notices.announce("me", 1, 2.0, place), SHIPS).path == place
+    assert place == (path if sum(lengths) <= 2048 else path[:-1])
+
+
+def test_bytes_that_were_cut_off_are_not_taken():
+    attachment = EncodedAttachment(".b", "bytes", (), (b"12345",))
+    payload = notices.with_value("me", 1, 2.0, (), b'{"b": "$ship bytes .b 5"}', [attachment])
+    assert notices.decode(payload, SHIPS).value == {"b": b"12345"}
+    with pytest.raises(BadData, match="truncated"):
+        notices.decode(payload[:-1], SHIPS)
+
+
 def test_equal_paths_of_other_types_are_not_taken_for_each_other():
     """Sound paths are remembered, and 1, 1.0 and True are equal."""
     for index in (b"7", b"7.0"):

@@ -9,6 +9,7 @@ import pytest
 import redis
 from conftest import PATIENCE, aeventually, assert_same
 
+import reem
 import reem_async
 from reem_async.errors import ServerFull, Stale
 from reem_async.local.segment import reason_against
@@ -76,6 +77,19 @@ async def test_early_updates_of_all_sizes_reach_subscribers_watches_and_mirrors(
             assert_same(update.data, value)
             assert not update.gap
             assert_same(await mirror.wait_until(lambda tree, number=number: tree["n"] == number, PATIENCE), value)
+
+
+async def test_an_early_update_is_read_before_that_of_the_server_where_both_wait(server_url, key):
+    """As for a busy program: plain code publishes on the thread of the subscriber's event loop."""
+    with reem.RedisInterface(server_url, local="early") as near, reem.RedisInterface(server_url) as far:
+        async with parties(server_url, key("cam")) as (_, kvs, told, _), kvs[key("other")].watch() as others:
+            seen = []
+            for number in range(10):
+                reem.PublishSpace(far)[key("other")] = number
+                reem.PublishSpace(near)[key("cam")] = {"n": number}
+                seen.append((await next_of(told)).early)
+                assert (await next_of(others)).data == number
+            assert seen == [False] + [True] * 9
 
 
 async def test_a_mirror_is_as_old_as_what_the_server_has_not_confirmed():

@@ -194,23 +194,28 @@ def test_a_program_that_was_stopped_goes_on_in_each_role(server):
     "keep", [pytest.param(True, marks=pytest.mark.long, id="with its data"), pytest.param(False, id="without")]
 )
 def test_nodes_are_back_within_a_second_after_a_restart(keep):
-    """And none is reported to have left, since it has not."""
+    """And none is reported to have left, since it has not, also one that takes a moment longer."""
     with (
         PrivateServer(keep=keep) as server,
         reem.RedisInterface(server.url, name="planner"),
+        program(server.url) as slow,
         reem.RedisInterface(server.url, timeout=0.3) as watcher,
     ):
-        eventually(watcher.nodes)
+        eventually(lambda: len(watcher.nodes()) == 2)
         with watcher.watch_nodes() as watch:
-            assert next(watch).node.name == "planner"
+            assert [next(watch).node.name for _ in range(2)] == ["planner"] * 2
+            slow.send_signal(signal.SIGSTOP)
             server.kill()
             time.sleep(1.2)
             server.start()
             begin = time.monotonic()
             eventually(lambda: contextlib.suppress(reem.ReemError) and watcher.nodes())
             assert time.monotonic() - begin < SOON
+            time.sleep(0.25)  # a watch has asked by now
+            slow.send_signal(signal.SIGCONT)
             time.sleep(1.3)
             assert watch._core.queue.take() is EMPTY
+            assert len(watcher.nodes()) == 2
 
 
 @pytest.mark.parametrize("kind", ["cluster", pytest.param("sentinel", marks=pytest.mark.long)])

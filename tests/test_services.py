@@ -9,6 +9,7 @@ import random
 import signal
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -420,8 +421,13 @@ def test_a_stopped_server_is_noticed_and_begins_nothing_later(caller, server_url
         caller[key()].call(number=3)
         process.send_signal(signal.SIGSTOP)
         eventually(lambda: Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] == "T")
-        with pytest.raises(CallTimeout):
-            caller[key()].call(number=4, timeout=0.3, done=str(tmp_path / "done"))
+
+        def leave(number):  # so much that the word that a caller has left comes much later than its request
+            with pytest.raises(CallTimeout):
+                caller[key()].call(number=number, timeout=0.3, array=np.zeros(8000), done=str(tmp_path / "done"))
+
+        with ThreadPoolExecutor() as pool:
+            assert len(list(pool.map(leave, [4] * 6))) == 6
         began = time.monotonic()
         with pytest.raises(ServiceLost, match=r"0\.9 s"):
             caller[key()].call(number=5, done=str(tmp_path / "done"))
@@ -574,9 +580,12 @@ async def test_hostile_messages_are_refused(akvs, raw, key):
     caller = next(each for each in manager.kept.values() if hasattr(each, "_pending"))
     (pending,) = caller._pending
     value = b'{"number":2}', ()
-    call_id = messages.Message(messages.CALL, "a" * 16, "b" * 16, 5, [""])
+    call_id = messages.Message(messages.CALL, "a" * 16, "b" * 16, 5, ["", ""])
     request = messages.packed(call_id, value, "", 5, None).payload
     answer = messages.packed(call_id._replace(kind=messages.ANSWER, call=pending), value, "", 5, None).payload
+    odd = b"{}", [EncodedAttachment("x", "numpy", (), (b"",))]  # an attachment under the key of something else
+    with pytest.raises(BadData, match="a value that cannot be"):
+        messages.decode(messages.packed(call_id, odd, "", 5, None).payload, lambda *_: None)
     for seed, (listener, payload) in enumerate([(served, request), (caller, answer)]):
         for odd in (answer if listener is caller else b"", *mutations(payload, seed)):
             with contextlib.suppress(BadData):

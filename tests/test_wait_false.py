@@ -372,6 +372,28 @@ def test_the_queue_of_a_forked_child_is_empty(server, reader):
         assert (reader["a"].read(), reader["b"].read(), space.dropped) == ({"n": 5}, "child", 0)
 
 
+def test_a_call_in_the_moment_in_which_the_sender_begins_to_wait_is_sent_at_once(server_url, kvs, key, monkeypatch):
+    class Queue(send_queue.SendQueue):
+        @property
+        def _is_idle(self):
+            return vars(self)["idle"]
+
+        @_is_idle.setter
+        def _is_idle(self, value):
+            if value and late:
+                space[key()] = late.pop()
+            vars(self)["idle"] = value
+
+    late = [1]
+    monkeypatch.setattr(send_queue, "SendQueue", Queue)
+    with reem.RedisInterface(server_url) as interface:
+        space = reem.PublishSpace(interface, wait=False)
+        space[key()] = 0
+        begin = time.monotonic()
+        eventually(lambda: kvs[key()].read() == 1)
+        assert time.monotonic() - begin < send_queue._IDLE / 2
+
+
 def test_a_forked_child_does_not_raise_the_errors_of_its_parent(server):
     with reem.RedisInterface(server.url) as interface:
         space = reem.PublishSpace(interface, wait=False)
@@ -490,6 +512,24 @@ def test_a_link_that_is_cut_again_and_again(publisher, server, reader):
         assert len(set(told)) == len(told)
         assert front.kvs.waiting == 0
         assert number // 2 < len(told) + front.kvs.dropped
+
+
+def test_an_update_that_found_no_server_keeps_its_number(publisher, server, reader):
+    with Proxy(server.port) as proxy, reader["a"].watch(Every(100)) as watch:
+        front = publisher(proxy.url, "newest", timeout=0.3)
+        front.write(["a"], 1)
+        front.flush()
+        proxy.black_hole()
+        proxy.reset()
+        front.write(["a"], 2)
+        front.sleep(0.5)
+        proxy.heal()
+        front.flush()
+        front.write(["a"], 3)
+        front.flush()
+        updates = [next(watch) for _ in range(3)]
+        assert [(update.data, update.sequence, update.missed) for update in updates] == [(n, n, 0) for n in (1, 2, 3)]
+        assert len({update.publisher for update in updates}) == 1
 
 
 @pytest.mark.parametrize("large", [False, True])
